@@ -1,0 +1,1 @@
+"""Robot data in, batches out: RLDS shards, token store, windows, mixtures, loaders, suites."""

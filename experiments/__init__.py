@@ -1,0 +1,1 @@
+"""The composition root: trials, sweeps, ledger, plots, reports and the `hma` command line."""

@@ -1,0 +1,320 @@
+"""Configuration: frozen dataclasses, validated when made, JSON both ways, with a stable hash.
+
+A default lives here and nowhere else. Named instances live in `presets`. A config holds
+what determines a result; paths, clocks and verbosity belong to the code that calls.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot work; the message names the field and what to change."""
+
+
+def require(condition: bool, message: str) -> None:
+    """Raises ConfigError(message) unless `condition` holds."""
+    if not condition:
+        raise ConfigError(message)
+
+
+# --- JSON and hash ---------------------------------------------------------------------------
+
+
+def to_dict(config: Any) -> Any:
+    """Plain JSON types from a config (dataclasses, tuples and scalars, nested)."""
+    if dataclasses.is_dataclass(config):
+        return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, (tuple, list)):
+        return [to_dict(v) for v in config]
+    if isinstance(config, dict):
+        return {k: to_dict(v) for k, v in config.items()}
+    return config
+
+
+def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
+    """A `cls` from `to_dict`'s output. Unknown and missing keys raise ConfigError by name."""
+    hints = typing.get_type_hints(cls)
+    known = {f.name: f for f in dataclasses.fields(cls)}
+    where = where or cls.__name__
+    unknown = sorted(set(values) - set(known))
+    require(not unknown, f"{where}: unknown field(s) {', '.join(unknown)}; known: {', '.join(known)}")
+    missing = [
+        n
+        for n, f in known.items()
+        if n not in values
+        and f.default is dataclasses.MISSING
+        and f.default_factory is dataclasses.MISSING
+    ]
+    require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
+    return cls(**{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
+
+
+def _decode(hint: Any, value: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None:
+            return None
+        options = [a for a in typing.get_args(hint) if a is not type(None)]
+        return _decode(options[0], value, where)
+    if dataclasses.is_dataclass(hint):
+        return from_dict(hint, value, where)
+    if origin is tuple:
+        args = typing.get_args(hint)
+        if len(args) == 2 and args[1] is Ellipsis:
+            args = (args[0],) * len(value)
+        return tuple(_decode(a, v, where) for a, v in zip(args, value, strict=True))
+    if hint is float and isinstance(value, int):
+        return float(value)
+    return value
+
+
+def to_json(config: Any) -> str:
+    return json.dumps(to_dict(config), indent=2, sort_keys=True)
+
+
+def from_json(cls: type, text: str) -> Any:
+    return from_dict(cls, json.loads(text))
+
+
+def stable_hash(config: Any, length: int = 16) -> str:
+    """Hex digest of the canonical JSON: the same on every machine and Python version."""
+    canonical = json.dumps(to_dict(config), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()[:length]
+
+
+def diff(old: Any, new: Any, path: str = "") -> list[str]:
+    """Readable lines 'field: old -> new' for every difference between two configs."""
+    a, b = to_dict(old), to_dict(new)
+    if isinstance(a, dict) and isinstance(b, dict):
+        lines = []
+        for key in sorted(set(a) | set(b)):
+            lines += diff(a.get(key), b.get(key), f"{path}.{key}" if path else key)
+        return lines
+    return [] if a == b else [f"{path}: {a!r} -> {b!r}"]
+
+
+# --- Tokenizer -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TokenizerConfig:
+    """The small convolutional tokenizer with lookup-free quantisation (`tokenizers.lfq`).
+
+    An image of `image_size` x `image_size` becomes (image_size / downsample)^2 tokens of
+    `bits` binary channels, split evenly into `factors` vocabulary factors.
+    """
+
+    image_size: int = 32
+    downsample: int = 8
+    bits: int = 12
+    factors: int = 2
+    channels: int = 32  # at full resolution; doubled at each level up to `max_channels`
+    max_channels: int = 128
+    res_blocks: int = 1  # per level
+    entropy_weight: float = 0.02
+    commitment_weight: float = 0.1
+
+    def __post_init__(self):
+        d = self.downsample
+        require(d >= 2 and d & (d - 1) == 0, f"tokenizer.downsample must be a power of two, got {d}")
+        require(
+            self.image_size % d == 0,
+            f"tokenizer.image_size {self.image_size} is not a multiple of downsample {d}",
+        )
+        require(
+            self.factors >= 1 and self.bits % self.factors == 0,
+            f"tokenizer.bits {self.bits} do not split into {self.factors} equal factors",
+        )
+        require(self.bits <= 24, f"tokenizer.bits must be at most 24, got {self.bits}")
+
+    @property
+    def grid(self) -> int:
+        """Tokens along one side of the image."""
+        return self.image_size // self.downsample
+
+    @property
+    def tokens(self) -> int:
+        """S: tokens per frame."""
+        return self.grid**2
+
+    @property
+    def factor_vocab(self) -> int:
+        """V: entries per factor."""
+        return 2 ** (self.bits // self.factors)
+
+    @property
+    def vocab_size(self) -> int:
+        return 2**self.bits
+
+
+# --- Model -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MupConfig:
+    """Width transfer (paper section 3.5; practice in Tensor Programs V).
+
+    `base_width` is where the multipliers are 1. Learning rate and initial variance of hidden
+    matrices scale with base_width / D, the read-out's input with base_width / D, attention
+    logits with `attention_scale` / head width.
+    """
+
+    enabled: bool = True
+    base_width: int = 256
+    attention_scale: float = 8.0
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The discrete HMA transformer. Defaults are the released base model (43.6 M, one robot)."""
+
+    width: int = 256  # D
+    layers: int = 32  # N
+    heads: int = 8  # H
+    frames: int = 12  # T
+    tokens: int = 256  # S
+    action_tokens: int = 64  # K
+    factors: int = 2  # Q
+    factor_vocab: int = 512  # V
+    mlp_ratio: float = 4.0
+    qkv_bias: bool = False
+    proj_bias: bool = True
+    mlp_bias: bool = True
+    qk_norm: bool = False
+    mup: MupConfig = field(default_factory=MupConfig)
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    remat: bool = True
+
+    def __post_init__(self):
+        require(
+            self.width % self.heads == 0,
+            f"model.width {self.width} is not a multiple of model.heads {self.heads}",
+        )
+        for name in ("width", "layers", "heads", "frames", "tokens", "factors"):
+            require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
+        require(self.action_tokens >= 1, "model.action_tokens must be at least 1")
+        require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
+
+    @property
+    def head_width(self) -> int:
+        return self.width // self.heads
+
+    @property
+    def mlp_width(self) -> int:
+        return int(self.width * self.mlp_ratio)
+
+    @property
+    def frame_tokens(self) -> int:
+        """P: tokens per frame inside the trunk."""
+        return self.tokens + self.action_tokens
+
+    @property
+    def vocab_size(self) -> int:
+        return self.factor_vocab**self.factors
+
+    @property
+    def mask_id(self) -> int:
+        """The id that stands for a masked position: one past the last token."""
+        return self.vocab_size
+
+    @property
+    def width_multiplier(self) -> float:
+        """muP's m = D / base width; 1 when muP is off."""
+        return self.width / self.mup.base_width if self.mup.enabled else 1.0
+
+
+@dataclass(frozen=True)
+class MaskingConfig:
+    """Training-time masking and corruption (reference section 1.9)."""
+
+    non_mlm_ratio: float = 0.2  # probability that prompt frames stay clean
+    prompt_frames: int = 4
+    max_corrupt_rate: float = 0.2
+    clean_rate_min: float = 0.2
+    label_smoothing: float = 0.01
+
+    def __post_init__(self):
+        for name in ("non_mlm_ratio", "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
+            value = getattr(self, name)
+            require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
+
+
+# --- Training --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    learning_rate: float = 1e-4  # at the muP base width
+    schedule: Literal["constant", "cosine", "wsd"] = "constant"
+    warmup_steps: int = 500
+    final_fraction: float = 0.1  # of the learning rate, at the end of cosine and wsd
+    decay_fraction: float = 0.2  # of all steps, the decay phase of wsd
+    beta1: float = 0.9
+    beta2: float = 0.95
+    epsilon: float = 1e-8
+    weight_decay: float = 0.05
+    clip_norm: float = 1.0
+
+    def __post_init__(self):
+        require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")
+        require(self.warmup_steps >= 0, "optimizer.warmup_steps must not be negative")
+        require(self.clip_norm > 0, f"optimizer.clip_norm must be positive, got {self.clip_norm}")
+
+
+@dataclass(frozen=True)
+class MeshConfig:
+    """Devices along each mesh axis; -1 on one axis takes all that are left."""
+
+    data: int = -1
+    fsdp: int = 1
+    tensor: int = 1
+
+    def __post_init__(self):
+        sizes = (self.data, self.fsdp, self.tensor)
+        require(sizes.count(-1) <= 1, f"mesh: only one axis may be -1, got {sizes}")
+        require(all(s == -1 or s >= 1 for s in sizes), f"mesh axes must be -1 or at least 1, got {sizes}")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run. `batch` counts windows per optimiser step, over all devices."""
+
+    steps: int = 60_000
+    batch: int = 64
+    accumulate: int = 1  # micro-batches per step
+    seed: int = 0
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    masking: MaskingConfig = field(default_factory=MaskingConfig)
+
+    def __post_init__(self):
+        require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
+        require(
+            self.batch % self.accumulate == 0,
+            f"train.batch {self.batch} is not a multiple of train.accumulate {self.accumulate}",
+        )
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """The evaluation protocol (paper section 4, Metrics)."""
+
+    windows_per_dataset: int = 500
+    prompt_frames: int = 4
+    unmask_steps: int = 2  # M
+    random_actions: int = 5  # draws for delta PSNR
+    batch: int = 32
+    perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
+    seed: int = 0
+
+    def __post_init__(self):
+        require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
+        require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
+        require(self.random_actions >= 1, "eval.random_actions must be at least 1")

@@ -1,0 +1,97 @@
+"""The embodiment table: what a model must know of each robot's actions.
+
+It is data, not configuration: made from a token store, saved inside every checkpoint, and
+the only place where the order of the embodiment axis E is decided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hma_jax.config import ConfigError, require
+
+DEAD_STD = 1e-6
+"""A dimension whose standard deviation is below this (in raw units) carries no signal."""
+
+
+@dataclass(frozen=True)
+class Embodiment:
+    """One robot and its action space.
+
+    `mean` and `std` are over single native actions, length `action_dim`, in raw units. The
+    action chunk of a frame is `stride` native actions, flattened sub-step-major.
+    """
+
+    name: str
+    action_dim: int
+    stride: int
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    def __post_init__(self):
+        require(
+            len(self.mean) == len(self.std) == self.action_dim,
+            f"embodiment {self.name!r}: mean and std must have {self.action_dim} entries, "
+            f"got {len(self.mean)} and {len(self.std)}",
+        )
+        require(self.stride >= 1, f"embodiment {self.name!r}: stride must be at least 1")
+        require(
+            bool(np.isfinite(self.mean).all() and np.isfinite(self.std).all()),
+            f"embodiment {self.name!r}: action statistics are not finite; check its actions for NaN",
+        )
+
+    @property
+    def chunk(self) -> int:
+        """Values in one frame's action chunk: stride x action_dim."""
+        return self.stride * self.action_dim
+
+
+@dataclass(frozen=True)
+class EmbodimentTable:
+    """Embodiments in the order of the E axis."""
+
+    entries: tuple[Embodiment, ...]
+
+    def __post_init__(self):
+        names = [e.name for e in self.entries]
+        require(len(names) >= 1, "the embodiment table is empty")
+        require(len(set(names)) == len(names), f"embodiment names repeat: {sorted(names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.entries)
+
+    @property
+    def size(self) -> int:
+        """E."""
+        return len(self.entries)
+
+    @property
+    def action_width(self) -> int:
+        """U: the widest chunk; narrower ones are padded with zeros."""
+        return max(e.chunk for e in self.entries)
+
+    def index(self, name: str) -> int:
+        for i, entry in enumerate(self.entries):
+            if entry.name == name:
+                return i
+        raise ConfigError(f"unknown embodiment {name!r}; the table has {', '.join(self.names)}")
+
+    def normaliser(self) -> tuple[np.ndarray, np.ndarray]:
+        """(mean_EU, inverse_std_EU), float32.
+
+        Padding and dead dimensions get an inverse of 0, so they normalise to exactly 0.
+        DIFFERS: the release divides by std + 1e-10, which turns rounding noise on a constant
+        dimension into values of order 100 (reference section 5.6).
+        """
+        mean = np.zeros((self.size, self.action_width), np.float32)
+        inverse = np.zeros((self.size, self.action_width), np.float32)
+        for i, e in enumerate(self.entries):
+            std = np.asarray(e.std, np.float64)
+            alive = std > DEAD_STD
+            one = np.where(alive, 1.0 / np.where(alive, std, 1.0), 0.0)
+            mean[i, : e.chunk] = np.tile(np.asarray(e.mean), e.stride)
+            inverse[i, : e.chunk] = np.tile(one, e.stride)
+        return mean, inverse
