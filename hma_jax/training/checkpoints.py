@@ -1,0 +1,104 @@
+"""Checkpoints: whole or absent, on any mesh, and never mistaken for another run's.
+
+Orbax (v1) writes asynchronously into a temporary directory and renames. Beside the arrays
+every checkpoint carries `meta`, the JSON description of the run (configurations, embodiment
+table, data provenance); restoring under another description is refused by name.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+from orbax.checkpoint import v1 as ocp
+
+from hma_jax.config import ConfigError, diff
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint that is missing, unreadable or belongs to another configuration."""
+
+
+class Checkpoints:
+    """The checkpoints of one run. Use as a context manager: leaving waits for pending saves."""
+
+    def __init__(self, directory: Path, meta: dict[str, Any], keep: int = 2):
+        """Raises CheckpointError if `directory` cannot be written."""
+        self.directory = Path(directory).absolute()
+        self.meta = meta
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise CheckpointError(
+                f"cannot create the checkpoint directory {self.directory}: {error.strerror}; "
+                "choose another output directory"
+            ) from error
+        self._orbax = ocp.training.Checkpointer(
+            self.directory,
+            preservation_policy=ocp.training.preservation_policies.LatestN(keep),
+            # A save cut short by a kill leaves a temporary directory; drop it.
+            cleanup_tmp_directories=True,
+        )
+
+    def __enter__(self) -> Checkpoints:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._orbax.close()
+
+    @property
+    def latest_step(self) -> int | None:
+        latest = self._orbax.latest
+        return None if latest is None else latest.step
+
+    def save(self, step: int, state: Any) -> None:
+        """Starts an asynchronous save; the arrays are copied before this returns."""
+        if step != self.latest_step:
+            self._orbax.save_async(step, state, custom_metadata=self.meta)
+
+    def wait(self) -> None:
+        self._orbax.wait()
+
+    def restore(self, like: Any, ignore: tuple[str, ...] = ()) -> Any:
+        """The latest state, laid out as the arrays of `like` are.
+
+        `ignore` lists fields of `meta` ('train.steps') that may differ. Raises CheckpointError
+        naming every other difference.
+        """
+        step = self.latest_step
+        if step is None:
+            raise CheckpointError(f"no checkpoint under {self.directory}")
+        saved = self._orbax.metadata(step).custom_metadata or {}
+        changes = [line for line in diff(saved, self.meta) if line.split(":")[0] not in ignore]
+        if changes:
+            raise CheckpointError(
+                f"the checkpoint at {self.directory} (step {step}) was made by another "
+                "configuration; use a new output directory or restore these fields:\n  "
+                + "\n  ".join(changes)
+            )
+        abstract = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like
+        )
+        return self._orbax.load(step, abstract)
+
+
+def read_checkpoint(directory: Path) -> tuple[int, Any, dict[str, Any]]:
+    """(step, state as nested dicts of arrays on the default device, meta) of the latest one.
+
+    Raises CheckpointError if there is none.
+    """
+    directory = Path(directory).absolute()
+    if not directory.is_dir():
+        raise CheckpointError(f"no checkpoints at {directory}; give the directory of a training run")
+    with ocp.training.Checkpointer(directory) as orbax:
+        if orbax.latest is None:
+            raise CheckpointError(f"no finished checkpoint under {directory}; resume its training first")
+        step = orbax.latest.step
+        metadata = orbax.metadata(step)
+        # Saved on one mesh, read on whatever this process has: put everything on one device.
+        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        abstract = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), metadata.metadata
+        )
+        return step, orbax.load(step, abstract), metadata.custom_metadata or {}
