@@ -1,0 +1,101 @@
+"""Named studies and nothing else. `Study` says what each field means."""
+
+from __future__ import annotations
+
+from experiments.paper_mixture import PAPER_MIXTURE
+from experiments.study import StoreConfig, Study, SuiteConfig, TokenizerTraining
+from hma_jax.config import (
+    ConfigError,
+    EvalConfig,
+    MaskingConfig,
+    ModelConfig,
+    MupConfig,
+    OptimizerConfig,
+    TokenizerConfig,
+    TrainConfig,
+)
+
+SMOKE = Study(
+    name="smoke",  # seconds: proves that every part runs; its numbers mean nothing
+    suite=SuiteConfig(scale=0.02),
+    tokenizer=TokenizerConfig(image_size=16, downsample=4, bits=8, channels=8, max_channels=16),
+    tokenizer_training=TokenizerTraining(steps=3, batch=4),
+    model=ModelConfig(
+        width=16, layers=2, heads=2, frames=4, tokens=16, action_tokens=2, factor_vocab=16,
+        mup=MupConfig(base_width=16),
+    ),
+    train=TrainConfig(steps=3, batch=4, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=1),
+                      masking=MaskingConfig(prompt_frames=2)),
+    eval=EvalConfig(windows_per_dataset=2, prompt_frames=2, random_actions=1, batch=2, perplexity_group=1),
+    dataset_counts=(2, 3),
+    trajectory_counts=(2, 4),
+    widths=(8, 16),
+    flops_per_second=2e9,
+)
+
+CPU = Study(
+    name="cpu",  # the study of the README: two cores, minutes
+    suite=SuiteConfig(scale=1.0),
+    tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=12),
+    tokenizer_training=TokenizerTraining(steps=1000, batch=32),
+    model=ModelConfig(
+        width=64, layers=4, heads=4, frames=12, tokens=16, action_tokens=4, factor_vocab=64,
+        mup=MupConfig(base_width=64),
+    ),
+    train=TrainConfig(
+        steps=500, batch=16,
+        optimizer=OptimizerConfig(learning_rate=2e-3, warmup_steps=50, schedule="wsd"),
+    ),
+    eval=EvalConfig(windows_per_dataset=16, batch=16),
+    dataset_counts=(5, 10, 20, 40),
+    trajectory_counts=(3, 10, 30, 100),
+    widths=(16, 32, 64),
+    flops_per_second=3e10,
+)
+
+ACCELERATOR = Study(
+    name="accelerator",  # one GPU, hours
+    suite=SuiteConfig(scale=20.0),
+    tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=16, channels=64, max_channels=256),
+    tokenizer_training=TokenizerTraining(steps=10_000, batch=128, learning_rate=5e-4),
+    model=ModelConfig(
+        width=256, layers=12, heads=8, frames=12, tokens=64, action_tokens=16, factor_vocab=256,
+        compute_dtype="bfloat16",
+    ),
+    train=TrainConfig(
+        steps=20_000, batch=64,
+        optimizer=OptimizerConfig(learning_rate=5e-4, schedule="wsd"),
+    ),
+    eval=EvalConfig(windows_per_dataset=200, batch=64),
+    dataset_counts=(5, 10, 20, 30, 40),
+    trajectory_counts=(10, 30, 100, 300, 1000),
+    widths=(64, 128, 256, 512),
+    seeds=(0, 1, 2),
+    flops_per_second=1e14,
+)
+
+PAPER = Study(
+    name="paper",  # section 4 of the paper, as stated; bring the forty datasets with --data
+    datasets=tuple(PAPER_MIXTURE),
+    tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=128, max_channels=512,
+                              res_blocks=2),
+    tokenizer_training=TokenizerTraining(steps=200_000, batch=64, learning_rate=1e-4),
+    model=ModelConfig(compute_dtype="bfloat16"),
+    train=TrainConfig(steps=60_000, batch=64),
+    eval=EvalConfig(windows_per_dataset=500),
+    store=StoreConfig(val_fraction=0.01, max_val=500),
+    dataset_counts=(5, 10, 20, 30, 40),
+    trajectory_counts=(10, 100, 1_000, 10_000, 100_000, 1_000_000),
+    widths=(64, 128, 256, 512, 768, 1024),
+    tau=3.0,
+    flops_per_second=8e14,  # eight accelerators at 100 TFLOP/s
+)
+
+PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER)}
+
+
+def get_preset(name: str) -> Study:
+    """Raises ConfigError, listing the names, when there is none of that name."""
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset {name!r}; known: {', '.join(PRESETS)}")
+    return PRESETS[name]

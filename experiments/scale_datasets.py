@@ -1,0 +1,38 @@
+"""Does training on more robots help or hurt those already there?
+
+Question: perplexity and delta PSNR on the first datasets as further ones join the mixture,
+    the total number of training windows held fixed (so later points see less of each).
+Paper figure: 6, left.
+Command: python -m experiments.scale_datasets --preset cpu
+Cost: one training run per point and seed; `--dry-run` prints it.
+Expected outcome: no collapse. With a fixed budget the first datasets lose a little to
+    dilution; the paper, which lets the data grow, sees a slight gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from experiments.study import Study
+from experiments.sweep import Sweep, make_sweep
+
+
+def plan(study: Study) -> Sweep:
+    """Points are nested: each takes the first x datasets. All are judged on the smallest set."""
+    names = study.dataset_names()
+    judged = names[: study.dataset_counts[0]]
+    return make_sweep(
+        study,
+        name="datasets",
+        axis="datasets in the mixture",
+        scope=judged,
+        values=study.dataset_counts,
+        change=lambda trial, x: replace(trial, datasets=names[:x], evaluated=judged),
+        reference_x=len(names),
+    )
+
+
+if __name__ == "__main__":
+    from experiments.cli import run_module
+
+    run_module("datasets")

@@ -1,0 +1,192 @@
+"""What a study fixes: data, tokenizer, base model, budget, protocol and the points of each axis.
+
+Owns the `Study` record and how it is adapted (user data, command line overrides). Named
+instances are in `presets`; which trials follow from a study is in `scale_datasets`,
+`scale_trajectories` and `scale_width`. Nothing here imports JAX.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from hma_jax.config import (
+    ConfigError,
+    EvalConfig,
+    ModelConfig,
+    TokenizerConfig,
+    TrainConfig,
+    from_dict,
+    require,
+    to_dict,
+)
+
+
+@dataclass(frozen=True)
+class SuiteConfig:
+    """The simulated datasets; not used when a study runs on the user's own."""
+
+    scale: float = 1.0  # multiplies every dataset's number of episodes
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class TokenizerTraining:
+    """How the tokenizer is trained, on frames of every dataset of the study."""
+
+    steps: int = 2000
+    batch: int = 32
+    learning_rate: float = 1e-3
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class StoreConfig:
+    """What the token store keeps (`data_pipelines.tokenize_job`)."""
+
+    val_fraction: float = 0.05
+    min_val: int = 2  # held-out episodes per dataset, at least
+    max_val: int = 200  # and at most
+    frame_step: int | None = None  # None: only the 2 Hz frames
+
+
+@dataclass(frozen=True)
+class Study:
+    """One scaling study. The reference trial, which all three axes share, uses all datasets,
+    the largest trajectory count and the base model."""
+
+    name: str
+    model: ModelConfig
+    train: TrainConfig
+    eval: EvalConfig
+    dataset_counts: tuple[int, ...]
+    trajectory_counts: tuple[int, ...]  # per dataset
+    widths: tuple[int, ...]
+    tokenizer: TokenizerConfig = field(default_factory=TokenizerConfig)
+    tokenizer_training: TokenizerTraining = field(default_factory=TokenizerTraining)
+    suite: SuiteConfig = field(default_factory=SuiteConfig)
+    store: StoreConfig = field(default_factory=StoreConfig)
+    datasets: tuple[str, ...] = ()  # in the order they are added; () takes the suite's own order
+    tau: float = 3.0  # temperature of the mixture
+    seeds: tuple[int, ...] = (0,)
+    flops_per_second: float = 1e13  # sustained; only for the cost estimates of --dry-run
+
+    def __post_init__(self):
+        for axis in ("dataset_counts", "trajectory_counts", "widths", "seeds"):
+            points = getattr(self, axis)
+            require(len(points) >= 1, f"{axis} is empty; give at least one point")
+            require(
+                list(points) == sorted(set(points)) and (axis == "seeds" or points[0] >= 1),
+                f"{axis} must increase and be positive, got {points}",
+            )
+        require(
+            self.model.width in self.widths,
+            f"widths {self.widths} must contain model.width {self.model.width}, the width of the "
+            "reference trial",
+        )
+        for name, want in (
+            ("tokens", self.tokenizer.tokens),
+            ("factors", self.tokenizer.factors),
+            ("factor_vocab", self.tokenizer.factor_vocab),
+        ):
+            require(
+                getattr(self.model, name) == want,
+                f"model.{name} is {getattr(self.model, name)} but the tokenizer makes {want}; "
+                f"set model.{name}={want} or change the tokenizer",
+            )
+        require(
+            self.eval.prompt_frames < self.model.frames,
+            f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of "
+            f"model.frames {self.model.frames}",
+        )
+        require(
+            not self.datasets or self.dataset_counts[-1] == len(self.datasets),
+            f"the last of dataset_counts {self.dataset_counts} must be the number of datasets, "
+            f"{len(self.datasets)}",
+        )
+        require(len(set(self.datasets)) == len(self.datasets), f"datasets repeat: {self.datasets}")
+
+    def dataset_names(self) -> tuple[str, ...]:
+        """Every dataset of the study, in the order in which the datasets axis adds them."""
+        if self.datasets:
+            return self.datasets
+        from data_pipelines.suite.embodiments import EMBODIMENTS
+
+        count = self.dataset_counts[-1]
+        require(
+            count <= len(EMBODIMENTS),
+            f"dataset_counts asks for {count} datasets; the suite has {len(EMBODIMENTS)}",
+        )
+        return tuple(e.name for e in EMBODIMENTS[:count])
+
+
+def on_user_data(study: Study, names: Sequence[str]) -> Study:
+    """The same study on the user's datasets: counts beyond what there is are cut to it."""
+    counts = tuple(sorted({min(c, len(names)) for c in study.dataset_counts} | {len(names)}))
+    return replace(study, datasets=tuple(names), dataset_counts=counts)
+
+
+def override(study: Study, settings: Sequence[str]) -> Study:
+    """`study` with fields changed by 'path=value' strings, such as 'model.frames=4'.
+
+    Values are JSON; lists may be written '4,8,16'. Raises ConfigError for an unknown path
+    (with the closest known one) or a value of the wrong kind.
+    """
+    values = to_dict(study)
+    for setting in settings:
+        path, separator, text = setting.partition("=")
+        require(bool(separator), f"--set {setting}: write it as path=value, such as model.frames=4")
+        _assign(values, path.strip(), text.strip())
+    return from_dict(Study, values)
+
+
+def _assign(values: dict[str, Any], path: str, text: str) -> None:
+    """Puts the parsed `text` at `path`, in place."""
+    known = _leaves(values)
+    if path not in known:
+        close = difflib.get_close_matches(path, known, n=3)
+        hint = f"; did you mean {' or '.join(close)}?" if close else f"; known: {', '.join(known)}"
+        raise ConfigError(f"--set {path}: no such setting{hint}")
+    node = values
+    *parents, last = path.split(".")
+    for parent in parents:
+        node = node[parent]
+    node[last] = _parse(path, text, node[last])
+
+
+def _parse(path: str, text: str, old: Any) -> Any:
+    """A value of the kind of `old` from command line text."""
+    if isinstance(old, str):
+        return text
+    if isinstance(old, list) and not text.startswith("["):
+        items = [t.strip() for t in text.split(",") if t.strip()]
+        return [t if old and isinstance(old[0], str) or path == "datasets" else _json(path, t) for t in items]
+    value = _json(path, text)
+    if old is not None and value is not None:
+        number = isinstance(old, (int, float)) and not isinstance(old, bool)
+        fits = isinstance(value, (int, float)) if number else isinstance(value, type(old))
+        if isinstance(old, int) and isinstance(value, float) or isinstance(value, bool) and number:
+            fits = False
+        require(fits, f"--set {path}={text}: expected a value like {json.dumps(old)}")
+    return value
+
+
+def _json(path: str, text: str) -> Any:
+    try:
+        return json.loads(text.lower() if text in ("True", "False", "None") else text)
+    except json.JSONDecodeError:
+        if text == "None":
+            return None
+        raise ConfigError(f"--set {path}={text}: not a number, true, false, null or list") from None
+
+
+def _leaves(values: dict[str, Any], prefix: str = "") -> list[str]:
+    """Dotted paths of everything that is not a nested config."""
+    paths = []
+    for key, value in values.items():
+        paths += _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
+    return paths

@@ -1,0 +1,188 @@
+"""One trial: what determines it, its identity, and running it to a result.
+
+A trial's directory holds
+    job.json        the trial and its provenance (written by the runner)
+    run/            the training run (`hma_jax.training`): log, checkpoints
+    samples.npz     true and predicted frames of a few windows per dataset
+    result.json     written last: a trial with this file is finished
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, TrainConfig, stable_hash, to_dict
+
+if TYPE_CHECKING:
+    from experiments.pipeline import Workspace
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(phase, done, total)."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Everything about a trial that is chosen; `train.seed` also seeds its data order."""
+
+    datasets: tuple[str, ...]  # in the order of the embodiment axis
+    max_trajectories: int | None  # per dataset; None: all
+    evaluated: tuple[str, ...]  # datasets whose validation windows are used
+    model: ModelConfig
+    train: TrainConfig
+    eval: EvalConfig
+    tau: float = 3.0
+    shuffle_actions: bool = False  # the control: actions from another window
+    measure_untrained: bool = False  # also evaluate the model before its first step
+
+    @property
+    def title(self) -> str:
+        """One line that tells this trial from the others of its study."""
+        cap = "all" if self.max_trajectories is None else f"{self.max_trajectories}"
+        control = " · shuffled actions" if self.shuffle_actions else ""
+        return (
+            f"{len(self.datasets)} datasets · {cap} trajectories · width {self.model.width} · "
+            f"seed {self.train.seed}{control}"
+        )
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a trial's numbers depend on besides its own fields."""
+
+    store: str  # hash of the token store
+    manifest: str  # hash of the evaluation manifest
+    tokenizer: str  # identity of the tokenizer
+    code: str  # hash of the sources
+
+
+def trial_id(trial: Trial, provenance: Provenance) -> str:
+    """The name of a trial: equal exactly when everything that determines it is equal."""
+    return stable_hash({"trial": to_dict(trial), "provenance": to_dict(provenance)})
+
+
+@cache
+def source_hash(packages: tuple[str, ...] = ("hma_jax", "data_pipelines")) -> str:
+    """Hash of the sources that a trial runs: `packages` and this file.
+
+    Plots, reports and the command line are left out: changing them re-runs nothing.
+    """
+    root = Path(__file__).resolve().parent.parent
+    files = [p for package in packages for p in sorted((root / package).rglob("*.py"))]
+    return stable_hash(
+        [[p.relative_to(root).as_posix(), p.read_text()] for p in [*files, Path(__file__).resolve()]]
+    )
+
+
+def run_trial(
+    trial: Trial, workspace: Workspace, directory: Path, progress: Progress = lambda *_: None
+) -> dict[str, Any]:
+    """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
+
+    Returns what it writes to result.json. Raises ConfigError, DataError or DivergedError.
+    """
+    import jax
+
+    from data_pipelines.evalset import EvalManifest, eval_batches
+    from data_pipelines.loader import LoaderConfig, make_loader
+    from data_pipelines.store import TokenStore
+    from experiments.machine import describe_machine
+    from hma_jax.evaluation.protocol import evaluate
+    from hma_jax.flops import count_parameters, train_flops_per_window
+    from hma_jax.model import make_model
+    from hma_jax.tokenizers.io import load_tokenizer
+    from hma_jax.training.train import train_model
+
+    store = TokenStore(workspace.store)
+    table = store.embodiment_table(trial.datasets)
+    tokenizer = load_tokenizer(workspace.tokenizer)
+    manifest = EvalManifest.load(workspace.manifest)
+    loader = LoaderConfig(
+        frames=trial.model.frames,
+        batch=trial.train.batch,
+        tau=trial.tau,
+        seed=trial.train.seed,
+        max_trajectories=trial.max_trajectories,
+        datasets=trial.datasets,
+        shuffle_actions=trial.shuffle_actions,
+    )
+
+    def batches() -> Iterator[dict]:
+        return eval_batches(store, table, manifest, trial.eval.batch, trial.evaluated)
+
+    started = time.perf_counter()
+    outcome = train_model(
+        trial.model,
+        table,
+        trial.train,
+        lambda start: make_loader(store, table, loader, start_step=start),
+        mesh=MeshConfig(),
+        run_dir=directory / "run",
+        provenance={"store": store.hash(), "tokenizer": tokenizer.identity, "loader": to_dict(loader)},
+        checkpoint_every=max(trial.train.steps // 5, 1),
+        progress=lambda step, steps, _: progress("train", step, steps),
+    )
+
+    progress("evaluate", 0, 1)
+    measure = partial(
+        evaluate, model_config=trial.model, table=table, tokenizer=tokenizer, config=trial.eval
+    )
+    evaluation = measure(outcome.params, batches=batches())
+    untrained = None
+    if trial.measure_untrained:
+        fresh = make_model(trial.model, table).init(trial.train.seed)
+        untrained = measure(fresh, batches=_first_of_each_dataset(batches())).to_dict()
+
+    write_samples(directory / "samples.npz", evaluation.samples)
+    result = {
+        "evaluation": evaluation.to_dict(),
+        "untrained": untrained,
+        "losses": outcome.losses,
+        "parameters": count_parameters(trial.model, table),
+        "train_flops": train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
+        "run": {
+            "seconds": time.perf_counter() - started,
+            "train_seconds": outcome.seconds,
+            "compile_seconds": outcome.compile_seconds,
+            "machine": describe_machine(jax.devices()),
+            "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
+        },
+    }
+    write_atomically(directory / "result.json", json.dumps(result, indent=1))
+    return result
+
+
+def _first_of_each_dataset(batches: Iterator[dict]) -> Iterator[dict]:
+    """One batch per dataset: enough for a model that has learnt nothing."""
+    seen = set()
+    for batch in batches:
+        if batch["dataset"] not in seen:
+            seen.add(batch["dataset"])
+            yield batch
+
+
+def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:
+    """Stores {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}} as '<dataset>/<kind>'."""
+    import numpy as np
+
+    aside = path.with_suffix(".tmp.npz")
+    np.savez_compressed(
+        aside, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
+    )
+    os.replace(aside, path)
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """A reader sees the old text or the new one, also after a crash."""
+    aside = path.with_name(path.name + ".tmp")
+    with open(aside, "w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, path)
