@@ -276,6 +276,7 @@ class MeshConfig:
     data: int = -1
     fsdp: int = 1
     tensor: int = 1
+    min_shard_size: int = 2**14  # smaller parameters stay whole on every device
 
     def __post_init__(self):
         sizes = (self.data, self.fsdp, self.tensor)

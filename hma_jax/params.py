@@ -76,6 +76,11 @@ def ones(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
     return jnp.ones(shape, dtype)
 
 
+def bias(rngs: nnx.Rngs, shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
+    """Declares a bias: zero at first, never decayed."""
+    return param(rngs, shape, axes, zeros, role="vector", decay=False)
+
+
 def normal(std: float) -> Initializer:
     return lambda key, shape, dtype: std * jax.random.normal(key, shape, dtype)
 

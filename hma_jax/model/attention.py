@@ -1,0 +1,88 @@
+"""Multi-head attention over one axis, with optional keys and values kept from earlier frames."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from hma_jax.config import ModelConfig
+from hma_jax.model.layers import LayerNorm
+from hma_jax.params import bias, param, xavier_uniform
+
+TRUNK_GAIN = 0.1
+"""Xavier gain of every matrix of the trunk and of the modulation (reference section 1.10)."""
+
+
+def attention_scale(config: ModelConfig) -> float:
+    """What multiplies q.k.
+
+    Under muP attention_scale / head width: 8 / I as released, so that logits stay of order one
+    as heads widen; otherwise 1 / sqrt(I).
+    """
+    if config.mup.enabled:
+        return config.mup.attention_scale / config.head_width
+    return config.head_width**-0.5
+
+
+class Attention(nnx.Module):
+    """q, k, v and output projections; the caller says over which axis and what is visible."""
+
+    def __init__(self, rngs: nnx.Rngs, config: ModelConfig):
+        width, heads, head = config.width, config.heads, config.head_width
+        # The fans are those of the fused (3D, D) matrix of the release.
+        init = xavier_uniform(width, 3 * width, TRUNK_GAIN)
+        self.qkv = param(rngs, (width, 3, heads, head), ("D", None, "H", None), init, role="hidden")
+        shape, axes = (3, heads, head), (None, "H", None)
+        self.qkv_bias = bias(rngs, shape, axes) if config.qkv_bias else None
+        init = xavier_uniform(width, width, TRUNK_GAIN)
+        self.out = param(rngs, (heads, head, width), ("H", None, "D"), init, role="hidden")
+        self.out_bias = bias(rngs, (width,), ("D",)) if config.proj_bias else None
+        self.norm = LayerNorm(rngs, head, axis=None) if config.qk_norm else None
+        self.scale = attention_scale(config)
+
+    def project(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """x [..., D] -> q, k, v [..., H, I]; q carries the scale."""
+        qkv = jnp.einsum("...d,dchi->...chi", x, self.qkv.astype(x.dtype))
+        if self.qkv_bias is not None:
+            qkv = qkv + self.qkv_bias.astype(x.dtype)
+        q, k, v = qkv[..., 0, :, :], qkv[..., 1, :, :], qkv[..., 2, :, :]
+        if self.norm is not None:
+            q, k = self.norm(q), self.norm(k)
+        return q * self.scale, k, v
+
+    def project_out(self, y: jax.Array) -> jax.Array:
+        """y [..., H, I] -> [..., D]."""
+        out = jnp.einsum("...hi,hid->...d", y, self.out.astype(y.dtype))
+        return out if self.out_bias is None else out + self.out_bias.astype(y.dtype)
+
+    def over_space(self, x_BTPD: jax.Array) -> jax.Array:
+        """Every token sees every token of its own frame."""
+        q, k, v = self.project(x_BTPD)
+        logits = jnp.einsum("btphi,btshi->bthps", q, k)
+        weights = _softmax(logits)
+        return self.project_out(jnp.einsum("bthps,btshi->btphi", weights, v))
+
+    def over_time(
+        self,
+        x_BTPD: jax.Array,
+        visible: jax.Array,
+        past: tuple[jax.Array, jax.Array] | None,
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Every token sees its own position in other frames, where `visible` allows.
+
+        `past` holds keys and values [B, T_past, P, H, I] of earlier frames. `visible` is
+        bool [T, T_past + T]. Returns the output and the new frames' keys and values.
+        """
+        q, k, v = self.project(x_BTPD)
+        new = (k, v)
+        if past is not None:
+            k = jnp.concatenate([past[0], k], axis=1)
+            v = jnp.concatenate([past[1], v], axis=1)
+        logits = jnp.einsum("btphi,bsphi->bphts", q, k)
+        weights = _softmax(jnp.where(visible, logits, jnp.finfo(logits.dtype).min))
+        return self.project_out(jnp.einsum("bphts,bsphi->btphi", weights, v)), new
+
+
+def _softmax(logits: jax.Array) -> jax.Array:
+    return jax.nn.softmax(logits.astype(jnp.float32), axis=-1).astype(logits.dtype)

@@ -1,0 +1,81 @@
+"""The few layers everything is made of. Each declares its parameters through `params.param`."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from hma_jax.params import Initializer, Role, bias, ones, param, xavier_uniform
+
+BLOCK_EPS = 1e-5
+MODULATION_EPS = 1e-6
+
+
+def normalise(x: jax.Array, eps: float) -> jax.Array:
+    """x with zero mean and unit variance over its last axis; statistics in float32."""
+    x32 = x.astype(jnp.float32)
+    mean = jnp.mean(x32, axis=-1, keepdims=True)
+    centred = x32 - mean
+    variance = jnp.mean(jnp.square(centred), axis=-1, keepdims=True)
+    return (centred * jax.lax.rsqrt(variance + eps)).astype(x.dtype)
+
+
+class LayerNorm(nnx.Module):
+    """Layer norm over one width axis, with gain and bias."""
+
+    def __init__(self, rngs: nnx.Rngs, width: int, axis: str | None = "D", eps: float = BLOCK_EPS):
+        self.gain = param(rngs, (width,), (axis,), ones, role="vector")
+        self.bias = bias(rngs, (width,), (axis,))
+        self.eps = eps
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        return normalise(x, self.eps) * self.gain.astype(x.dtype) + self.bias.astype(x.dtype)
+
+
+class Linear(nnx.Module):
+    """y = x W + b over the last axis. `axes` names W's two dimensions."""
+
+    def __init__(
+        self,
+        rngs: nnx.Rngs,
+        sizes: tuple[int, int],
+        axes: tuple[str, str],
+        *,
+        gain: float,
+        role: Role,
+        with_bias: bool = True,
+    ):
+        init = xavier_uniform(*sizes, gain)
+        self.kernel = param(rngs, sizes, axes, init, role=role)
+        self.bias = bias(rngs, (sizes[1],), (axes[1],)) if with_bias else None
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        y = x @ self.kernel.astype(x.dtype)
+        return y if self.bias is None else y + self.bias.astype(x.dtype)
+
+
+class EmbodimentLinear(nnx.Module):
+    """One linear map per robot. Each example of a batch uses its own robot's slice."""
+
+    def __init__(
+        self,
+        rngs: nnx.Rngs,
+        embodiments: int,
+        sizes: tuple[int, int],
+        axes: tuple[str, str],
+        *,
+        init: Initializer,
+        role: Role,
+    ):
+        self.kernel = param(rngs, (embodiments, *sizes), ("E", *axes), init, role=role)
+        self.bias = bias(rngs, (embodiments, sizes[1]), ("E", axes[1]))
+
+    def __call__(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """x [B, ..., in] -> [B, ..., out]."""
+        kernel = jnp.take(self.kernel.get_value(), embodiment_B, axis=0).astype(x.dtype)
+        offset = jnp.take(self.bias.get_value(), embodiment_B, axis=0).astype(x.dtype)
+        middle = x.shape[1:-1]
+        rows = x.reshape(x.shape[0], -1, x.shape[-1])
+        y = jnp.einsum("bri,bio->bro", rows, kernel) + offset[:, None]
+        return y.reshape(x.shape[0], *middle, y.shape[-1])
