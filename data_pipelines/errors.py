@@ -1,0 +1,32 @@
+"""What goes wrong with data, as exceptions whose message is complete.
+
+Owns the exception types only. A message says what is wrong, where (file and byte offset, or
+dataset, episode and step) and what to do; the command line prints it as it is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class DataError(Exception):
+    """Data that cannot be used."""
+
+
+class CorruptRecordError(DataError):
+    """Bytes in a shard that are not what was written.
+
+    Attributes: `path` of the file, `offset` in bytes of the record's first byte, `reason`.
+    """
+
+    def __init__(self, path: str | Path, offset: int, reason: str):
+        self.path = Path(path)
+        self.offset = offset
+        self.reason = reason
+        super().__init__(
+            f"{path}: corrupt record at byte {offset}: {reason}. "
+            "Fetch the file again, or read the dataset with corrupt='skip' to leave the record out."
+        )
+
+    def __reduce__(self):
+        return type(self), (self.path, self.offset, self.reason)
