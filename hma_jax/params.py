@@ -1,14 +1,15 @@
 """Parameters are declared once, by `param`; everything else is derived from that declaration.
 
 A declaration says shape, logical axes (in the dimension letters), initialiser, muP role and
-whether weight decay applies. From it come the arrays (`init_params`), their sharding
+whether weight decay applies. From it come the arrays (`Declared.init`), their sharding
 (`training.sharding`), the optimiser's multipliers, decay mask and embodiment axis
 (`training.optimizer`), and the counts. Flax NNX modules hold declarations; what is jitted
-are pure functions of the plain nested dict of arrays that `init_params` returns.
+are pure functions of the plain nested dict of arrays that `Declared.init` returns.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from hma_jax.config import require
@@ -27,7 +29,8 @@ Role = Literal["hidden", "input", "output", "vector"]
 """What width does to a parameter (muP): `hidden` has two axes that grow with width, `input`
 and `output` one (from and to a fixed size), `vector` is a bias, a gain or an embedding."""
 
-Initializer = Callable[[jax.Array, tuple[int, ...], Any], jax.Array]
+Initializer = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
+"""init(rng, shape) -> float32 array."""
 
 LAYER_AXIS = "N"
 EMBODIMENT_AXIS = "E"
@@ -41,6 +44,7 @@ class ParamSpec:
     axes: tuple[str | None, ...]
     role: Role
     decay: bool
+    init: Initializer
 
     @property
     def embodiment_axis(self) -> int | None:
@@ -53,7 +57,6 @@ class ParamSpec:
 
 
 def param(
-    rngs: nnx.Rngs,
     shape: tuple[int, ...],
     axes: tuple[str | None, ...],
     init: Initializer,
@@ -61,67 +64,73 @@ def param(
     role: Role,
     decay: bool = True,
 ) -> nnx.Param:
-    """Declares one float32 parameter. `axes` names each dimension of `shape` (None: unnamed)."""
+    """Declares one float32 parameter. `axes` names each dimension of `shape` (None: unnamed).
+
+    No array is made here: `Declared.init` makes them all.
+    """
     require(len(shape) == len(axes), f"a parameter of shape {shape} needs {len(shape)} axes, got {axes}")
-    return nnx.Param(init(rngs.params(), shape, jnp.float32), axes=axes, role=role, decay=decay)
+    return nnx.Param(jnp.zeros(shape, jnp.float32), axes=axes, init=init, role=role, decay=decay)
 
 
-def zeros(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
-    del key
-    return jnp.zeros(shape, dtype)
-
-
-def ones(key: jax.Array, shape: tuple[int, ...], dtype: Any) -> jax.Array:
-    del key
-    return jnp.ones(shape, dtype)
-
-
-def bias(rngs: nnx.Rngs, shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
+def bias(shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
     """Declares a bias: zero at first, never decayed."""
-    return param(rngs, shape, axes, zeros, role="vector", decay=False)
+    return param(shape, axes, zeros, role="vector", decay=False)
+
+
+def zeros(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    del rng
+    return np.zeros(shape, np.float32)
+
+
+def ones(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    del rng
+    return np.ones(shape, np.float32)
+
+
+def uniform(rng: np.random.Generator, shape: tuple[int, ...], bound: float | np.ndarray) -> np.ndarray:
+    """Uniform in +-bound, which may vary over the array."""
+    return ((2 * rng.random(shape, np.float32) - 1) * bound).astype(np.float32)
 
 
 def normal(std: float) -> Initializer:
-    return lambda key, shape, dtype: std * jax.random.normal(key, shape, dtype)
+    return lambda rng, shape: np.float32(std) * rng.standard_normal(shape, np.float32)
 
 
 def xavier_uniform(fan_in: int, fan_out: int, gain: float = 1.0) -> Initializer:
     """Uniform in +-gain * sqrt(6 / (fan_in + fan_out)).
 
-    Fans are given, not read off the shape: a fused or per-embodiment array has more axes than
-    the matrix it stands for.
+    Fans are given, not read off the shape: a fused, stacked or per-embodiment array has more
+    axes than the matrix it stands for.
     """
     bound = gain * math.sqrt(6.0 / (fan_in + fan_out))
-    return lambda key, shape, dtype: jax.random.uniform(key, shape, dtype, -bound, bound)
+    return lambda rng, shape: uniform(rng, shape, bound)
 
 
-def stack(make: Callable[[nnx.Rngs], nnx.Module], count: int, rngs: nnx.Rngs) -> nnx.Module:
+def stack(make: Callable[[], nnx.Module], count: int) -> nnx.Module:
     """`count` modules as one whose parameters have a leading layer axis N."""
-
-    @nnx.split_rngs(splits=count)
-    @nnx.vmap(in_axes=(0,), out_axes=0)
-    def build(rngs: nnx.Rngs) -> nnx.Module:
-        return make(rngs)
-
-    return build(rngs)
+    return nnx.vmap(lambda _: make(), in_axes=0, out_axes=0)(jnp.arange(count))
 
 
 @dataclass(frozen=True)
 class Declared:
     """A module's static structure and the specs of its parameters, without arrays."""
 
-    make: Callable[[nnx.Rngs], nnx.Module]
     graphdef: nnx.GraphDef
     specs: Params  # nested dict of ParamSpec
 
-    def init(self, seed: int) -> Params:
-        """Arrays for every declaration, a function of `seed` alone."""
+    def init(self, seed: int, shardings: Params | None = None) -> Params:
+        """Arrays for every declaration.
 
-        def build(key: jax.Array) -> Params:
-            state = nnx.state(self.make(nnx.Rngs(params=key)), nnx.Param)
-            return _map_variables(state, lambda variable: variable.get_value())
+        Each is a function of (seed, its path) alone, made on the host: adding a parameter does
+        not change the others, nothing is compiled, and a mesh does not matter.
+        """
 
-        return jax.jit(build)(jax.random.key(seed))
+        def make(path: tuple[Any, ...], spec: ParamSpec) -> np.ndarray:
+            words = np.frombuffer(hashlib.sha256(path_name(path).encode()).digest(), np.uint32)
+            return spec.init(np.random.default_rng([seed, *words.tolist()]), spec.shape)
+
+        arrays = jax.tree.map_with_path(make, self.specs, is_leaf=is_spec)
+        return jax.device_put(arrays, shardings)
 
     def merge(self, params: Params) -> nnx.Module:
         """The module around `params`; call it inside the traced function."""
@@ -129,18 +138,24 @@ class Declared:
 
     def leaves(self) -> dict[str, ParamSpec]:
         """'path/of/parameter' -> spec, in a fixed order."""
-        flat, _ = jax.tree.flatten_with_path(self.specs, is_leaf=lambda s: isinstance(s, ParamSpec))
+        flat = jax.tree.leaves_with_path(self.specs, is_leaf=is_spec)
         return {path_name(path): spec for path, spec in flat}
 
     def count(self) -> int:
         return sum(spec.size for spec in self.leaves().values())
 
 
-def declare(make: Callable[[nnx.Rngs], nnx.Module]) -> Declared:
+def declare(make: Callable[[], nnx.Module]) -> Declared:
     """Traces `make` abstractly (no arrays are allocated) and reads its declarations."""
-    module = nnx.eval_shape(lambda: make(nnx.Rngs(params=0)))
-    graphdef, state, _ = nnx.split(module, nnx.Param, ...)
-    return Declared(make, graphdef, _map_variables(state, _spec))
+    graphdef, state, _ = nnx.split(nnx.eval_shape(make), nnx.Param, ...)
+    # List indices become strings: checkpoints keep dictionaries with string keys only.
+    flat = {tuple(map(str, path)): _spec(variable) for path, variable in nnx.to_flat_state(state)}
+    return Declared(graphdef, nnx.traversals.unflatten_mapping(flat))
+
+
+def is_spec(leaf: Any) -> bool:
+    """For `is_leaf` when mapping over `Declared.specs`."""
+    return isinstance(leaf, ParamSpec)
 
 
 def merge(graphdef: nnx.GraphDef, params: Params) -> nnx.Module:
@@ -162,10 +177,4 @@ def _spec(variable: nnx.Param) -> ParamSpec:
     axes = tuple(variable.axes)
     if len(shape) == len(axes) + 1:  # made by `stack`
         axes = (LAYER_AXIS, *axes)
-    return ParamSpec(shape, axes, variable.role, variable.decay)
-
-
-def _map_variables(state: nnx.State, fn: Callable[[nnx.Param], Any]) -> Params:
-    # List indices become strings: checkpoints keep dictionaries with string keys only.
-    flat = {tuple(str(k) for k in path): fn(variable) for path, variable in nnx.to_flat_state(state)}
-    return nnx.traversals.unflatten_mapping(flat)
+    return ParamSpec(shape, axes, variable.role, variable.decay, variable.init)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from hma_jax.config import ModelConfig
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.model.attention import TRUNK_GAIN
 from hma_jax.model.layers import BLOCK_EPS, MODULATION_EPS, EmbodimentLinear, normalise
-from hma_jax.params import bias, ones, param, xavier_uniform
+from hma_jax.params import bias, ones, param, uniform, xavier_uniform
 
 STEM_GAIN = 0.01
 """Xavier gain of the stems as trained by the release; the paper's text says 0.1 for "action
@@ -25,28 +26,24 @@ projectors", which matches the modulation (reference section 1.10)."""
 class Stem(nnx.Module):
     """Raw action chunks of any robot to features: Linear, layer norm, ReLU, Linear."""
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig, table: EmbodimentTable):
+    def __init__(self, config: ModelConfig, table: EmbodimentTable):
         size, width = table.size, config.width
         self.table = table
 
-        def first_layer(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
-            # Each robot's slice has the fan-in of its own chunk; the padded rows are zero and
+        def first_layer(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+            # Each robot's slice has the fan-in of its own chunk. Rows of padding are zero and
             # stay so, because padded inputs are zero.
-            keys = jax.random.split(key, size)
-            slices = []
-            for k, entry in zip(keys, table.entries, strict=True):
-                init = xavier_uniform(entry.chunk, width, STEM_GAIN)
-                own = init(k, (entry.chunk, width), dtype)
-                slices.append(jnp.pad(own, ((0, shape[1] - entry.chunk), (0, 0))))
-            return jnp.stack(slices)
+            chunk_E = np.array([entry.chunk for entry in table.entries])[:, None, None]
+            own = np.arange(shape[1])[:, None] < chunk_E
+            return uniform(rng, shape, np.where(own, STEM_GAIN * np.sqrt(6 / (chunk_E + width)), 0.0))
 
         self.into = EmbodimentLinear(
-            rngs, size, (table.action_width, width), ("U", "D"), init=first_layer, role="input"
+            size, (table.action_width, width), ("U", "D"), init=first_layer, role="input"
         )
-        self.gain = param(rngs, (size, width), ("E", "D"), ones, role="vector")
-        self.bias = bias(rngs, (size, width), ("E", "D"))
+        self.gain = param((size, width), ("E", "D"), ones, role="vector")
+        self.bias = bias((size, width), ("E", "D"))
         init = xavier_uniform(width, width, STEM_GAIN)
-        self.out = EmbodimentLinear(rngs, size, (width, width), ("D", "D_out"), init=init, role="hidden")
+        self.out = EmbodimentLinear(size, (width, width), ("D", "D_out"), init=init, role="hidden")
 
     def __call__(self, actions_BTU: jax.Array, embodiment_B: jax.Array, dtype: jnp.dtype) -> jax.Array:
         """Raw, zero-padded actions -> features a_BTD in `dtype`."""
@@ -62,15 +59,15 @@ class Stem(nnx.Module):
 class Modulation(nnx.Module):
     """x -> W_o[LN(x) (1 + scale) + shift] with (shift, scale) from the action feature."""
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig, embodiments: int):
+    def __init__(self, config: ModelConfig, embodiments: int):
         width = config.width
         init = xavier_uniform(width, width, TRUNK_GAIN)
         wide = xavier_uniform(width, 2 * width, TRUNK_GAIN)
         square, double = (width, width), (width, 2 * width)
         axes = ("D", "D_out")
-        self.hidden = EmbodimentLinear(rngs, embodiments, square, axes, init=init, role="hidden")
-        self.shift_scale = EmbodimentLinear(rngs, embodiments, double, axes, init=wide, role="hidden")
-        self.out = EmbodimentLinear(rngs, embodiments, square, axes, init=init, role="hidden")
+        self.hidden = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")
+        self.shift_scale = EmbodimentLinear(embodiments, double, axes, init=wide, role="hidden")
+        self.out = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")
 
     def __call__(self, x_BTPD: jax.Array, action_BTD: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         both = self.shift_scale(jax.nn.silu(self.hidden(action_BTD, embodiment_B)), embodiment_B)

@@ -28,17 +28,17 @@ def attention_scale(config: ModelConfig) -> float:
 class Attention(nnx.Module):
     """q, k, v and output projections; the caller says over which axis and what is visible."""
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig):
+    def __init__(self, config: ModelConfig):
         width, heads, head = config.width, config.heads, config.head_width
         # The fans are those of the fused (3D, D) matrix of the release.
         init = xavier_uniform(width, 3 * width, TRUNK_GAIN)
-        self.qkv = param(rngs, (width, 3, heads, head), ("D", None, "H", None), init, role="hidden")
+        self.qkv = param((width, 3, heads, head), ("D", None, "H", None), init, role="hidden")
         shape, axes = (3, heads, head), (None, "H", None)
-        self.qkv_bias = bias(rngs, shape, axes) if config.qkv_bias else None
+        self.qkv_bias = bias(shape, axes) if config.qkv_bias else None
         init = xavier_uniform(width, width, TRUNK_GAIN)
-        self.out = param(rngs, (heads, head, width), ("H", None, "D"), init, role="hidden")
-        self.out_bias = bias(rngs, (width,), ("D",)) if config.proj_bias else None
-        self.norm = LayerNorm(rngs, head, axis=None) if config.qk_norm else None
+        self.out = param((heads, head, width), ("H", None, "D"), init, role="hidden")
+        self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
+        self.norm = LayerNorm(head, axis=None) if config.qk_norm else None
         self.scale = attention_scale(config)
 
     def project(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

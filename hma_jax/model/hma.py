@@ -40,10 +40,10 @@ def causal(frames: int) -> jax.Array:
 class TokenEmbed(nnx.Module):
     """Sum of one table per factor; masked positions get one learned vector instead."""
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig):
+    def __init__(self, config: ModelConfig):
         q, v, d = config.factors, config.factor_vocab, config.width
-        self.tables = param(rngs, (q, v, d), ("Q", "V", "D"), normal(1.0), role="vector")
-        self.mask = param(rngs, (d,), ("D",), zeros, role="vector")
+        self.tables = param((q, v, d), ("Q", "V", "D"), normal(1.0), role="vector")
+        self.mask = param((d,), ("D",), zeros, role="vector")
         self.mask_id = config.mask_id
 
     def __call__(self, tokens: jax.Array, dtype: jnp.dtype) -> jax.Array:
@@ -57,16 +57,15 @@ class TokenEmbed(nnx.Module):
 class HMA(nnx.Module):
     """The discrete model with `concat+modulate` conditioning."""
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig, table: EmbodimentTable):
+    def __init__(self, config: ModelConfig, table: EmbodimentTable):
         self.config = config
-        self.embed = TokenEmbed(rngs, config)
+        self.embed = TokenEmbed(config)
         shape = (config.frames, config.frame_tokens, config.width)
-        self.positions = param(rngs, shape, ("T", "P", "D"), zeros, role="vector")
-        self.stem = Stem(rngs, config, table)
-        self.trunk = Trunk(rngs, config, table.size)
+        self.positions = param(shape, ("T", "P", "D"), zeros, role="vector")
+        self.stem = Stem(config, table)
+        self.trunk = Trunk(config, table.size)
         # muP's read-out: its input is divided by m, its initial weights multiplied by sqrt(m).
         self.readout = Linear(
-            rngs,
             (config.width, config.factors * config.factor_vocab),
             ("D", "V"),
             gain=READOUT_GAIN * config.width_multiplier**0.5,
@@ -118,4 +117,4 @@ class HMA(nnx.Module):
 
 def declare_model(config: ModelConfig, table: EmbodimentTable) -> Declared:
     """The model's declarations; see `params.Declared` for init, merge and count."""
-    return declare(lambda rngs: HMA(rngs, config, table))
+    return declare(lambda: HMA(config, table))

@@ -24,9 +24,9 @@ def normalise(x: jax.Array, eps: float) -> jax.Array:
 class LayerNorm(nnx.Module):
     """Layer norm over one width axis, with gain and bias."""
 
-    def __init__(self, rngs: nnx.Rngs, width: int, axis: str | None = "D", eps: float = BLOCK_EPS):
-        self.gain = param(rngs, (width,), (axis,), ones, role="vector")
-        self.bias = bias(rngs, (width,), (axis,))
+    def __init__(self, width: int, axis: str | None = "D", eps: float = BLOCK_EPS):
+        self.gain = param((width,), (axis,), ones, role="vector")
+        self.bias = bias((width,), (axis,))
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -38,7 +38,6 @@ class Linear(nnx.Module):
 
     def __init__(
         self,
-        rngs: nnx.Rngs,
         sizes: tuple[int, int],
         axes: tuple[str, str],
         *,
@@ -47,8 +46,8 @@ class Linear(nnx.Module):
         with_bias: bool = True,
     ):
         init = xavier_uniform(*sizes, gain)
-        self.kernel = param(rngs, sizes, axes, init, role=role)
-        self.bias = bias(rngs, (sizes[1],), (axes[1],)) if with_bias else None
+        self.kernel = param(sizes, axes, init, role=role)
+        self.bias = bias((sizes[1],), (axes[1],)) if with_bias else None
 
     def __call__(self, x: jax.Array) -> jax.Array:
         y = x @ self.kernel.astype(x.dtype)
@@ -60,7 +59,6 @@ class EmbodimentLinear(nnx.Module):
 
     def __init__(
         self,
-        rngs: nnx.Rngs,
         embodiments: int,
         sizes: tuple[int, int],
         axes: tuple[str, str],
@@ -68,8 +66,8 @@ class EmbodimentLinear(nnx.Module):
         init: Initializer,
         role: Role,
     ):
-        self.kernel = param(rngs, (embodiments, *sizes), ("E", *axes), init, role=role)
-        self.bias = bias(rngs, (embodiments, sizes[1]), ("E", axes[1]))
+        self.kernel = param((embodiments, *sizes), ("E", *axes), init, role=role)
+        self.bias = bias((embodiments, sizes[1]), ("E", axes[1]))
 
     def __call__(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""

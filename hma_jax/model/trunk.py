@@ -29,17 +29,17 @@ class Block(nnx.Module):
     attention: the released checkpoints were trained so.
     """
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig, embodiments: int):
+    def __init__(self, config: ModelConfig, embodiments: int):
         # With qk_norm the release drops both block norms (reference section 1.4).
-        self.norm_space = None if config.qk_norm else LayerNorm(rngs, config.width)
-        self.space = Attention(rngs, config)
-        self.modulation = Modulation(rngs, config, embodiments)
-        self.time = Attention(rngs, config)
-        self.norm_mlp = None if config.qk_norm else LayerNorm(rngs, config.width)
+        self.norm_space = None if config.qk_norm else LayerNorm(config.width)
+        self.space = Attention(config)
+        self.modulation = Modulation(config, embodiments)
+        self.time = Attention(config)
+        self.norm_mlp = None if config.qk_norm else LayerNorm(config.width)
         sizes = (config.width, config.mlp_width)
         options = {"gain": TRUNK_GAIN, "role": "hidden", "with_bias": config.mlp_bias}
-        self.mlp_in = Linear(rngs, sizes, ("D", "F"), **options)
-        self.mlp_out = Linear(rngs, sizes[::-1], ("F", "D"), **options)
+        self.mlp_in = Linear(sizes, ("D", "F"), **options)
+        self.mlp_out = Linear(sizes[::-1], ("F", "D"), **options)
 
     def __call__(
         self,
@@ -63,8 +63,8 @@ class Block(nnx.Module):
 class Trunk(nnx.Module):
     """The part all robots share, but for the modulation slices inside its blocks."""
 
-    def __init__(self, rngs: nnx.Rngs, config: ModelConfig, embodiments: int):
-        self.blocks = stack(lambda r: Block(r, config, embodiments), config.layers, rngs)
+    def __init__(self, config: ModelConfig, embodiments: int):
+        self.blocks = stack(lambda: Block(config, embodiments), config.layers)
         self.remat = config.remat
 
     def __call__(
