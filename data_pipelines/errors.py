@@ -13,7 +13,11 @@ class DataError(Exception):
     """Data that cannot be used."""
 
 
-class CorruptRecordError(DataError):
+class EpisodeError(DataError):
+    """One episode is unusable; the policy corrupt='skip' may leave it out."""
+
+
+class CorruptRecordError(EpisodeError):
     """Bytes in a shard that are not what was written.
 
     Attributes: `path` of the file, `offset` in bytes of the record's first byte, `reason`.

@@ -1,0 +1,251 @@
+"""An RLDS dataset directory as random-access episodes, without TensorFlow.
+
+Owns reading what tfds wrote: schema, shards, records, one camera and the action of an
+episode. Knows neither tokenizers nor windows nor which dataset has which camera (see
+`registry`). tfds is asked for metadata only; records go through `tfrecord` and `example`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
+from data_pipelines.example import Feature, parse_example
+from data_pipelines.images import decode_image
+from data_pipelines.schema import closest, listing, read_metadata, resolve_version, step_key
+from data_pipelines.tfrecord import read_record, scan_shard
+from hma_jax.config import ConfigError, require
+
+SUCCESS_KEY = "episode_metadata/success"
+"""Optional episode flag that says whether the behaviour reached its goal."""
+
+MAX_SKIPPED = 16
+"""Default bound of the policy corrupt='skip'."""
+
+
+@dataclass(frozen=True)
+class RawEpisode:
+    """One episode as recorded. `images`: every `frame_step`-th of the N native frames."""
+
+    index: int
+    images: list[np.ndarray]  # uint8 [H, W, 3] each
+    actions: np.ndarray  # float32 [N, A], native rate, raw units
+    success: bool | None
+
+    @property
+    def steps(self) -> int:
+        """N, native frames."""
+        return len(self.actions)
+
+
+class RldsDataset:
+    """Random access to the episodes of one split.
+
+    `directory` is a version directory (`<name>/1.0.0`) or its parent, then the newest
+    version is taken. Shards are indexed when the object is made. Thread-safe; pickles.
+
+    Damage: with corrupt="raise" every damaged shard or record is an error. With "skip",
+    what a damaged shard still holds is indexed, `skip` accepts unusable episodes, and all
+    losses are listed in `skipped`; more than `max_skipped` of them raise DataError.
+
+    Raises DataError for a directory that is no dataset, missing or damaged shards and a
+    record count that contradicts dataset_info.json; ConfigError for an unknown split.
+    """
+
+    def __init__(
+        self,
+        directory: str | Path,
+        split: str = "train",
+        *,
+        corrupt: Literal["raise", "skip"] = "raise",
+        max_skipped: int = MAX_SKIPPED,
+    ):
+        require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
+        self.directory = resolve_version(directory)
+        self.split = split
+        self.corrupt = corrupt
+        self.max_skipped = max_skipped
+        self.skipped: dict[str, int] = {}  # reason -> episodes lost
+        meta = read_metadata(self.directory, split)
+        self.name, self.version = meta.name, meta.version
+        self.features = meta.features
+        self._index(meta.shards, meta.shard_lengths)
+
+    def __len__(self) -> int:
+        return len(self._lengths)
+
+    def fingerprint(self) -> str:
+        """Hash over the shards' names and sizes and the length of every record."""
+        digest = hashlib.sha256()
+        for path, size in zip(self._paths, self._sizes, strict=True):
+            digest.update(f"{path.name}:{size};".encode())
+        digest.update(self._lengths.astype("<i8").tobytes())
+        return digest.hexdigest()[:16]
+
+    # --- episodes ----------------------------------------------------------------------------
+
+    def episode(
+        self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1
+    ) -> RawEpisode:
+        """Episode `i`: one camera, the actions of `action_keys` concatenated, the success flag.
+
+        Keys are relative to a step, as in features.json: `observation/image_0`, `action`,
+        `action/arm`. Raises ConfigError for keys that the dataset lacks, CorruptRecordError
+        for damaged bytes and EpisodeError for contents that cannot be used.
+        """
+        self.check_keys(image_key, action_keys)
+        image_key, action_keys = step_key(image_key), [step_key(k) for k in action_keys]
+        record = self.record(i, [image_key, *action_keys, SUCCESS_KEY])
+        encoded = record.get(image_key) or []
+        actions = self._actions(i, record, action_keys, steps=len(encoded))
+        images = [self._image(i, image_key, t, encoded) for t in range(0, len(encoded), frame_step)]
+        success = record.get(SUCCESS_KEY)
+        known = success is not None and len(success) == 1
+        return RawEpisode(i, images, actions, bool(success[0]) if known else None)
+
+    def frames(
+        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]
+    ) -> list[np.ndarray]:
+        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers."""
+        self.check_keys(image_key, ())
+        image_key = step_key(image_key)
+        encoded = self.record(i, [image_key]).get(image_key) or []
+        if not encoded:
+            raise EpisodeError(f"{self._where(i)}: it has no frames in {image_key!r}; leave it out")
+        return [self._image(i, image_key, t, encoded) for t in choose(len(encoded))]
+
+    def record(self, i: int, keys: Sequence[str] | None = None) -> dict[str, Feature]:
+        """The flat features of episode `i`, as `example.parse_example` gives them."""
+        path, offset, length = self._place(i)
+        payload = read_record(path, offset, length)
+        try:
+            return parse_example(payload, keys)
+        except DataError as error:
+            raise CorruptRecordError(path, offset, str(error)) from error
+
+    def check_keys(
+        self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None
+    ) -> None:
+        """Raises ConfigError unless the camera and the action fields exist, with these sizes."""
+        cameras = [k for k, f in self.features.items() if f.image]
+        numbers = [k for k, f in self.features.items() if f.size and "action" in k]
+        if step_key(image_key) not in self.features:
+            raise ConfigError(
+                f"{self.name}: no image {image_key!r} in {self.directory / 'features.json'}; "
+                f"images there: {listing(cameras)}{closest(image_key, cameras)}. Correct image_key."
+            )
+        require(
+            self.features[step_key(image_key)].image,
+            f"{self.name}: {image_key!r} is not an image; images: {listing(cameras)}. Correct image_key.",
+        )
+        for n, key in enumerate(action_keys):
+            feature = self.features.get(step_key(key))
+            if feature is None or not feature.size:
+                raise ConfigError(
+                    f"{self.name}: no numeric field {key!r} in {self.directory / 'features.json'}; "
+                    f"action fields there: {listing(numbers)}{closest(key, numbers)}. Correct action_keys."
+                )
+            if action_dims is not None and feature.size != action_dims[n]:
+                raise ConfigError(
+                    f"{self.name}: field {key!r} has {feature.size} values per step in "
+                    f"{self.directory / 'features.json'}, but {action_dims[n]} were expected. "
+                    "Correct action_dims, or read the version of the dataset it was written for."
+                )
+
+    def skip(self, error: EpisodeError) -> None:
+        """Counts an unusable episode, or raises `error` under the policy corrupt='raise'."""
+        if self.corrupt == "raise":
+            raise error
+        self._lose(str(error), 1)
+
+    # --- inside ------------------------------------------------------------------------------
+
+    def _index(self, shards: list[Path], expected: list[int]) -> None:
+        offsets, lengths, shard_of, sizes = [], [], [], []
+        for n, (path, count) in enumerate(zip(shards, expected, strict=True)):
+            try:
+                index, damage = scan_shard(path)
+            except DataError as error:
+                if self.corrupt == "raise":
+                    raise
+                self._lose(str(error), count)
+                sizes.append(0)
+                continue
+            if damage is not None and self.corrupt == "raise":
+                raise damage
+            self._check_count(path, len(index), count, damage)
+            offsets.append(index.offsets)
+            lengths.append(index.lengths)
+            shard_of.append(np.full(len(index), n, np.int32))
+            sizes.append(path.stat().st_size)
+        self._paths, self._sizes = shards, sizes
+        self._offsets = np.concatenate(offsets or [np.zeros(0, np.int64)])
+        self._lengths = np.concatenate(lengths or [np.zeros(0, np.int64)])
+        self._shard_of = np.concatenate(shard_of or [np.zeros(0, np.int32)])
+        if not len(self):
+            raise DataError(f"{self.directory}: split {self.split!r} has no readable episode.")
+
+    def _check_count(self, path: Path, found: int, expected: int, damage: Exception | None) -> None:
+        if found == expected:
+            return
+        empty = ": the file is empty" if path.stat().st_size == 0 else ""
+        message = (
+            f"{path}: {found} records, but dataset_info.json says {expected}{empty}. "
+            "Fetch the shard again, or restore the dataset_info.json it was written with."
+        )
+        if self.corrupt == "raise" or found > expected:
+            raise DataError(message)
+        self._lose(str(damage or message), expected - found)
+
+    def _lose(self, reason: str, episodes: int) -> None:
+        self.skipped[reason] = self.skipped.get(reason, 0) + episodes
+        lost = sum(self.skipped.values())
+        if lost > self.max_skipped:
+            raise DataError(
+                f"{self.name}: {lost} episodes are unusable, more than max_skipped={self.max_skipped}. "
+                f"The last: {reason}"
+            )
+
+    def _place(self, i: int) -> tuple[Path, int, int]:
+        if not 0 <= i < len(self):
+            raise IndexError(f"{self.name}: episode {i} of {len(self)}")
+        return self._paths[self._shard_of[i]], int(self._offsets[i]), int(self._lengths[i])
+
+    def _where(self, i: int) -> str:
+        path, offset, _ = self._place(i)
+        return f"{self.name}, episode {i} ({path.name}, byte {offset})"
+
+    def _image(self, i: int, key: str, step: int, encoded: list[bytes]) -> np.ndarray:
+        try:
+            return decode_image(encoded[step])
+        except ValueError as error:
+            raise EpisodeError(
+                f"{self._where(i)}: step {step} of {key!r} cannot be decoded: {error}. "
+                "Repair the episode, or read with corrupt='skip'."
+            ) from error
+
+    def _actions(self, i: int, record: dict[str, Feature], keys: list[str], steps: int) -> np.ndarray:
+        columns = []
+        for key in keys:
+            values, size = record.get(key, []), self.features[key].size
+            if isinstance(values, list) or len(values) != steps * size or not steps:
+                raise EpisodeError(
+                    f"{self._where(i)}: {key!r} has {len(values)} values, but {steps} frames of "
+                    f"{size} need {steps * size}. Repair the episode, or read with corrupt='skip'."
+                )
+            values = values.reshape(steps, size).astype(np.float32)
+            finite = np.isfinite(values).all(axis=1)
+            if not finite.all():
+                step = int(np.flatnonzero(~finite)[0])
+                raise EpisodeError(
+                    f"{self._where(i)}: {key!r} is not finite at step {step}: {values[step].tolist()}. "
+                    "Repair the episode, or read with corrupt='skip'."
+                )
+            columns.append(values)
+        return np.concatenate(columns, axis=1)
