@@ -1,0 +1,141 @@
+"""Making the suite: which datasets are missing, in which processes, all or nothing each.
+
+Bytes depend on the table, scale and seed, never on the number of workers.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import zlib
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from data_pipelines.suite.embodiments import EMBODIMENTS
+from data_pipelines.suite.spec import EmbodimentSpec
+from data_pipelines.suite.write import VERSION, write_dataset
+from hma_jax.config import ConfigError, require
+
+GENERATOR = 1
+"""Raise it when simulation, rendering or encoding change: older datasets are then remade."""
+
+MIN_EPISODES = 8
+"""At any scale: enough for a held-out split."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with (name of the dataset just finished or found complete, how many are, of how many)."""
+
+
+def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
+    """Specs by name, in the given order; all of them for None. ConfigError for unknown names."""
+    if names is None:
+        return EMBODIMENTS
+    known = {spec.name: spec for spec in EMBODIMENTS}
+    unknown = [n for n in names if n not in known]
+    require(not unknown, f"unknown embodiment(s) {', '.join(unknown)}; the suite has {', '.join(known)}")
+    return tuple(known[n] for n in names)
+
+
+def episode_count(spec: EmbodimentSpec, scale: float) -> int:
+    return max(MIN_EPISODES, round(spec.episodes * scale))
+
+
+def fingerprint(spec: EmbodimentSpec, scale: float, seed: int) -> str:
+    """Hash of everything the bytes of this dataset depend on."""
+    text = repr((GENERATOR, spec, episode_count(spec, scale), seed))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def is_complete(directory: Path, mark: str) -> bool:
+    """Whether `directory` holds a dataset with this fingerprint and all of its shards."""
+    try:
+        metadata = json.loads((directory / "metadata.json").read_text())
+        info = json.loads((directory / "dataset_info.json").read_text())
+    except (OSError, ValueError):
+        return False
+    shards = len(info["splits"][0]["shardLengths"])
+    return metadata.get("fingerprint") == mark and len(list(directory.glob("*.tfrecord-*"))) == shards
+
+
+def generate_suite(
+    root: str | Path,
+    *,
+    scale: float = 1.0,
+    seed: int = 0,
+    names: Sequence[str] | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
+
+    `scale` multiplies the episode counts of the table. Datasets already complete with the
+    same fingerprint are left as they are, others are remade; each appears all at once.
+    Raises ConfigError for bad arguments or a root that cannot be written.
+    """
+    require(scale > 0, f"suite scale must be positive, got {scale}")
+    require(workers >= 1, f"suite workers must be at least 1, got {workers}")
+    specs, root = select(names), Path(root)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the suite's directory {root}: {error.strerror}") from error
+    if not os.access(root, os.W_OK):
+        raise ConfigError(f"cannot write to the suite's directory {root}; choose another or fix its permissions")
+
+    paths = [root / spec.name / VERSION for spec in specs]
+    missing = []
+    finished = 0
+    for spec, path in zip(specs, paths, strict=True):
+        if is_complete(path, fingerprint(spec, scale, seed)):
+            finished += 1
+            if progress:
+                progress(spec.name, finished, len(specs))
+        else:
+            missing.append(spec)
+    missing.sort(key=lambda s: -s.episodes * s.hz * len(s.cameras))  # the longest first
+
+    def report(name: str) -> None:
+        nonlocal finished
+        finished += 1
+        if progress:
+            progress(name, finished, len(specs))
+
+    if workers == 1 or len(missing) <= 1:
+        for spec in missing:
+            _make(spec.name, root, scale, seed)
+            report(spec.name)
+        return paths
+    # Spawned, not forked: the caller may have started threads (JAX has).
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context) as pool:
+        jobs = {pool.submit(_make, spec.name, root, scale, seed): spec.name for spec in missing}
+        for job in as_completed(jobs):
+            job.result()
+            report(jobs[job])
+    return paths
+
+
+def _make(name: str, root: Path, scale: float, seed: int) -> None:
+    """One dataset: written aside, then renamed into place."""
+    (spec,) = select([name])
+    final = root / name / VERSION
+    aside = root / name / f".{VERSION}.incomplete.{os.getpid()}"
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        write_dataset(
+            spec,
+            aside,
+            episodes=episode_count(spec, scale),
+            seed=zlib.crc32(f"{seed}/{name}".encode()),
+            metadata={"fingerprint": fingerprint(spec, scale, seed), "generator": GENERATOR, "seed": seed},
+        )
+        if final.exists():
+            shutil.rmtree(final)
+        os.replace(aside, final)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)

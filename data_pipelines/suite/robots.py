@@ -1,0 +1,188 @@
+"""Builders of the robots that `embodiments` lists: arms, gantries, rovers, grippers, hands.
+
+Each returns a `Body`; `attach` and `join` combine them. Lengths in world units (the image is
+2 wide), angles in radians, speeds per second.
+"""
+
+from __future__ import annotations
+
+import math
+
+from data_pipelines.suite.bodies import Body, Joint, Link, attach
+
+
+def arm(
+    lengths: tuple[float, ...],
+    *,
+    base: tuple[float, float] = (0.0, 0.0),
+    heading: float = 90.0,
+    radius: float = 0.15,
+    taper: float = 0.85,
+    bend: float = 120.0,
+    swing: float | None = None,
+    speed: float = 2.4,
+    paint: int = 0,
+) -> Body:
+    """A chain of revolute links. `heading` (degrees) is straight out; the first joint swings
+    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner."""
+    swing = bend if swing is None else swing
+    links, joints = [], []
+    for i, length in enumerate(lengths):
+        links.append(
+            Link(
+                parent=i - 1,
+                joint=i,
+                angle=math.radians(heading) if i == 0 else 0.0,
+                mount=base if i == 0 else (0.0, 0.0),
+                length=length,
+                radius=radius * taper**i,
+                paint=(paint + i) % 3,
+                touches=i == len(lengths) - 1,
+            )
+        )
+        limit = math.radians(swing if i == 0 else bend)
+        joints.append(Joint(-limit, limit, speed))
+    return Body(tuple(links), tuple(joints), (len(links) - 1,), (-1,))
+
+
+def gripper(size: float = 0.2, radius: float = 0.06, paint: int = 2) -> Body:
+    """Two fingers on one joint: 0 closed, 1 open. The tool is the point between them."""
+    links = [Link(length=0.6 * size)]
+    for side in (1, -1):
+        links.append(
+            Link(
+                joint=0,
+                gain=0.75 * side,
+                angle=0.12 * side,
+                mount=(0.0, 0.35 * size * side),
+                length=size,
+                radius=radius,
+                paint=paint,
+            )
+        )
+    return Body(tuple(links), (Joint(0.0, 1.0, 4.0),), (0,), (0,))
+
+
+def finger(
+    phalanges: int,
+    *,
+    mount: tuple[float, float] = (0.0, 0.0),
+    angle: float = 0.0,
+    length: float = 0.25,
+    radius: float = 0.07,
+    curl: tuple[float, float] = (-0.2, 1.3),
+    coupled: bool = False,
+    tool: bool = True,
+    paint: int = 1,
+) -> Body:
+    """A finger that curls; `coupled` moves all phalanges by one joint (a tendon)."""
+    links = [
+        Link(
+            parent=i - 1,
+            joint=0 if coupled else i,
+            angle=angle if i == 0 else 0.0,
+            mount=mount if i == 0 else (0.0, 0.0),
+            length=length * 0.9**i,
+            radius=radius * 0.92**i,
+            paint=paint,
+            touches=True,
+        )
+        for i in range(phalanges)
+    ]
+    joints = (Joint(*curl, 3.5),) * (1 if coupled else phalanges)
+    return Body(tuple(links), joints, (phalanges - 1,) if tool else (), (-1,) if tool else ())
+
+
+def hand(
+    fingers: int,
+    phalanges: int,
+    *,
+    base: tuple[float, float] = (0.0, -0.55),
+    palm: float = 0.3,
+    length: float = 0.4,
+    radius: float = 0.1,
+    coupled: bool = False,
+) -> Body:
+    """A palm with fingers that fan out upwards, all of them tools."""
+    links = (Link(mount=base, angle=math.pi / 2, length=0.0, radius=palm),)
+    body = Body(links, (), (), ())
+    for i in range(fingers):
+        place = i / (fingers - 1) * 2 - 1  # -1 left ... 1 right, seen along the hand
+        curl = (-0.25, 1.35) if place > 0 else (-1.35, 0.25)
+        part = finger(
+            phalanges,
+            mount=(palm * 0.75 * math.cos(place * 1.3), -palm * 0.95 * math.sin(place * 1.3)),
+            angle=-place * 0.9,
+            length=length,
+            radius=radius,
+            curl=curl,
+            coupled=coupled,
+            paint=1 + i % 2,
+        )
+        body = attach(body, part, at=0)
+    return body
+
+
+def gantry(
+    *,
+    reach: float = 0.72,
+    speed: float = 0.9,
+    size: float = 0.24,
+    rail: bool = False,
+    turns: bool = False,
+    bar: float = 0.3,
+    touches: bool = True,
+) -> Body:
+    """A head that slides along x and y, drawn as a disc; with `rail` also its moving beam;
+    with `turns` the head carries a bar that rotates."""
+    links = [Link(joint=0, kind="slide_x")]
+    if rail:
+        links.append(Link(parent=0, mount=(0.0, -1.2), angle=math.pi / 2, length=2.4, radius=0.09))
+    links.append(Link(parent=0, joint=1, kind="slide_y", radius=size, paint=1, touches=touches))
+    joints = [Joint(-reach, reach, speed)] * 2
+    if turns:
+        links.append(Link(parent=len(links) - 1, joint=2))
+        joints.append(Joint(-math.pi / 2, math.pi / 2, 2.4))
+    tool = len(links) - 1
+    if turns:
+        links.append(
+            Link(parent=tool, mount=(-bar, 0.0), length=2 * bar, radius=0.1, paint=2, touches=touches)
+        )
+    return Body(tuple(links), tuple(joints), (tool,), (-1,))
+
+
+def rover(
+    *,
+    reach: float = 0.68,
+    size: tuple[float, float] = (0.26, 0.2),
+    speed: float = 0.8,
+    turn: float = 2.6,
+    round_: bool = False,
+) -> Body:
+    """A base free in x, y and heading: a box (or disc) with a nose that shows the heading."""
+    length, width = size
+    links = [
+        Link(joint=0, kind="slide_x"),
+        Link(parent=0, joint=1, kind="slide_y"),
+        Link(parent=1, joint=2),
+    ]
+    if round_:
+        links.append(Link(parent=2, radius=length, touches=True))
+    else:
+        for side in (1, -1):  # wheels
+            links.append(
+                Link(parent=2, mount=(-0.8 * length, side * width), length=1.6 * length, radius=0.07, paint=2)
+            )
+        links.append(
+            Link(
+                parent=2,
+                mount=(-length + 0.05, 0.0),
+                length=2 * length - 0.1,
+                half_width=width - 0.05,
+                radius=0.05,
+                touches=True,
+            )
+        )
+    links.append(Link(parent=2, mount=(0.45 * length, 0.0), length=0.3 * length, radius=0.1, paint=1))
+    joints = (Joint(-reach, reach, speed), Joint(-reach, reach, speed), Joint(-math.pi, math.pi, turn, wraps=True))
+    return Body(tuple(links), joints, (2,), (-1,))

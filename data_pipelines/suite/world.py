@@ -1,0 +1,234 @@
+"""The simulator: many episodes of one embodiment at once, quasi-static, in numpy.
+
+Owns the state, contact, grasping, distractors and the scripted behaviour's loop. All
+episodes advance together; a rollout is a pure function of (spec, episodes, seed) or, when
+actions are given, of those. Nothing is drawn here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.suite.bodies import Pose
+from data_pipelines.suite.spec import EmbodimentSpec
+
+SUBSTEP_SECONDS = 1 / 15
+"""Longest physics step: bodies move less than an object's radius in it."""
+
+WALL = 0.8
+"""Objects stay within [-WALL, WALL]."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What happened. The state at step t is the one before action t.
+
+    q [n, T, C], objects [n, T, K, 2], distractors [n, T, J, 2], goals [n, G, 2],
+    actions float32 [n, T, A], lengths [n] (steps that count), reached [n] (the first step
+    whose action reached the goal; T if none), success [n].
+    """
+
+    q: np.ndarray
+    objects: np.ndarray
+    distractors: np.ndarray
+    goals: np.ndarray
+    actions: np.ndarray
+    lengths: np.ndarray
+    reached: np.ndarray
+
+    @property
+    def success(self) -> np.ndarray:
+        return self.reached < self.lengths
+
+
+def simulate(spec: EmbodimentSpec, episodes: int, seed: int, actions: np.ndarray | None = None) -> Rollout:
+    """Runs `episodes` episodes. With `actions` [n, T, A] these are executed, from the same
+    starts, in place of the scripted behaviour."""
+    world = World(spec, episodes, np.random.default_rng([seed, 1]))
+    behaviour = Behaviour(world, np.random.default_rng([seed, 2]))
+    shortest, longest = (round(s * spec.hz) for s in spec.seconds)
+    lengths = np.random.default_rng([seed, 3]).integers(shortest, longest + 1, episodes)
+    steps = int(longest) if actions is None else actions.shape[1]
+    seen: dict[str, list[np.ndarray]] = {"q": [], "objects": [], "distractors": [], "actions": []}
+    reached = np.full(episodes, steps)
+    for t in range(steps):
+        seen["q"].append(world.q.copy())
+        seen["objects"].append(world.objects.copy())
+        seen["distractors"].append(world.distractors.copy())
+        action = behaviour.act() if actions is None else actions[:, t]
+        seen["actions"].append(action.astype(np.float32))
+        world.step(seen["actions"][-1].astype(np.float64))
+        world.done |= spec.task.done(world)
+        reached = np.where(world.done, np.minimum(reached, t), reached)
+    stacked = {k: np.stack(v, 1) for k, v in seen.items()}
+    return Rollout(goals=world.goals, lengths=lengths, reached=reached, **stacked)
+
+
+class World:
+    """The state of n episodes and its physics."""
+
+    def __init__(self, spec: EmbodimentSpec, n: int, rng: np.random.Generator):
+        body, task = spec.body, spec.task
+        self.spec, self.body, self.dt = spec, body, 1.0 / spec.hz
+        self.substeps = int(np.ceil(self.dt / SUBSTEP_SECONDS - 1e-9))
+        self.q = body.random(rng, n, 0.7)
+        self.goals = self._reachable(rng, n)
+        self.objects = np.stack([self._reachable(rng, n)[:, 0] for _ in range(task.objects)], 1) if (
+            task.objects
+        ) else np.zeros((n, 0, 2))
+        if task.objects:  # an object that starts on its mark would be an empty task
+            away = self.objects[:, 0] - self.goals[:, 0]
+            close = np.linalg.norm(away, axis=1) < 2.5 * task.radius
+            self.objects[close, 0] = -self.objects[close, 0]
+        look = spec.look
+        self.distractors = rng.uniform(-0.9, 0.9, (n, look.distractors, 2))
+        heading = rng.uniform(0, 2 * np.pi, (n, look.distractors))
+        self.drift = look.distractor_speed * np.stack([np.cos(heading), np.sin(heading)], -1)
+        self.held = np.full((n, len(body.tools)), -1)
+        self.hold = np.zeros((n, len(body.tools), 2))
+        self.done = np.zeros(n, bool)
+        self.pushers = [i for i, link in enumerate(body.links) if link.touches] if task.pushes else []
+        self.tool_radius = max((body.links[i].radius for i in self.pushers), default=0.1)
+        self.grasp = task.size + 0.1
+        self.pose: Pose = body.pose(self.q)
+        self._separate()
+        distance = (
+            np.linalg.norm(self.tools - self.objects[:, :1], axis=-1)
+            if task.objects
+            else np.zeros((n, len(body.tools)))
+        )
+        self.hand = distance.argmin(1)  # the tool that does the task
+        self.done |= task.done(self)
+        self.done[:] = False
+
+    @property
+    def tools(self) -> np.ndarray:
+        """[n, M, 2]"""
+        return self.body.tool_points(self.pose)
+
+    def _reachable(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """[n, M, 2] points that the tools of a random configuration have."""
+        points = self.body.tool_points(self.body.pose(self.body.random(rng, n, 0.85)))
+        return np.clip(points, -0.7, 0.7)
+
+    def step(self, action: np.ndarray) -> None:
+        """One native step under `action` [n, A]."""
+        h = self.dt / self.substeps
+        for _ in range(self.substeps):
+            start = 0
+            for control in self.spec.controls:
+                control.advance(self.body, self.q, action[:, start : start + control.dim], h, self.dt)
+                start += control.dim
+            self.body.confine(self.q)
+            self.pose = self.body.pose(self.q)
+            if self.spec.task.carries:
+                self._grip()
+            self._separate()
+            self._wander(h)
+
+    def _grip(self) -> None:
+        """Closed grippers hold what is between their fingers; open ones let go."""
+        rows = np.arange(len(self.q))
+        tools = self.tools
+        for m, joint in enumerate(self.body.grips):
+            if joint < 0:
+                continue
+            away = self.objects - tools[:, m, None]
+            distance = np.linalg.norm(away, axis=-1)
+            nearest = distance.argmin(1)
+            closed = self.q[:, joint] < 0.35
+            free = self.held[:, m] < 0
+            grasp = closed & free & (distance[rows, nearest] < self.grasp)
+            grasp &= ~(self.held == nearest[:, None]).any(1)  # two hands do not share
+            self.held[grasp, m] = nearest[grasp]
+            self.hold[grasp, m] = away[rows, nearest][grasp]
+            self.held[self.q[:, joint] > 0.6, m] = -1
+            has = self.held[:, m] >= 0
+            self.hold[:, m] *= 0.8  # a held object settles between the fingers
+            self.objects[rows[has], self.held[has, m]] = (tools[:, m] + self.hold[:, m])[has]
+
+    def _separate(self) -> None:
+        """Quasi-static contact: links push objects, objects push each other, walls stop them."""
+        count, size = self.objects.shape[1], self.spec.task.size
+        for i in self.pushers:
+            link = self.body.links[i]
+            a, b = self.pose.origin[:, i], self.pose.tip[:, i]
+            gap = size + link.radius + link.half_width
+            for k in range(count):
+                point = self.objects[:, k]
+                along = b - a
+                t = ((point - a) * along).sum(1) / max(link.length**2, 1e-9)
+                near = a + np.clip(t, 0.0, 1.0)[:, None] * along
+                self._push_out(point, near, gap)
+        for k in range(count):
+            for j in range(k):
+                away = self.objects[:, k] - self.objects[:, j]
+                distance = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
+                shift = away / distance * np.maximum(2 * size - distance, 0.0) / 2
+                self.objects[:, k] += shift
+                self.objects[:, j] -= shift
+        np.clip(self.objects, -WALL, WALL, out=self.objects)
+
+    @staticmethod
+    def _push_out(point: np.ndarray, near: np.ndarray, gap: float) -> None:
+        away = point - near
+        distance = np.linalg.norm(away, axis=1, keepdims=True)
+        overlap = np.maximum(gap - distance, 0.0)
+        point += away / np.maximum(distance, 1e-6) * overlap
+
+    def _wander(self, h: float) -> None:
+        self.distractors += self.drift * h
+        outside = (np.abs(self.distractors) > 0.95) & (self.distractors * self.drift > 0)
+        self.drift[outside] *= -1.0
+
+
+class Behaviour:
+    """Scripted and restless: part of the time on the task, part on wishes of its own.
+
+    Wishes change at random moments, so that the future cannot be told from the past alone:
+    a video model must look at the actions.
+    """
+
+    def __init__(self, world: World, rng: np.random.Generator):
+        n = len(world.q)
+        self.world, self.rng = world, rng
+        self.on_task = rng.random(n) < world.spec.purpose
+        self.wish = world.body.random(rng, n)
+        self.bias = np.zeros_like(world.q)
+
+    def act(self) -> np.ndarray:
+        """[n, A] actions for the present state."""
+        world, spec, body, rng = self.world, self.world.spec, self.world.body, self.rng
+        n = len(world.q)
+        arrived = np.abs(self.wish - world.q).max(1) < 0.15
+        change = (rng.random(n) < spec.restless * world.dt) | (arrived & ~self.on_task)
+        self.on_task = np.where(change, (rng.random(n) < spec.purpose) & ~world.done, self.on_task)
+        wish = body.random(rng, n)
+        for grip in body.grips:
+            if grip >= 0:
+                wish[:, grip] = rng.random(n) < 0.5
+        self.wish = np.where(change[:, None], wish, self.wish)
+
+        goal = np.where(self.on_task[:, None], self._task_goal(), self.wish)
+        fade = np.exp(-world.dt / 0.5)
+        kick = np.sqrt(1 - fade**2) * rng.standard_normal(goal.shape)
+        self.bias = fade * self.bias + kick
+        goal = np.clip(goal + self.bias * spec.noise * body.speed * 0.5, body.low, body.high)
+        return np.concatenate([c.encode(body, world.q, goal, world.dt) for c in spec.controls], 1)
+
+    def _task_goal(self) -> np.ndarray:
+        """[n, C]: the configuration that serves the task; joints it does not need explore."""
+        world, body = self.world, self.world.body
+        target, opening = world.spec.task.plan(world)
+        move = target - world.tools
+        far = np.linalg.norm(move, axis=-1, keepdims=True)
+        move = move * np.minimum(1.0, 0.4 / np.maximum(far, 1e-9))
+        goal = world.q + body.solve(world.pose, move)
+        busy = body.tool_joints[world.hand] if world.objects.shape[1] else body.tool_joints.any(0)
+        goal = np.where(busy, goal, self.wish)
+        for m, grip in enumerate(body.grips):
+            if grip >= 0:
+                goal[:, grip] = np.where(np.isnan(opening[:, m]), self.wish[:, grip], opening[:, m])
+        return goal
