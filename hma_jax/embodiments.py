@@ -79,19 +79,21 @@ class EmbodimentTable:
                 return i
         raise ConfigError(f"unknown embodiment {name!r}; the table has {', '.join(self.names)}")
 
-    def normaliser(self) -> tuple[np.ndarray, np.ndarray]:
-        """(mean_EU, inverse_std_EU), float32.
+    def statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        """(mean_EU, std_EU), float32; both are 0 in the padding, std also in dead dimensions."""
+        mean = np.zeros((self.size, self.action_width), np.float32)
+        std = np.zeros((self.size, self.action_width), np.float32)
+        for i, e in enumerate(self.entries):
+            alive = [s if s > DEAD_STD else 0.0 for s in e.std]
+            mean[i, : e.chunk] = np.tile(e.mean, e.stride)
+            std[i, : e.chunk] = np.tile(alive, e.stride)
+        return mean, std
 
-        Padding and dead dimensions get an inverse of 0, so they normalise to exactly 0.
+    def normaliser(self) -> tuple[np.ndarray, np.ndarray]:
+        """(mean_EU, inverse_std_EU), float32: padding and dead dimensions normalise to exactly 0.
+
         DIFFERS: the release divides by std + 1e-10, which turns rounding noise on a constant
         dimension into values of order 100 (reference section 5.6).
         """
-        mean = np.zeros((self.size, self.action_width), np.float32)
-        inverse = np.zeros((self.size, self.action_width), np.float32)
-        for i, e in enumerate(self.entries):
-            std = np.asarray(e.std, np.float64)
-            alive = std > DEAD_STD
-            one = np.where(alive, 1.0 / np.where(alive, std, 1.0), 0.0)
-            mean[i, : e.chunk] = np.tile(np.asarray(e.mean), e.stride)
-            inverse[i, : e.chunk] = np.tile(one, e.stride)
-        return mean, inverse
+        mean, std = self.statistics()
+        return mean, np.where(std > 0, 1 / np.where(std > 0, std, 1), 0).astype(np.float32)
