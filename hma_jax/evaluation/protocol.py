@@ -1,0 +1,214 @@
+"""The evaluation protocol: which images and logits are compared, over which windows.
+
+Paper section 4 (Metrics), reference section 6. For every window of a frozen manifest:
+
+* likelihood: cross-entropy of each frame, wholly masked, given the true frames before it;
+* fidelity: PSNR and SSIM of an autoregressive rollout from the prompt against the recorded
+  frames (not their reconstruction by the tokenizer);
+* controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
+  under random action sequences, unmasking with the same random numbers.
+
+DIFFERS: the release's rollout replaces one context frame only (reference section 6.2); its
+random actions also overwrite the prompt's and use other random numbers (section 6.3).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import EvalConfig, ModelConfig, require
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.evaluation.metrics import (
+    Stat,
+    corpus_perplexity,
+    factored_cross_entropy,
+    group_means,
+    mean_and_sem,
+    perplexity,
+    psnr,
+    ssim,
+    stratified,
+)
+from hma_jax.generation import DecodeConfig, next_frame_logits, rollout
+from hma_jax.model import declare_model
+from hma_jax.model.hma import compose
+from hma_jax.params import Params
+
+
+class Decoder(Protocol):
+    """The half of a tokenizer that evaluation needs."""
+
+    def decode(self, ids: np.ndarray) -> np.ndarray:
+        """ids [B, S] -> uint8 [B, height, width, 3]."""
+        ...
+
+
+@dataclass
+class Evaluation:
+    """Every metric per dataset, with standard errors over windows, and a few clips to look at."""
+
+    datasets: dict[str, dict[str, Stat]] = field(default_factory=dict)
+    samples: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+
+    def over(self, names: Iterable[str]) -> dict[str, Stat]:
+        """Each metric averaged over the named datasets, all counting equally."""
+        chosen = [self.datasets[name] for name in names]
+        require(len(chosen) > 0, "no datasets to average an evaluation over")
+        return {metric: stratified(d[metric] for d in chosen) for metric in chosen[0]}
+
+    @property
+    def overall(self) -> dict[str, Stat]:
+        return self.over(self.datasets)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {n: {m: dataclasses.asdict(s) for m, s in d.items()} for n, d in self.datasets.items()}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Evaluation:
+        return cls({n: {m: Stat(**s) for m, s in d.items()} for n, d in values.items()})
+
+
+def random_actions(
+    seed: int, window_B: jax.Array, embodiment_B: jax.Array, table: EmbodimentTable, shape: tuple[int, int]
+) -> jax.Array:
+    """[B, draws, T, U] with `shape` = (draws, T): N(mean, std) of each robot's own actions.
+
+    A function of (seed, window number): every trial sees the same draws.
+    """
+    mean_EU, std_EU = (jnp.asarray(x) for x in table.statistics())
+
+    def draw(window: jax.Array) -> jax.Array:
+        key = jax.random.fold_in(jax.random.key(seed), window)
+        return jax.random.normal(key, (*shape, table.action_width))
+
+    noise = jax.vmap(draw)(window_B)
+    return mean_EU[embodiment_B][:, None, None] + std_EU[embodiment_B][:, None, None] * noise
+
+
+def make_evaluator(model: ModelConfig, table: EmbodimentTable, config: EvalConfig) -> Callable:
+    """A jitted f(params, batch) -> (loss [B], correct [B], tokens [B, 1 + draws, T - prompt, S])."""
+    require(
+        config.prompt_frames < model.frames,
+        f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of "
+        f"{model.frames} frames",
+    )
+    declared = declare_model(model, table)
+    decode = DecodeConfig(unmask_steps=config.unmask_steps)
+    first_free = config.prompt_frames - 1  # the first chunk that leads to a predicted frame
+
+    def evaluate_batch(params: Params, batch: dict[str, jax.Array]):
+        hma = declared.merge(params)
+        tokens, actions, embodiment = batch["tokens"], batch["actions"], batch["embodiment"]
+        logits = next_frame_logits(hma, tokens, actions, embodiment)
+        loss = factored_cross_entropy(logits, tokens[:, 1:]).mean((1, 2))
+        guess = compose(jnp.argmax(logits, -1), model.factor_vocab)
+        correct = (guess == tokens[:, 1:]).astype(jnp.float32).mean((1, 2))
+
+        shape = (config.random_actions, model.frames)
+        other = random_actions(config.seed, batch["window"], embodiment, table, shape)
+        other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
+        sequences = jnp.concatenate([actions[:, None], other], axis=1)
+        key = jax.random.key(config.seed + 1)
+        keys = jax.vmap(lambda w: jax.random.fold_in(key, w))(batch["window"])
+        prompt = tokens[:, : config.prompt_frames]
+        return loss, correct, rollout(hma, prompt, sequences, embodiment, keys, decode)
+
+    return jax.jit(evaluate_batch)
+
+
+def evaluate(
+    params: Params,
+    model: ModelConfig,
+    table: EmbodimentTable,
+    tokenizer: Decoder,
+    batches: Iterator[dict[str, Any]],
+    config: EvalConfig,
+    *,
+    samples_per_dataset: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> Evaluation:
+    """Applies the protocol to `batches` (each of one dataset, its name under "dataset").
+
+    A batch holds tokens, actions, embodiment, window (numbers), frames (uint8, recorded) and
+    valid (bool [B]: rows that are not padding). `progress` is told the windows done so far.
+    """
+    evaluator = make_evaluator(model, table, config)
+    columns: dict[str, dict[str, list[np.ndarray]]] = {}
+    result = Evaluation()
+    done = 0
+    for batch in batches:
+        name, valid = batch["dataset"], batch["valid"]
+        arrays = {k: batch[k] for k in ("tokens", "actions", "embodiment", "window")}
+        loss, correct, tokens = (np.asarray(x)[valid] for x in evaluator(params, arrays))
+        truth = batch["frames"][valid]
+        predicted, last_random = _decode_rollouts(tokenizer, tokens)
+        values = _compare(truth, predicted, last_random, config.prompt_frames)
+        values |= {"cross_entropy": loss, "accuracy": correct}
+        for metric, column in values.items():
+            columns.setdefault(name, {}).setdefault(metric, []).append(column)
+        if name not in result.samples and samples_per_dataset > 0:
+            count = samples_per_dataset
+            result.samples[name] = _clips(
+                tokenizer, truth[:count], predicted[:count], tokens[:count], config.prompt_frames
+            )
+        done += int(valid.sum())
+        if progress is not None:
+            progress(done)
+    require(len(columns) > 0, "the evaluation has no windows; freeze a manifest over other datasets")
+    for name, metrics in columns.items():
+        joined = {metric: np.concatenate(parts) for metric, parts in metrics.items()}
+        stats = {metric: mean_and_sem(values) for metric, values in joined.items()}
+        groups = group_means(joined["cross_entropy"], config.perplexity_group)
+        stats["perplexity"] = perplexity(*groups)
+        stats["perplexity_corpus"] = corpus_perplexity(joined["cross_entropy"])
+        result.datasets[name] = stats
+    return result
+
+
+def _decode_rollouts(tokenizer: Decoder, tokens: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """tokens [B, 1 + draws, T', S] -> frames under true actions [B, T', ...] and last frames
+    under random ones [B, draws, ...]."""
+    batch, _, frames, size = tokens.shape
+    predicted = tokenizer.decode(tokens[:, 0].reshape(-1, size))
+    last = tokenizer.decode(tokens[:, 1:, -1].reshape(-1, size))
+    shape = predicted.shape[1:]
+    return predicted.reshape(batch, frames, *shape), last.reshape(batch, -1, *shape)
+
+
+def _compare(
+    truth: np.ndarray, predicted: np.ndarray, last_random: np.ndarray, prompt: int
+) -> dict[str, np.ndarray]:
+    """Image metrics per window; frames are uint8 [B, T, height, width, 3]."""
+    future, last = truth[:, prompt:], truth[:, -1]
+    psnr_last = psnr(predicted[:, -1], last)
+    psnr_random = psnr(last_random, np.broadcast_to(last[:, None], last_random.shape)).mean(1)
+    return {
+        "psnr": psnr(predicted, future).mean(1),
+        "psnr_last": psnr_last,
+        "psnr_random": psnr_random,
+        "delta_psnr": psnr_last - psnr_random,
+        # What a model scores that repeats the last prompt frame for ever.
+        "psnr_copy": psnr(np.broadcast_to(truth[:, prompt - 1 : prompt], future.shape), future).mean(1),
+        "ssim": ssim(predicted, future).mean(1),
+    }
+
+
+def _clips(
+    tokenizer: Decoder, truth: np.ndarray, predicted: np.ndarray, tokens: np.ndarray, prompt: int
+) -> dict[str, np.ndarray]:
+    """Clips to look at: true, predicted and under the first random actions, all [n, T, ...]."""
+    count, _, frames, size = tokens.shape
+    random = tokenizer.decode(tokens[:, 1].reshape(-1, size)).reshape(predicted.shape)
+    start = truth[:, :prompt]
+    return {
+        "true": truth,
+        "predicted": np.concatenate([start, predicted], axis=1),
+        "random": np.concatenate([start, random], axis=1),
+    }
