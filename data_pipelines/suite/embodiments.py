@@ -2,111 +2,224 @@
 
 The order matters: scaling over datasets takes the first 5, 10, 20, 40, so each prefix is
 diverse, and the first five (the common evaluation set) have much data and strong actions.
-Parts used more than once come first; angles of bodies are degrees, of controls radians.
+Angles of bodies are degrees, of controls radians.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
-from data_pipelines.suite.bodies import Body, attach, join
+from data_pipelines.suite.bodies import attach, join
 from data_pipelines.suite.controls import Drive, JointRate, JointTarget, ToolRate, ToolTarget
-from data_pipelines.suite.robots import arm, finger, gantry, gripper, hand, rover
-from data_pipelines.suite.spec import Camera, EmbodimentSpec, Look
+from data_pipelines.suite.looks import CHALK, CLAY, LAB, MINT, NIGHT, PLUM, ROAD, SAND, SEA, SKY, SLATE, WOOD
+from data_pipelines.suite.robots import arm, claw, gantry, gripper, hand, rover, two_arms
+from data_pipelines.suite.spec import Camera, EmbodimentSpec
 from data_pipelines.suite.tasks import Carry, Push, Reach
 
 PIXEL = 1 / 32  # world units per pixel of a 64-pixel image
 DEGREE = math.pi / 180
-MILLIMETRE = 1 / 500  # where a table is 1 m wide
+METRE = 2.0  # world units, where the floor is 1 m wide
 TICK = 2 * math.pi / 4096  # one encoder step of a hobby servo, radians
 
 
 def _j(first: int, count: int) -> tuple[int, ...]:
+    """Joints first .. first + count - 1."""
     return tuple(range(first, first + count))
-
-
-def _pair(*lengths: float, tip: Body | None = None, tips: int = 1, radius: float = 0.13, **kw) -> Body:
-    """Two arms from the lower corners, each with `tips` copies of `tip` as its hand."""
-    arms = []
-    for side in (-1, 1):
-        one = arm(lengths, base=(0.55 * side, -0.7), heading=90 + 12 * side, radius=radius, swing=55, **kw)
-        arms.append(one if tip is None else attach(one, *(tip,) * tips))
-    return join(*arms)
-
-
-def _claw(fingers: int, phalanges: int, length: float = 0.16) -> Body:
-    """Fingers that fan out from a wrist."""
-    palm = Body((), (), (), ())
-    spread = [(i / (fingers - 1) * 2 - 1) for i in range(fingers)]
-    parts = [
-        finger(phalanges, angle=0.7 * s, length=length, radius=0.055, curl=(-0.7, 0.7), tool=False, paint=2)
-        for s in spread
-    ]
-    return join(palm, *parts)
-
-
-SAND = Look(floor=(196, 188, 172), robot=((52, 84, 150), (226, 122, 52), (70, 70, 80)))
-SLATE = Look(floor=(84, 98, 108), outside=(60, 66, 72), robot=((238, 208, 88), (240, 226, 150), (220, 90, 70)))
-MINT = Look(floor=(168, 198, 180), robot=((110, 52, 110), (60, 60, 72), (240, 232, 210)))
-NIGHT = Look(floor=(50, 54, 66), outside=(34, 36, 44), robot=((206, 92, 84), (232, 166, 96), (232, 228, 220)))
-CHALK = Look(floor=(222, 222, 218), outside=(190, 190, 190), robot=((44, 48, 54), (190, 56, 50), (236, 170, 60)))
-WOOD = Look(
-    floor=(186, 146, 106), outside=(214, 210, 204), robot=((62, 68, 76), (52, 116, 170), (240, 240, 236)),
-    pattern="table",
-)
-SKY = Look(floor=(150, 180, 206), outside=(226, 228, 224), robot=((236, 120, 60), (70, 76, 96), (250, 236, 200)), pattern="slope")
-ROAD = Look(floor=(118, 146, 96), outside=(108, 108, 112), robot=((222, 66, 62), (250, 236, 160), (36, 36, 40)), pattern="stripe")
-
-
-def _with(look: Look, **changes) -> Look:
-    from dataclasses import replace
-
-    return replace(look, **changes)
 
 
 E = EmbodimentSpec
 
+# A table: one entry per paragraph, whatever a formatter would prefer.
+# fmt: off
 EMBODIMENTS: tuple[EmbodimentSpec, ...] = (
+    # --- The first five ------------------------------------------------------------------
     E("two_link_arm_joint_targets", "arm", hz=5, episodes=280, look=SAND,
       body=arm((0.52, 0.42), radius=0.19, bend=150, swing=170),
       controls=(JointTarget("joints", _j(0, 2)),),
-      task=Reach(radius=0.15), instruction="touch the mark"),
+      task=Reach(radius=0.13), instruction="touch the mark"),
     E("disc_pusher_delta_pixels", "pusher", hz=4, episodes=320, look=SLATE,
       body=gantry(size=0.28, speed=0.95),
       controls=(JointRate("xy", _j(0, 2), unit=PIXEL, convention="delta"),),
       task=Push(objects=2), instruction="push the disc onto the mark"),
-    E("rover_wheel_speeds", "rover", hz=3, episodes=200, look=_with(MINT, distractors=1),
+    E("rover_wheel_speeds", "rover", hz=3, episodes=200, look=replace(MINT, distractors=1),
       body=rover(size=(0.32, 0.26), speed=1.0),
-      controls=(Drive("wheels", "wheels"),),
-      task=Reach(radius=0.2), instruction="drive to the mark", cameras=(Camera(rotate=20),)),
+      controls=(Drive("wheels", "wheels", unit=METRE),),
+      task=Reach(radius=0.12), instruction="drive to the mark", cameras=(Camera(rotate=15),)),
     E("two_grippers_joint_targets", "bimanual", hz=6, episodes=140, look=WOOD,
-      body=_pair(0.45, 0.35, 0.12, tip=gripper(0.22), radius=0.15),
-      controls=(JointTarget("joints", _j(0, 8), unit=DEGREE * 30),),
+      body=two_arms((0.45, 0.35, 0.12), tip=gripper(0.22), radius=0.16),
+      controls=(JointTarget("joints", _j(0, 8), unit=30 * DEGREE),),
       task=Carry(size=0.16, objects=2), instruction="put the disc on the mark"),
     E("gantry_gripper_normalised", "gripper", hz=8, episodes=120, look=NIGHT,
-      body=attach(gantry(turns=True, size=0.24, bar=0.3, reach=0.65), gripper(0.34, 0.08)),
-      controls=(JointTarget("pose", _j(0, 2), unit=0.65), JointTarget("turn", (2,), unit=math.pi / 2), JointTarget("grip", (3,))),
+      body=attach(gantry(turns=True, size=0.24, reach=0.65), gripper(0.34, 0.08)),
+      controls=(JointTarget("xy", _j(0, 2), unit=0.65), JointTarget("turn", (2,), unit=math.pi / 2),
+                JointTarget("grip", (3,))),
       task=Carry(size=0.17, objects=2), instruction="carry the disc to the mark",
       cameras=(Camera(), Camera("wrist_image", zoom=1.4, follow=1))),
-    E("three_link_arm_tool_delta_mm", "arm", hz=5, episodes=90, look=CHALK,
+    # --- up to ten -----------------------------------------------------------------------
+    E("three_link_arm_tool_delta_metres", "arm", hz=5, episodes=100, look=CHALK,
       body=attach(arm((0.55, 0.45, 0.15), base=(0, -0.75), radius=0.17, swing=80), gripper(0.26, 0.07)),
-      controls=(ToolRate("xy", unit=MILLIMETRE, speed=1.0), JointTarget("grip", (3,))),
-      task=Carry(objects=3, size=0.16), instruction="bring the disc to the mark", cameras=(Camera(flip=True, zoom=0.95),)),
+      controls=(ToolRate("xy", unit=METRE, speed=1.0), JointTarget("grip", (3,))),
+      task=Carry(objects=3, size=0.16), instruction="bring the disc to the mark",
+      cameras=(Camera(flip=True, zoom=0.95),)),
     E("five_finger_hand_tendons", "hand", hz=10, episodes=60, look=SKY,
       body=hand(5, 2, length=0.42, radius=0.12, coupled=True),
-      controls=(JointTarget("tendons", _j(0, 5), unit=0.8),),
+      controls=(JointTarget("tendons", _j(0, 5), unit=0.8, offset=0.2),),
       task=Reach(radius=0.22), instruction="make the shown grasp"),
-    E("holonomic_base_velocity", "rover", hz=4, episodes=80, look=_with(ROAD, distractors=2),
+    E("holonomic_base_velocity", "rover", hz=4, episodes=90, look=replace(ROAD, distractors=1),
       body=rover(size=(0.3, 0.3), speed=1.0, round_=True),
       controls=(Drive("velocity", "holonomic", unit=0.5, turn_unit=1.5),),
       task=Push(objects=2), instruction="shove the disc onto the mark", cameras=(Camera(rotate=-90),)),
-    E("mobile_arm_twist_and_joints", "mobile_arm", hz=10, episodes=48, dict_actions=True, look=_with(SAND, floor=(150, 140, 170)),
-      body=attach(rover(size=(0.3, 0.24), reach=0.5), attach(arm((0.4, 0.3), heading=0, radius=0.13, swing=100), gripper(0.22)), at=2),
-      controls=(Drive("base_twist", "twist", turn_unit=0.5), JointTarget("arm_joints", _j(3, 2)), JointTarget("gripper", (5,), unit=0.1)),
+    E("mobile_arm_twist_and_joints", "mobile_arm", hz=10, episodes=48, dict_actions=True, look=PLUM,
+      body=attach(rover(size=(0.3, 0.24), reach=0.5),
+                  attach(arm((0.4, 0.3), heading=0, radius=0.14, swing=100), gripper(0.22)), at=2),
+      controls=(Drive("base_twist", "twist", turn_unit=0.5), JointTarget("arm_joints", _j(3, 2)),
+                JointTarget("gripper", (5,), unit=0.1)),
       task=Carry(size=0.16), instruction="fetch the disc and take it to the mark",
       cameras=(Camera(zoom=0.9), Camera("base_image", zoom=0.8, follow=2))),
-    E("humanoid_hands_joint_targets", "bimanual", hz=10, episodes=40, look=MINT,
-      body=_pair(0.2, 0.18, 0.16, 0.14, 0.13, 0.12, 0.1, tip=_claw(4, 2, 0.17), radius=0.14, taper=0.95, bend=40),
-      controls=(JointTarget("joints", _j(0, 30)),),
-      task=Reach(radius=0.35), instruction="reach both marks"),
+    E("humanoid_hands_joint_targets", "bimanual", hz=10, episodes=40, look=SEA,
+      body=two_arms((0.24, 0.2, 0.18, 0.16, 0.14, 0.12), tip=claw(4, 2), radius=0.15, taper=0.95, bend=45),
+      controls=(JointTarget("joints", _j(0, 28)),),
+      task=Reach(radius=0.3), instruction="reach both marks"),
+    # --- up to twenty --------------------------------------------------------------------
+    E("seven_joint_arm_velocity", "arm", hz=15, episodes=28, look=LAB,
+      body=arm((0.26, 0.24, 0.22, 0.2, 0.18, 0.16, 0.14), base=(-0.1, -0.75), radius=0.18, taper=0.94,
+               swing=60, bend=50, speed=1.8),
+      controls=(JointRate("joints", _j(0, 7)),),
+      task=Reach(radius=0.2), instruction="touch the mark", cameras=(Camera(width=80),)),
+    E("car_speed_and_steering", "rover", hz=5, episodes=80, look=replace(ROAD, distractors=2, floor=(150, 150, 132)),
+      body=rover(size=(0.34, 0.2), speed=1.2),
+      controls=(Drive("car", "car", unit=1.2, turn_unit=0.7, track=0.4),),
+      task=Reach(radius=0.15), instruction="park on the mark", cameras=(Camera(zoom=0.95),)),
+    E("plate_pusher_pose_metres", "pusher", hz=2, episodes=90, look=CLAY, seconds=(9, 13),
+      body=gantry(turns=True, size=0.18, bar=0.34),
+      controls=(JointTarget("xy", _j(0, 2), unit=METRE, offset=-1.0), JointTarget("turn", (2,))),
+      task=Push(objects=3, size=0.17), instruction="sweep the disc onto the mark"),
+    E("two_arms_tool_delta", "bimanual", hz=5, episodes=60, dict_actions=True, look=replace(SAND, floor=(150, 160, 150)),
+      body=two_arms((0.55, 0.45), tip=gripper(0.22, 0.07), radius=0.16, base=(0.6, -0.65)),
+      controls=(ToolRate("left_xy", 0, unit=0.1), JointTarget("left_grip", (2,)),
+                ToolRate("right_xy", 1, unit=0.1), JointTarget("right_grip", (5,))),
+      task=Carry(objects=2), instruction="bring the disc to the mark",
+      cameras=(Camera(rotate=180), Camera("left_image", zoom=1.2, follow=1), Camera("right_image", zoom=1.2, follow=6))),
+    E("four_joint_arm_servo_ticks", "arm", hz=20, episodes=20, look=NIGHT,
+      body=arm((0.42, 0.36, 0.3, 0.22), base=(0.55, -0.6), heading=120, radius=0.17, swing=60, bend=90),
+      controls=(JointTarget("ticks", _j(0, 4), unit=TICK, offset=-2048 * TICK),),
+      task=Push(objects=2), instruction="knock the disc onto the mark"),
+    E("three_finger_hand_velocity", "hand", hz=6, episodes=50, look=LAB,
+      body=hand(3, 2, palm=0.32, length=0.46, radius=0.15),
+      controls=(JointRate("joints", _j(0, 6), unit=2.0),),
+      task=Reach(radius=0.3), instruction="make the shown grasp", cameras=(Camera(rotate=90, zoom=0.9),)),
+    E("beam_gantry_pixels", "pusher", hz=3, episodes=70, look=replace(CHALK, distractors=1),
+      body=gantry(rail=True, size=0.26),
+      controls=(JointTarget("xy", _j(0, 2), unit=PIXEL, offset=-1.0),),
+      task=Push(objects=1, size=0.24), instruction="push the disc onto the mark"),
+    E("sweeping_arm_joint_delta_degrees", "arm", hz=6, episodes=60, look=MINT,
+      body=arm((0.6, 0.5), base=(-0.75, 0.0), heading=0, radius=0.17, swing=70, bend=110),
+      controls=(JointRate("joints", _j(0, 2), unit=DEGREE, convention="delta"),),
+      task=Push(objects=3, size=0.18, radius=0.28), instruction="sweep the disc onto the mark",
+      cameras=(Camera(height=64, width=72),)),
+    E("round_robot_twist", "rover", hz=2, episodes=64, look=replace(SLATE, distractors=1), seconds=(9, 13),
+      body=rover(size=(0.3, 0.3), speed=0.9, round_=True),
+      controls=(Drive("twist", "twist"),),
+      task=Push(objects=2, radius=0.3), instruction="nudge the disc onto the mark",
+      cameras=(Camera(), Camera("front_image", zoom=0.9, centre=(0.5, 0.0), follow=2))),
+    E("five_joint_arm_tool_targets", "arm", hz=10, episodes=40, dict_actions=True, look=WOOD,
+      body=attach(arm((0.36, 0.32, 0.26, 0.2, 0.1), base=(0, -0.7), radius=0.16, swing=60, bend=70), gripper(0.24)),
+      controls=(ToolTarget("position", unit=METRE, offset=0.1), JointTarget("gripper", (5,), unit=0.08)),
+      task=Carry(), instruction="pick the disc and place it on the mark",
+      cameras=(Camera(), Camera("wrist_image", zoom=1.5, follow=4))),
+    # --- up to forty ---------------------------------------------------------------------
+    E("tabletop_pair_joint_targets", "bimanual", hz=20, episodes=18, look=replace(CHALK, floor=(60, 66, 74)),
+      body=two_arms((0.3, 0.26, 0.22, 0.18, 0.12, 0.08), tip=gripper(0.2, 0.06), radius=0.14, bend=55),
+      controls=(JointTarget("joints", _j(0, 14)),),
+      task=Carry(size=0.16), instruction="lift the disc to the mark",
+      cameras=(Camera(zoom=0.95), Camera("left_wrist_image", zoom=1.3, follow=5))),
+    E("disc_pusher_velocity", "pusher", hz=10, episodes=32, look=SEA,
+      body=gantry(size=0.3, speed=0.9),
+      controls=(JointRate("xy", _j(0, 2), unit=0.9),),
+      task=Push(objects=3, size=0.16), instruction="push the disc onto the mark", cameras=(Camera(rotate=45, zoom=0.9),)),
+    E("two_paddles_joint_targets", "bimanual", hz=4, episodes=56, look=replace(SKY, floor=(96, 120, 150)),
+      body=two_arms((0.85,), base=(0.8, -0.6), radius=0.15, heading=120, swing=60),
+      controls=(JointTarget("paddles", _j(0, 2), unit=60 * DEGREE),),
+      task=Push(objects=3, size=0.18, radius=0.3), instruction="bat the disc onto the mark"),
+    E("holonomic_mobile_arm", "mobile_arm", hz=5, episodes=50, dict_actions=True, look=CLAY,
+      body=attach(rover(size=(0.28, 0.28), reach=0.45, round_=True),
+                  arm((0.3, 0.26, 0.22), heading=0, radius=0.13, swing=110, bend=100, paint=1), at=2),
+      controls=(Drive("base", "holonomic"), JointRate("arm", _j(3, 3))),
+      task=Push(objects=1, size=0.2, radius=0.3), instruction="push the disc onto the mark", cameras=(Camera(zoom=0.9),)),
+    E("four_finger_hand_joint_targets", "hand", hz=8, episodes=36, look=replace(PLUM, floor=(150, 130, 160)),
+      body=hand(4, 3, palm=0.34, length=0.36, radius=0.13),
+      controls=(JointTarget("joints", _j(0, 12), unit=DEGREE),),
+      task=Reach(radius=0.42), instruction="make the shown grasp"),
+    E("six_joint_arm_joint_delta", "arm", hz=10, episodes=28, look=SAND,
+      body=attach(arm((0.3, 0.28, 0.24, 0.2, 0.16, 0.1), base=(0.6, 0.6), heading=225, radius=0.17, taper=0.92,
+                      swing=50, bend=55), gripper(0.26)),
+      controls=(JointRate("joints", _j(0, 6), unit=0.1, convention="delta"), JointTarget("gripper", (6,))),
+      task=Carry(objects=2), instruction="take the disc to the mark"),
+    E("gantry_gripper_delta_millimetres", "gripper", hz=5, episodes=54, look=LAB,
+      body=attach(gantry(turns=True, size=0.22, rail=True), gripper(0.36, 0.085)),
+      controls=(JointRate("xy", _j(0, 2), unit=METRE / 1000, convention="delta"),
+                JointRate("turn", (2,), unit=DEGREE, convention="delta"), JointTarget("grip", (3,))),
+      task=Carry(objects=2), instruction="carry the disc to the mark",
+      cameras=(Camera(flip=True), Camera("wrist_image", zoom=1.4, follow=2))),
+    E("tracked_rover_motor_ticks", "rover", hz=15, episodes=20, look=replace(CLAY, floor=(206, 176, 130)),
+      body=rover(size=(0.3, 0.28), speed=0.9, turn=2.2),
+      controls=(Drive("tracks", "wheels", unit=1 / 300),),
+      task=Push(objects=2, size=0.18, radius=0.3), instruction="push the disc onto the mark"),
+    E("two_arms_joint_velocity", "bimanual", hz=6, episodes=44, look=NIGHT,
+      body=two_arms((0.4, 0.32, 0.24, 0.16), radius=0.17, base=(0.65, 0.6), heading=-80, bend=70),
+      controls=(JointRate("joints", _j(0, 8), unit=2.4),),
+      task=Reach(radius=0.3), instruction="reach both marks"),
+    E("torso_arms_and_fingers", "bimanual", hz=15, episodes=18, dict_actions=True, look=replace(WOOD, pattern="slope"),
+      body=attach(arm((0.25, 0.2), base=(0, -0.75), radius=0.24, swing=20, bend=25),
+                  *(attach(arm((0.26, 0.22, 0.2, 0.16, 0.1), base=(0, -0.16 * s), heading=50 * -s, radius=0.13, taper=0.93,
+                               swing=50, bend=50, paint=1), claw(5, 1, length=0.24)) for s in (-1, 1))),
+      controls=(JointTarget("torso", _j(0, 2)), JointTarget("left_arm", _j(2, 5)), JointTarget("left_hand", _j(7, 5)),
+                JointTarget("right_arm", _j(12, 5)), JointTarget("right_hand", _j(17, 5))),
+      task=Reach(radius=0.3), instruction="reach both marks"),
+    E("two_link_arm_tool_velocity", "arm", hz=2, episodes=60, look=SEA, seconds=(9, 13),
+      body=arm((0.6, 0.5), base=(0, -0.7), radius=0.2, swing=80, bend=130),
+      controls=(ToolRate("velocity", unit=0.5, convention="velocity"),),
+      task=Push(objects=1, size=0.2, radius=0.3), instruction="push the disc onto the mark"),
+    E("mirrored_pusher_targets", "pusher", hz=30, episodes=16, look=replace(MINT, distractors=2),
+      body=gantry(size=0.27),
+      controls=(JointTarget("xy", _j(0, 2), unit=0.8),),
+      task=Push(objects=2), instruction="push the disc onto the mark", cameras=(Camera(flip=True, rotate=90),)),
+    E("picker_arm_joint_targets_turns", "arm", hz=3, episodes=50, look=ROAD,
+      body=attach(arm((0.5, 0.42, 0.14), base=(0.7, -0.5), heading=140, radius=0.17, swing=70), gripper(0.28, 0.075)),
+      controls=(JointTarget("joints", _j(0, 3), unit=2 * math.pi), JointTarget("grip", (3,))),
+      task=Carry(objects=2), instruction="pick the disc and place it on the mark"),
+    E("two_rovers_wheel_speeds", "rover", hz=4, episodes=40, look=PLUM,
+      body=join(rover(size=(0.26, 0.22)), rover(size=(0.22, 0.22), round_=True)),
+      controls=(Drive("first", "wheels"), Drive("second", "wheels", base=3)),
+      task=Reach(radius=0.2), instruction="drive both robots to their marks"),
+    E("arm_with_hand_targets", "arm", hz=20, episodes=16, dict_actions=True, look=replace(LAB, floor=(120, 150, 140)),
+      body=attach(arm((0.5, 0.42), base=(-0.6, -0.6), heading=60, radius=0.19, swing=60, bend=100),
+                  claw(3, 2, length=0.26, radius=0.09)),
+      controls=(JointTarget("arm", _j(0, 2)), JointTarget("hand", _j(2, 6), unit=0.7)),
+      task=Push(objects=2, size=0.18, radius=0.3), instruction="poke the disc onto the mark"),
+    E("ten_joint_snake_targets", "arm", hz=6, episodes=36, look=CLAY,
+      body=arm((0.2,) * 10, base=(-0.85, -0.3), heading=20, radius=0.16, taper=0.97, swing=40, bend=38),
+      controls=(JointTarget("joints", _j(0, 10), unit=DEGREE),),
+      task=Push(objects=2, size=0.18, radius=0.3), instruction="push the disc onto the mark", cameras=(Camera(zoom=0.9),)),
+    E("twin_heads_delta", "pusher", hz=5, episodes=44, look=SAND,
+      body=join(gantry(size=0.22), gantry(size=0.26, rail=True)),
+      controls=(JointRate("heads", _j(0, 4), unit=0.2, convention="delta"),),
+      task=Push(objects=2, size=0.18), instruction="push the disc onto the mark"),
+    E("sixteen_joint_pair_targets", "bimanual", hz=10, episodes=24, look=SKY,
+      body=two_arms((0.3, 0.26, 0.22, 0.18), tip=claw(4, 1, length=0.24, radius=0.08), radius=0.16, bend=70),
+      controls=(JointTarget("joints", _j(0, 16), unit=1.2),),
+      task=Push(objects=2, size=0.18, radius=0.3), instruction="push the disc onto the mark"),
+    E("mobile_pair_twist_and_targets", "mobile_arm", hz=8, episodes=30, dict_actions=True, look=SLATE,
+      body=attach(rover(size=(0.28, 0.24), reach=0.45),
+                  *(attach(arm((0.28, 0.22, 0.1), base=(0, -0.15 * s), heading=25 * -s, radius=0.12, swing=70, bend=90, paint=1),
+                           gripper(0.2)) for s in (-1, 1)), at=2),
+      controls=(Drive("base", "twist", unit=METRE), JointTarget("left", _j(3, 4)), JointTarget("right", _j(7, 4))),
+      task=Carry(), instruction="fetch the disc and take it to the mark", cameras=(Camera(zoom=0.9),)),
+    E("fast_arm_joint_velocity", "arm", hz=30, episodes=16, look=CHALK,
+      body=arm((0.5, 0.4), base=(0.1, 0.1), radius=0.2, bend=150, swing=175, speed=2.6),
+      controls=(JointRate("joints", _j(0, 2), unit=DEGREE),),
+      task=Reach(radius=0.15, objects=2), instruction="touch the mark",
+      cameras=(Camera(), Camera("tip_image", follow=1))),
 )
+# fmt: on

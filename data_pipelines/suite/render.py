@@ -51,7 +51,7 @@ def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
     """The looks of n episodes: pure in (spec, n, seed)."""
     rng = np.random.default_rng([seed, 4])
     look = spec.look
-    light = rng.uniform(0.86, 1.1, (n, 1, 1)) * (1 + 0.04 * rng.standard_normal((n, 1, 3)))
+    light = rng.uniform(0.86, 1.1, (n, 1, 1)) * (1 + 0.025 * rng.standard_normal((n, 1, 3)))
 
     def colours(base: np.ndarray, spread: float) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
@@ -133,7 +133,7 @@ def _scene(spec, rollout, looks, pose: Pose, episode, step) -> Shapes:
     visible = [i for i, link in enumerate(links) if link.radius > 0]
     middle = (pose.origin[:, visible] + pose.tip[:, visible]) / 2
     discs = np.concatenate([goals, objects, drift], 1)
-    sizes = [task.radius * 0.9] * goals.shape[1]
+    sizes = [max(task.radius, 0.15)] * goals.shape[1]
     sizes += [task.size] * objects.shape[1] + [look.distractor_size] * drift.shape[1]
     count = discs.shape[1]
     return Shapes(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from data_pipelines.suite.bodies import Body, Joint, Link, attach
+from data_pipelines.suite.bodies import Body, Joint, Link, attach, join
 
 
 def arm(
@@ -186,3 +186,48 @@ def rover(
     links.append(Link(parent=2, mount=(0.45 * length, 0.0), length=0.3 * length, radius=0.1, paint=1))
     joints = (Joint(-reach, reach, speed), Joint(-reach, reach, speed), Joint(-math.pi, math.pi, turn, wraps=True))
     return Body(tuple(links), joints, (2,), (-1,))
+
+
+def claw(fingers: int, phalanges: int, *, length: float = 0.17, radius: float = 0.06) -> Body:
+    """Fingers that fan out from a wrist; they carry no tool of their own."""
+    return join(
+        *(
+            finger(
+                phalanges,
+                angle=0.8 * (2 * i / (fingers - 1) - 1),
+                length=length,
+                radius=radius,
+                curl=(-0.7, 0.7),
+                tool=False,
+                paint=2,
+            )
+            for i in range(fingers)
+        )
+    )
+
+
+def two_arms(
+    lengths: tuple[float, ...],
+    *,
+    tip: Body | None = None,
+    radius: float = 0.14,
+    base: tuple[float, float] = (0.5, -0.7),
+    heading: float = 102.0,
+    swing: float = 55.0,
+    bend: float = 100.0,
+    taper: float = 0.88,
+) -> Body:
+    """Two mirrored arms, left first, each with `tip` as its hand. Joints: arm, tip, arm, tip."""
+    arms = []
+    for side in (-1, 1):
+        one = arm(
+            lengths,
+            base=(base[0] * side, base[1]),
+            heading=90 + (heading - 90) * side,
+            radius=radius,
+            swing=swing,
+            bend=bend,
+            taper=taper,
+        )
+        arms.append(one if tip is None else attach(one, tip))
+    return join(*arms)

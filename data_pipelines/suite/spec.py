@@ -42,7 +42,7 @@ class Look:
     outside: RGB = (120, 116, 112)
     robot: tuple[RGB, RGB, RGB] = ((70, 90, 160), (215, 120, 60), (60, 60, 70))
     pattern: Literal["plain", "slope", "stripe", "table"] = "plain"
-    shade: float = 16.0  # standard deviation of the floor's colour between episodes
+    shade: float = 14.0  # standard deviation of the floor's colour between episodes
     distractors: int = 0
     distractor_speed: float = 0.35  # world units per second
     distractor_size: float = 0.13
@@ -64,7 +64,7 @@ class EmbodimentSpec:
     cameras: tuple[Camera, ...] = (Camera(),)
     seconds: tuple[float, float] = (8.0, 12.0)  # shortest and longest episode
     dict_actions: bool = False  # one tensor per control, instead of one tensor
-    purpose: float = 0.55  # share of the time spent on the task; the rest explores
+    purpose: float = 0.5  # mean share of the time spent on the task; the rest explores
     restless: float = 0.8  # changes of mind per second
     noise: float = 0.15  # of the wishes, in units of what a joint can do in 0.5 s
 

@@ -100,8 +100,6 @@ class World:
             else np.zeros((n, len(body.tools)))
         )
         self.hand = distance.argmin(1)  # the tool that does the task
-        self.done |= task.done(self)
-        self.done[:] = False
 
     @property
     def tools(self) -> np.ndarray:
@@ -194,7 +192,8 @@ class Behaviour:
     def __init__(self, world: World, rng: np.random.Generator):
         n = len(world.q)
         self.world, self.rng = world, rng
-        self.on_task = rng.random(n) < world.spec.purpose
+        self.purpose = world.spec.purpose * rng.uniform(0.0, 2.0, n)  # some only play
+        self.on_task = rng.random(n) < self.purpose
         self.wish = world.body.random(rng, n)
         self.bias = np.zeros_like(world.q)
 
@@ -202,13 +201,14 @@ class Behaviour:
         """[n, A] actions for the present state."""
         world, spec, body, rng = self.world, self.world.spec, self.world.body, self.rng
         n = len(world.q)
+        change = rng.random(n) < 0.5 * spec.restless * world.dt
+        self.on_task = np.where(change, (rng.random(n) < self.purpose) & ~world.done, self.on_task)
         arrived = np.abs(self.wish - world.q).max(1) < 0.15
-        change = (rng.random(n) < spec.restless * world.dt) | (arrived & ~self.on_task)
-        self.on_task = np.where(change, (rng.random(n) < spec.purpose) & ~world.done, self.on_task)
         wish = body.random(rng, n)
         for grip in body.grips:
             if grip >= 0:
                 wish[:, grip] = rng.random(n) < 0.5
+        change = (rng.random(n) < spec.restless * world.dt) | arrived
         self.wish = np.where(change[:, None], wish, self.wish)
 
         goal = np.where(self.on_task[:, None], self._task_goal(), self.wish)
