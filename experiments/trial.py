@@ -23,6 +23,9 @@ from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, TrainConfig, sta
 if TYPE_CHECKING:
     from experiments.pipeline import Workspace
 
+CHECKPOINTS = 5
+"""Saved per training run, evenly spread: what an interrupted trial resumes from."""
+
 Progress = Callable[[str, int, int], None]
 """Called as progress(phase, done, total)."""
 
@@ -81,7 +84,12 @@ def source_hash(packages: tuple[str, ...] = ("hma_jax", "data_pipelines")) -> st
 
 
 def run_trial(
-    trial: Trial, workspace: Workspace, directory: Path, progress: Progress = lambda *_: None
+    trial: Trial,
+    workspace: Workspace,
+    directory: Path,
+    *,
+    mesh: MeshConfig = MeshConfig(),
+    progress: Progress = lambda *_: None,
 ) -> dict[str, Any]:
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
 
@@ -94,9 +102,10 @@ def run_trial(
     from data_pipelines.store import TokenStore
     from experiments.machine import describe_machine
     from hma_jax.evaluation.protocol import evaluate
-    from hma_jax.flops import count_parameters, train_flops_per_window
-    from hma_jax.model import make_model
+    from hma_jax.flops import train_flops_per_window
+    from hma_jax.model import declare_model
     from hma_jax.tokenizers.io import load_tokenizer
+    from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
 
     store = TokenStore(workspace.store)
@@ -113,43 +122,47 @@ def run_trial(
         shuffle_actions=trial.shuffle_actions,
     )
 
-    def batches() -> Iterator[dict]:
+    def batches() -> Iterator[dict[str, Any]]:
         return eval_batches(store, table, manifest, trial.eval.batch, trial.evaluated)
 
     started = time.perf_counter()
-    outcome = train_model(
+    trained = train_model(
         trial.model,
         table,
         trial.train,
         lambda start: make_loader(store, table, loader, start_step=start),
-        mesh=MeshConfig(),
+        mesh=mesh,
         run_dir=directory / "run",
         provenance={"store": store.hash(), "tokenizer": tokenizer.identity, "loader": to_dict(loader)},
-        checkpoint_every=max(trial.train.steps // 5, 1),
-        progress=lambda step, steps, _: progress("train", step, steps),
+        options=LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
+        progress=lambda step, steps, _: progress("training", step, steps),
     )
 
-    progress("evaluate", 0, 1)
-    measure = partial(
-        evaluate, model_config=trial.model, table=table, tokenizer=tokenizer, config=trial.eval
-    )
-    evaluation = measure(outcome.params, batches=batches())
+    windows = len(trial.evaluated) * trial.eval.windows_per_dataset  # at most
+    progress("evaluating", 0, windows)
+    evaluation = evaluate(
+        trained.state.params, trial.model, table, tokenizer, batches(), trial.eval,
+        progress=lambda done: progress("evaluating", done, windows),
+    )  # fmt: skip
+    declared = declare_model(trial.model, table)
     untrained = None
     if trial.measure_untrained:
-        fresh = make_model(trial.model, table).init(trial.train.seed)
-        untrained = measure(fresh, batches=_first_of_each_dataset(batches())).to_dict()
+        untrained = evaluate(
+            declared.init(trial.train.seed), trial.model, table, tokenizer,
+            _first_of_each_dataset(batches()), trial.eval, samples_per_dataset=0,
+        ).to_dict()  # fmt: skip
 
     write_samples(directory / "samples.npz", evaluation.samples)
     result = {
         "evaluation": evaluation.to_dict(),
         "untrained": untrained,
-        "losses": outcome.losses,
-        "parameters": count_parameters(trial.model, table),
+        "losses": trained.losses,
+        "parameters": declared.count(),
         "train_flops": train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
         "run": {
             "seconds": time.perf_counter() - started,
-            "train_seconds": outcome.seconds,
-            "compile_seconds": outcome.compile_seconds,
+            "train_seconds": trained.seconds,
+            "compile_seconds": trained.compile_seconds,
             "machine": describe_machine(jax.devices()),
             "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
         },

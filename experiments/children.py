@@ -1,0 +1,60 @@
+"""Child processes: their share of the machine, and their end with the parent.
+
+The parent puts its wishes into the environment; the child calls `settle` before it imports
+JAX, whose thread pools take their size from the cores a process may use.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+_PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
+_PR_SET_PDEATHSIG = 1
+
+
+def child_environment(slot: int, workers: int, compile_cache: Path | None = None) -> dict[str, str]:
+    """The environment of the child in `slot` of `workers`: 1/workers of cores and accelerator."""
+    environment = dict(os.environ)
+    environment[_PARENT] = str(os.getpid())
+    if workers > 1 and hasattr(os, "sched_getaffinity"):
+        cores = sorted(os.sched_getaffinity(0))
+        share = cores[slot::workers] or [cores[slot % len(cores)]]
+        environment[_CORES] = ",".join(map(str, share))
+    if workers > 1:
+        environment.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 / workers:.3f}")
+    if compile_cache is not None:
+        environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(compile_cache))
+        environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    return environment
+
+
+def settle() -> None:
+    """Called first in a child: takes its cores and arranges to die with its parent."""
+    cores = os.environ.get(_CORES)
+    if cores:
+        os.sched_setaffinity(0, {int(c) for c in cores.split(",")})
+    parent = int(os.environ.get(_PARENT, "0"))
+    if parent:
+        _die_with(parent)
+
+
+def _die_with(parent: int) -> None:
+    """A parent killed with -9 cannot stop its children, so each child watches for itself."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # it died before the line above
+            os._exit(1)
+        return
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
