@@ -164,7 +164,7 @@ def merge(graphdef: nnx.GraphDef, params: Params) -> nnx.Module:
         tuple(int(k) if k.isdigit() else k for k in path): nnx.Param(value)
         for path, value in nnx.traversals.flatten_mapping(params).items()
     }
-    return nnx.merge(graphdef, nnx.State.from_flat_path(flat))
+    return nnx.merge(graphdef, nnx.from_flat_state(flat))
 
 
 def path_name(path: tuple[Any, ...]) -> str:

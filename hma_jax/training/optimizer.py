@@ -112,6 +112,6 @@ def apply_adamw(
 
 def clip_by_global_norm(grads: Params, limit: float) -> tuple[Params, jax.Array]:
     """Gradients scaled to a global norm of at most `limit`, and the norm before."""
-    norm = optax.global_norm(grads)
+    norm = optax.tree.norm(grads)
     scale = jnp.minimum(1.0, limit / jnp.maximum(norm, 1e-12))
     return jax.tree.map(lambda g: g * scale, grads), norm
