@@ -18,13 +18,17 @@ from data_pipelines.suite.world import Rollout
 CHUNK = 48
 """Frames drawn together: about what keeps canvas and windows in the cache."""
 
+PIXEL = np.complex128
+"""Pixels are moved as one 16-byte element (four float32, the last unused): six times faster
+in numpy's indexing than rows of three."""
+
 
 @dataclass(frozen=True)
 class Shapes:
     """P rounded boxes in F frames, painted in order. World units, radians, colours 0..255.
 
     centre [F, P, 2], angle [F, P], half [P, 2] (extent without the corners), radius [P],
-    colour [F, P, 3].
+    colour float32 [P, F, 4].
     """
 
     centre: np.ndarray
@@ -36,7 +40,7 @@ class Shapes:
 
 @dataclass(frozen=True)
 class Appearance:
-    """What differs between episodes: colours [n, ., 3] 0..255 and a light gradient [n, 2]."""
+    """What differs between episodes: colours [n, ., 4] 0..255 and a light gradient [n, 2]."""
 
     floor: np.ndarray
     outside: np.ndarray
@@ -55,7 +59,8 @@ def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
 
     def colours(base: np.ndarray, spread: float) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
-        return np.clip((base + spread * rng.standard_normal(base.shape)) * light, 8, 247).astype(np.float32)
+        lit = np.clip((base + spread * rng.standard_normal(base.shape)) * light, 8, 247)
+        return np.pad(lit, ((0, 0), (0, 0), (0, 1))).astype(np.float32)
 
     floor = np.array([look.floor]) + look.shade * rng.standard_normal((n, 1, 1))
     things = [_hues(rng, (n, k)) for k in (spec.task.objects, look.distractors)]
@@ -119,9 +124,9 @@ def _render_chunk(spec, rollout, looks, camera, episode, step) -> np.ndarray:
             view.angles(shapes.angle[:, p]),
             shapes.half[p] * view.scale,
             shapes.radius[p] * view.scale,
-            shapes.colour[:, p],
+            shapes.colour[p],
         )
-    return (canvas + 0.5).astype(np.uint8)
+    return canvas.astype(np.uint8)[..., :3]
 
 
 def _scene(spec, rollout, looks, pose: Pose, episode, step) -> Shapes:
@@ -136,20 +141,14 @@ def _scene(spec, rollout, looks, pose: Pose, episode, step) -> Shapes:
     sizes = [max(task.radius, 0.15)] * goals.shape[1]
     sizes += [task.size] * objects.shape[1] + [look.distractor_size] * drift.shape[1]
     count = discs.shape[1]
+    colours = [np.repeat(looks.goal, goals.shape[1], 1), looks.objects, looks.distractors]
+    colours.append(looks.robot[:, [links[i].paint for i in visible]])
     return Shapes(
         centre=np.concatenate([discs, middle], 1),
         angle=np.concatenate([np.zeros((frames, count)), pose.angle[:, visible]], 1),
         half=np.array([(0, 0)] * count + [(links[i].length / 2, links[i].half_width) for i in visible]),
         radius=np.array(sizes + [links[i].radius for i in visible]),
-        colour=np.concatenate(
-            [
-                np.repeat(looks.goal[episode], goals.shape[1], 1),
-                looks.objects[episode],
-                looks.distractors[episode],
-                looks.robot[episode][:, [links[i].paint for i in visible]],
-            ],
-            1,
-        ),
+        colour=np.ascontiguousarray(np.concatenate(colours, 1)[episode].swapaxes(0, 1)),
     )
 
 
@@ -187,8 +186,9 @@ class _View:
     def world(self) -> tuple[np.ndarray, np.ndarray]:
         """World x and y of every pixel, [F or 1, H*W] float32."""
         row, column = np.mgrid[: self.camera.height, : self.camera.width].reshape(2, -1).astype(np.float32)
-        x = (column - self.origin[0]) / self.scale * self.mirror
-        y = -(row - self.origin[1]) / self.scale
+        left, top = (float(v) for v in self.origin)  # python floats keep the arrays float32
+        x = (column - left) / self.scale * self.mirror
+        y = (top - row) / self.scale
         keep = slice(None) if self.moving else slice(0, 1)
         cos, sin = self.cos[keep, None].astype(np.float32), self.sin[keep, None].astype(np.float32)
         centre = self.centre[keep].astype(np.float32)
@@ -196,7 +196,7 @@ class _View:
 
 
 def _background(spec, looks: Appearance, view: _View, episode: np.ndarray) -> np.ndarray:
-    """float32 canvas [F, H, W, 3]: floor, outside and the light's slope."""
+    """float32 canvas [F, H, W, 4]: floor, outside and the light's slope."""
     x, y = view.world()
     pattern = spec.look.pattern
     inside = np.clip(((1.02 - np.maximum(np.abs(x), np.abs(y))) * view.scale), 0, 1)
@@ -212,16 +212,16 @@ def _background(spec, looks: Appearance, view: _View, episode: np.ndarray) -> np
     floor, outside = looks.floor[ids], looks.outside[ids]
     light = looks.slope[ids, :1] * x + looks.slope[ids, 1:] * y
     canvas = outside + inside[..., None] * (floor - outside) + light[..., None]
-    canvas = np.clip(canvas, 0, 254).reshape(-1, view.camera.height, view.camera.width, 3)
+    canvas = np.clip(canvas, 0, 254).reshape(-1, view.camera.height, view.camera.width, 4)
     return canvas if view.moving else canvas[which]
 
 
 def _paint(canvas, centre, angle, half, radius, colour) -> None:
-    """Blends one rounded box per frame into `canvas` [F, H, W, 3], in place. Pixel units."""
+    """Blends one rounded box per frame into `canvas` [F, H, W, 4], in place. Pixel units."""
     frames, height, width = canvas.shape[:3]
-    cos, sin = np.cos(angle)[:, None, None], np.sin(angle)[:, None, None]
-    extent = np.stack([np.abs(cos) * half[0] + np.abs(sin) * half[1],
-                       np.abs(sin) * half[0] + np.abs(cos) * half[1]], -1)[:, 0, 0] + radius + 1.0
+    cos, sin = np.cos(angle), np.sin(angle)
+    width_height = np.abs(cos) * half[0] + np.abs(sin) * half[1], np.abs(sin) * half[0] + np.abs(cos) * half[1]
+    extent = np.stack(width_height, 1) + radius + 1.0
     size = np.minimum(np.ceil(2 * extent.max(0)).astype(int) + 1, (width, height))
     corner = np.clip(np.floor(centre - extent).astype(int), 0, np.array([width, height]) - size)
     dx = (corner[:, :1] + np.arange(size[0]) - centre[:, :1])[:, None, :].astype(np.float32)
@@ -229,21 +229,26 @@ def _paint(canvas, centre, angle, half, radius, colour) -> None:
     if half[0] == half[1] == 0:
         squared = dx * dx + dy * dy
     else:
-        cos, sin = cos.astype(np.float32), sin.astype(np.float32)
+        cos, sin = (v.astype(np.float32)[:, None, None] for v in (cos, sin))
         u = np.abs(cos * dx + sin * dy)
         u = np.maximum(u - np.float32(half[0]), 0)
         v = np.abs(cos * dy - sin * dx)
         if half[1] > 0:
             v = np.maximum(v - np.float32(half[1]), 0)
         squared = u * u + v * v
-    cover = np.float32(radius + 0.5) - np.sqrt(squared)
-    mask = cover > 0
-    index = (np.arange(frames) * height * width)[:, None, None] + (
-        (corner[:, 1:] + np.arange(size[1])) * width
-    )[:, :, None]
-    index = (index + (corner[:, :1] + np.arange(size[0]))[:, None, :])[mask]
-    cover = np.minimum(cover[mask], 1)[:, None]
-    flat = canvas.reshape(-1, 3)
-    under = flat[index]
-    under += cover * (np.repeat(colour, mask.sum((1, 2)), 0) - under)
-    flat[index] = under
+    cover = (np.float32(radius + 0.5) - np.sqrt(squared)).ravel()
+    # From here on only covered pixels: position in the window -> position in the canvas.
+    hit = np.flatnonzero(cover > 0)
+    area = int(size[0] * size[1])
+    counts = np.diff(np.searchsorted(hit, np.arange(frames + 1) * area))
+    first = np.arange(frames) * height * width + corner[:, 1] * width + corner[:, 0]
+    window = (np.arange(size[1])[:, None] * width + np.arange(size[0])).ravel()
+    index = window[hit - np.repeat(np.arange(frames) * area, counts)] + np.repeat(first, counts)
+    pixels = canvas.reshape(-1, 4).view(PIXEL)[:, 0]
+    under = pixels[index]
+    channels = under.view(np.float32).reshape(-1, 4)
+    paint = np.repeat(colour.view(PIXEL)[:, 0], counts).view(np.float32).reshape(-1, 4)
+    paint -= channels
+    paint *= np.minimum(cover[hit], 1)[:, None]
+    channels += paint
+    pixels[index] = under

@@ -201,8 +201,8 @@ class Behaviour:
         """[n, A] actions for the present state."""
         world, spec, body, rng = self.world, self.world.spec, self.world.body, self.rng
         n = len(world.q)
-        change = rng.random(n) < 0.5 * spec.restless * world.dt
-        self.on_task = np.where(change, (rng.random(n) < self.purpose) & ~world.done, self.on_task)
+        change = rng.random(n) < spec.restless * world.dt
+        self.on_task = np.where(change, rng.random(n) < self.purpose, self.on_task) & ~world.done
         arrived = np.abs(self.wish - world.q).max(1) < 0.15
         wish = body.random(rng, n)
         for grip in body.grips:
