@@ -10,6 +10,7 @@ import difflib
 import functools
 from dataclasses import dataclass
 
+from data_pipelines.suite.embodiments import EMBODIMENTS
 from hma_jax.config import ConfigError, require
 
 FRAME_RATE = 2.0
@@ -87,9 +88,6 @@ REAL = (
 
 @functools.cache
 def _table() -> dict[str, DatasetSpec]:
-    # Imported here: the suite reads shards back through this package's modules.
-    from data_pipelines.suite.embodiments import EMBODIMENTS
-
     table = {spec.name: spec for spec in REAL}
     for e in EMBODIMENTS:
         prefix = "action/" if e.dict_actions else ""
@@ -115,7 +113,7 @@ def get_spec(name: str) -> DatasetSpec:
     spec = _table().get(name)
     if spec is None:
         close = difflib.get_close_matches(name, _table(), n=3, cutoff=0.4)
-        hint = f"did you mean {', '.join(close)}?" if close else "`hma data list` shows those known."
+        hint = f"did you mean {', '.join(close)}?" if close else f"known: {', '.join(_table())}."
         raise ConfigError(
             f"unknown dataset {name!r}; {hint} A new one is an entry in data_pipelines/registry.py."
         )

@@ -159,10 +159,11 @@ class RldsDataset:
                 )
 
     def skip(self, error: EpisodeError) -> None:
-        """Counts an unusable episode, or raises `error` under the policy corrupt='raise'."""
+        """Counts an unusable episode once, or raises `error` under the policy corrupt='raise'."""
         if self.corrupt == "raise":
             raise error
-        self._lose(str(error), 1)
+        if str(error) not in self.skipped:
+            self._lose(str(error), 1)
 
     # --- inside ------------------------------------------------------------------------------
 

@@ -7,19 +7,9 @@ everybody who reads the dataset.
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 
-
-def episode_hash(dataset: str, episodes: np.ndarray, salt: str) -> np.ndarray:
-    """uint64 per episode index: uniform, independent between datasets and salts."""
-    seed = int.from_bytes(hashlib.sha256(f"{salt}/{dataset}".encode()).digest()[:8], "little")
-    with np.errstate(over="ignore"):  # splitmix64: wrapping multiplications are the point
-        x = np.asarray(episodes, np.uint64) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed)
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
+from data_pipelines.order import hash64, stream_seed
 
 
 def held_out(
@@ -44,5 +34,5 @@ def smallest_hashes(dataset: str, episodes: np.ndarray, count: int | None, salt:
     """
     if count is None or count >= len(episodes):
         return np.arange(len(episodes))
-    order = np.argsort(episode_hash(dataset, episodes, salt), kind="stable")
+    order = np.argsort(hash64(episodes, stream_seed(salt, dataset)), kind="stable")
     return np.sort(order[:count])

@@ -1,0 +1,49 @@
+"""How often each dataset is drawn: p ∝ n^(1/τ).
+
+Owns the weights and the drop of datasets that have nothing to give; draws nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from hma_jax.config import require
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Datasets that are drawn, their probabilities, and why the others are not drawn."""
+
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+    dropped: dict[str, str]  # name -> reason
+
+
+def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.ndarray:
+    """float64 probabilities ∝ counts^(1/tau), 0 where the count is 0 (paper section 4;
+    reference section 4.3). tau = 1 is proportional sampling, larger is flatter.
+    """
+    require(tau > 0, f"the mixture temperature tau must be positive, got {tau}")
+    counts = np.asarray(counts, np.float64)
+    if counts.sum() <= 0:
+        raise DataError("every dataset of the mixture is empty; add one that has data")
+    powers = np.where(counts > 0, (counts / counts.sum()) ** (1.0 / tau), 0.0)
+    return powers / powers.sum()
+
+
+def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] = {}) -> Mixture:
+    """The mixture of the datasets in `counts` (name -> examples).
+
+    Those with none are left out; `reasons` may say why. If none remains: DataError with all
+    the reasons.
+    """
+    dropped = {n: reasons.get(n, "it is empty") for n, c in counts.items() if c == 0}
+    if len(dropped) == len(counts):
+        raise DataError("no dataset can be used. " + " ".join(f"{n}: {why}" for n, why in dropped.items()))
+    names = tuple(n for n in counts if n not in dropped)
+    weights = mixture_weights([counts[n] for n in names], tau)
+    return Mixture(names, tuple(weights.tolist()), dropped)
