@@ -11,7 +11,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from experiments.results import CurvePoint, Row, curve, tally
 
@@ -60,9 +60,8 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[str], path: Path) -> Non
     """All axes in one figure: a column per sweep, laid out as figure 6 of the paper."""
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(
-            2, len(sweeps), figsize=(3.9 * len(sweeps), 6.4), layout="constrained", squeeze=False,
-            sharey="row",
-        )  # fmt: skip
+            2, len(sweeps), figsize=(3.9 * len(sweeps), 6.2), layout="constrained", squeeze=False
+        )
         for column, sweep in enumerate(sweeps):
             for panel, metric in zip(panels[:, column], LABELS, strict=True):
                 _draw(panel, rows, sweep, metric)
@@ -92,7 +91,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: str, metric: str) -> None:
         if any(len(p.seeds) > 1 for p in points):
             panel.plot(
                 [p.x for p in points for _ in p.seeds], [v for p in points for v in p.seeds],
-                "o", color=colour, alpha=0.35, markersize=3.5, markeredgewidth=0, zorder=2, label="seeds",
+                "o", color=colour, alpha=0.45, markersize=3.5, markeredgewidth=0, zorder=4, label="seeds",
             )  # fmt: skip
         _x_axis(panel, points, sweep)
     else:
@@ -100,9 +99,11 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: str, metric: str) -> None:
     _reference_line(panel, curve(rows, sweep, metric, role="control"), "shuffled actions", (0, (4, 2)))
     if metric == "perplexity":
         panel.set_yscale("log")
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         panel.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-        panel.yaxis.set_minor_formatter(_sparse_minor(panel))
-        _reference_line(panel, curve(rows, sweep, metric, role="untrained"), "untrained", (0, (1, 2)))
+        panel.yaxis.set_minor_formatter(NullFormatter())
+        for p in curve(rows, sweep, metric, role="untrained"):  # far above: a line would flatten the curve
+            panel.set_title(f"untrained: {p.mean:.0f}", loc="left", fontsize=8.5, color=MUTED)
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     finished, total = tally(rows, sweep)
@@ -119,7 +120,7 @@ def _reference_line(panel: Axes, points: list[CurvePoint], label: str, dashes: t
         return
     mean, sem = points[-1].mean, points[-1].sem
     panel.axhline(mean, color=MUTED, linewidth=1.3, linestyle=dashes, zorder=1, label=label)
-    if sem > 0:
+    if sem > 0:  # not nan
         panel.axhspan(mean - sem, mean + sem, color=MUTED, alpha=0.12, linewidth=0, zorder=0)
 
 
@@ -134,14 +135,6 @@ def _x_axis(panel: Axes, points: list[CurvePoint], sweep: str) -> None:
     panel.xaxis.set_minor_locator(NullLocator())
     if len(points) == 1:
         panel.set_xlim(points[0].x / 2, points[0].x * 2)
-
-
-def _sparse_minor(panel: Axes) -> FuncFormatter | NullFormatter:
-    """Minor ticks are named only where a log axis spans less than a decade."""
-    low, high = panel.get_ylim()
-    if low <= 0 or high / low > 10:
-        return NullFormatter()
-    return FuncFormatter(lambda v, _: f"{v:g}")
 
 
 def _count(n: float) -> str:

@@ -14,14 +14,20 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, TrainConfig, stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from experiments.pipeline import Workspace
+    from data_pipelines.evalset import EvalManifest
+    from data_pipelines.store import TokenStore
+    from experiments.workspace import Workspace
+    from hma_jax.embodiments import EmbodimentTable
+    from hma_jax.evaluation.protocol import Evaluation
+    from hma_jax.tokenizers.base import Tokenizer
+    from hma_jax.training.loop import FitResult
 
 CHECKPOINTS = 5
 """Saved per training run, evenly spread: what an interrupted trial resumes from."""
@@ -83,6 +89,98 @@ def source_hash(packages: tuple[str, ...] = ("hma_jax", "data_pipelines")) -> st
     )
 
 
+@dataclass(frozen=True)
+class Materials:
+    """What the pipeline prepared, opened."""
+
+    store: TokenStore
+    tokenizer: Tokenizer
+    manifest: EvalManifest
+
+
+def open_materials(workspace: Workspace) -> Materials:
+    """Raises ConfigError or DataError for what is missing or damaged."""
+    from data_pipelines.evalset import EvalManifest
+    from data_pipelines.store import TokenStore
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    return Materials(
+        TokenStore(workspace.store),
+        load_tokenizer(workspace.tokenizer),
+        EvalManifest.load(workspace.manifest),
+    )
+
+
+def train_trial(
+    trial: Trial,
+    materials: Materials,
+    run_dir: Path,
+    *,
+    mesh: MeshConfig = MeshConfig(),
+    progress: Progress = lambda *_: None,
+) -> FitResult:
+    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train_model`."""
+    from data_pipelines.loader import LoaderConfig, make_loader
+    from hma_jax.training.loop import LoopOptions
+    from hma_jax.training.train import train_model
+
+    store = materials.store
+    table = store.embodiment_table(trial.datasets)
+    loader = LoaderConfig(
+        frames=trial.model.frames,
+        batch=trial.train.batch,
+        tau=trial.tau,
+        seed=trial.train.seed,
+        max_trajectories=trial.max_trajectories,
+        datasets=trial.datasets,
+        shuffle_actions=trial.shuffle_actions,
+    )
+    return train_model(
+        trial.model,
+        table,
+        trial.train,
+        lambda start: make_loader(store, table, loader, start_step=start),
+        mesh=mesh,
+        run_dir=run_dir,
+        provenance={
+            "store": store.hash(),
+            "tokenizer": materials.tokenizer.identity,
+            "loader": to_dict(loader),
+        },
+        options=LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
+        progress=lambda step, steps, _: progress("training", step, steps),
+    )
+
+
+def evaluate_on(
+    names: tuple[str, ...],
+    params: Any,
+    model: ModelConfig,
+    table: EmbodimentTable,
+    materials: Materials,
+    config: EvalConfig,
+    *,
+    first_batches: bool = False,
+    progress: Progress = lambda *_: None,
+) -> Evaluation:
+    """The protocol over the frozen windows of `names`; only the first batch of each on request."""
+    from data_pipelines.evalset import eval_batches
+    from hma_jax.evaluation.protocol import evaluate
+
+    batches = eval_batches(materials.store, table, materials.manifest, config.batch, names)
+    windows = len(names) * config.windows_per_dataset  # at most
+    progress("evaluating", 0, windows)
+    return evaluate(
+        params,
+        model,
+        table,
+        materials.tokenizer,
+        _first_of_each_dataset(batches) if first_batches else batches,
+        config,
+        progress=lambda done: progress("evaluating", done, windows),
+    )
+
+
 def run_trial(
     trial: Trial,
     workspace: Workspace,
@@ -93,64 +191,27 @@ def run_trial(
 ) -> dict[str, Any]:
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
 
-    Returns what it writes to result.json. Raises ConfigError, DataError or DivergedError.
+    Returns what it writes to result.json. Raises ConfigError, DataError, DivergedError or
+    Interrupted.
     """
     import jax
 
-    from data_pipelines.evalset import EvalManifest, eval_batches
-    from data_pipelines.loader import LoaderConfig, make_loader
-    from data_pipelines.store import TokenStore
     from experiments.machine import describe_machine
-    from hma_jax.evaluation.protocol import evaluate
     from hma_jax.flops import train_flops_per_window
     from hma_jax.model import declare_model
-    from hma_jax.tokenizers.io import load_tokenizer
-    from hma_jax.training.loop import LoopOptions
-    from hma_jax.training.train import train_model
-
-    store = TokenStore(workspace.store)
-    table = store.embodiment_table(trial.datasets)
-    tokenizer = load_tokenizer(workspace.tokenizer)
-    manifest = EvalManifest.load(workspace.manifest)
-    loader = LoaderConfig(
-        frames=trial.model.frames,
-        batch=trial.train.batch,
-        tau=trial.tau,
-        seed=trial.train.seed,
-        max_trajectories=trial.max_trajectories,
-        datasets=trial.datasets,
-        shuffle_actions=trial.shuffle_actions,
-    )
-
-    def batches() -> Iterator[dict[str, Any]]:
-        return eval_batches(store, table, manifest, trial.eval.batch, trial.evaluated)
 
     started = time.perf_counter()
-    trained = train_model(
-        trial.model,
-        table,
-        trial.train,
-        lambda start: make_loader(store, table, loader, start_step=start),
-        mesh=mesh,
-        run_dir=directory / "run",
-        provenance={"store": store.hash(), "tokenizer": tokenizer.identity, "loader": to_dict(loader)},
-        options=LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
-        progress=lambda step, steps, _: progress("training", step, steps),
-    )
-
-    windows = len(trial.evaluated) * trial.eval.windows_per_dataset  # at most
-    progress("evaluating", 0, windows)
-    evaluation = evaluate(
-        trained.state.params, trial.model, table, tokenizer, batches(), trial.eval,
-        progress=lambda done: progress("evaluating", done, windows),
-    )  # fmt: skip
+    materials = open_materials(workspace)
+    table = materials.store.embodiment_table(trial.datasets)
     declared = declare_model(trial.model, table)
+    trained = train_trial(trial, materials, directory / "run", mesh=mesh, progress=progress)
+
+    subject = (trial.model, table, materials, trial.eval)
+    evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, progress=progress)
     untrained = None
-    if trial.measure_untrained:
-        untrained = evaluate(
-            declared.init(trial.train.seed), trial.model, table, tokenizer,
-            _first_of_each_dataset(batches()), trial.eval, samples_per_dataset=0,
-        ).to_dict()  # fmt: skip
+    if trial.measure_untrained:  # what it says of one batch it says of all: it has learnt nothing
+        fresh = declared.init(trial.train.seed)
+        untrained = evaluate_on(trial.evaluated, fresh, *subject, first_batches=True).to_dict()
 
     write_samples(directory / "samples.npz", evaluation.samples)
     result = {
@@ -172,7 +233,7 @@ def run_trial(
 
 
 def _first_of_each_dataset(batches: Iterator[dict]) -> Iterator[dict]:
-    """One batch per dataset: enough for a model that has learnt nothing."""
+    """The first batch of each dataset."""
     seen = set()
     for batch in batches:
         if batch["dataset"] not in seen:

@@ -25,7 +25,7 @@ def main(directory: Path) -> int:
 
     from data_pipelines.errors import DataError
     from experiments.ledger import DIVERGED, FAILED
-    from experiments.pipeline import Workspace
+    from experiments.workspace import Workspace
     from experiments.trial import Trial, run_trial, write_atomically
     from hma_jax.config import ConfigError, MeshConfig, from_dict
     from hma_jax.training.loop import DivergedError, Interrupted

@@ -1,0 +1,211 @@
+"""The `hma` command line: arguments, help and error messages. What commands do is in `commands`.
+
+Exit codes: 0 done; 1 the work failed (data, a trial, a full disk); 2 wrong arguments or
+configuration; 130 interrupted. `--debug` or HMA_DEBUG=1 shows the traceback of an error.
+Imports no JAX, so that --help is instant.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
+from tyro.extras import SubcommandApp
+
+from experiments import commands
+from experiments.progress import errors
+from hma_jax.config import ConfigError, MeshConfig
+
+PROGRAM = "hma"
+Preset = Literal["smoke", "cpu", "accelerator", "paper"]
+Axis = Literal["datasets", "trajectories", "width"]
+
+
+@dataclass(frozen=True)
+class Where:
+    """Which study, on which data, in which directory."""
+
+    preset: Preset = "cpu"
+    """Named study: smoke (seconds), cpu (minutes), accelerator (one GPU), paper (as published)."""
+    out: Path | None = None
+    """Directory for everything that is written; runs/PRESET if not given."""
+    data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
+    """Your RLDS directories, instead of the simulated suite. Their names must be in the registry."""
+    set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
+    """Change one setting, such as --set model.frames=4 --set train.steps=100; may be repeated."""
+
+    def setting(self) -> commands.Setting:
+        return commands.make_setting(self.preset, self.out, self.data, self.set)
+
+
+@dataclass(frozen=True)
+class How:
+    """How trials are run; none of it changes a result."""
+
+    workers: int = 1
+    """Trials at a time, each in its own process with its share of the cores."""
+    retry_failed: Annotated[bool, arg(name="retry-failed")] = False
+    """Run trials again that failed or diverged; otherwise they stay as they are, and visible."""
+    dry_run: Annotated[bool, arg(name="dry-run")] = False
+    """Print trials, parameters, FLOPs and expected time, and stop."""
+    mesh: tuple[int, int, int] = (-1, 1, 1)
+    """Devices for data, fsdp and tensor parallelism; -1 takes those that are left."""
+
+
+app = SubcommandApp()
+data_app = SubcommandApp()
+tokenizer_app = SubcommandApp()
+
+
+@app.command(name="study")
+def study(where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
+    """Run a whole scaling study: data, tokenizer, the three sweeps, CSV, figures and a report page.
+
+    Run the same command again after an interruption: only what is missing is done.
+    """
+    _run(where, how, tuple(commands.AXES))
+
+
+@app.command(name="sweep")
+def sweep(axis: Positional[Axis], where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
+    """Run one axis of a study: datasets, trajectories or width.
+
+    Shares data and the reference trial with the other axes of the same --out.
+    """
+    _run(where, how, (axis,))
+
+
+def _run(where: Where, how: How, axes: tuple[str, ...]) -> None:
+    setting = where.setting()
+    if how.workers < 1:
+        raise ConfigError(f"--workers must be at least 1, got {how.workers}")
+    mesh = MeshConfig(*how.mesh)
+    if how.dry_run:
+        commands.dry_run(setting.study, axes)
+        return
+    commands.run_study(setting, axes, workers=how.workers, retry_failed=how.retry_failed, mesh=mesh)
+
+
+@data_app.command(name="list")
+def data_list() -> None:
+    """List the datasets that the registry knows: camera, action size, rate."""
+    commands.list_datasets()
+
+
+@data_app.command(name="suite")
+def data_suite(where: OmitArgPrefixes[Where]) -> None:
+    """Write the study's simulated datasets as RLDS directories."""
+    commands.write_suite(where.setting())
+
+
+@tokenizer_app.command(name="train")
+def tokenizer_train(where: OmitArgPrefixes[Where]) -> None:
+    """Train the study's image tokenizer on its datasets."""
+    commands.train_tokenizer(where.setting())
+
+
+@app.command(name="tokenize")
+def tokenize(where: OmitArgPrefixes[Where]) -> None:
+    """Prepare everything up to training: suite, tokenizer, token store, evaluation windows."""
+    commands.tokenize(where.setting())
+
+
+@app.command(name="train")
+def train(
+    where: OmitArgPrefixes[Where],
+    run: Path | None = None,
+    mesh: tuple[int, int, int] = (-1, 1, 1),
+) -> None:
+    """Train one model, the study's reference trial; change it with --set.
+
+    Args:
+        where: Study, data, output directory and settings.
+        run: Directory of the training run; OUT/model if not given. Resumed if it exists.
+        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
+    """
+    commands.train(where.setting(), run, MeshConfig(*mesh))
+
+
+@app.command(name="evaluate")
+def evaluate(run: Positional[Path], where: OmitArgPrefixes[Where]) -> None:
+    """Evaluate a trained model on the frozen windows of a study.
+
+    Args:
+        run: Directory of the training run.
+        where: The study whose windows, tokenizer and protocol are used.
+    """
+    commands.evaluate(where.setting(), run)
+
+
+@app.command(name="report")
+def report(out: Path) -> None:
+    """Draw CSV, figures and page again from the trials that are finished.
+
+    Args:
+        out: Directory of a study that has run.
+    """
+    commands.draw_again(out)
+
+
+app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
+app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit code; errors become one message on stderr."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = os.environ.get("HMA_DEBUG", "0") not in ("", "0")
+    if "--debug" in arguments:
+        arguments.remove("--debug")
+        debug = True
+    try:
+        app.cli(
+            prog=PROGRAM,
+            description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
+            args=arguments or ["--help"],
+        )
+        return 0
+    except KeyboardInterrupt:
+        _say("interrupted; the same command goes on from here")
+        return 130
+    except Exception as error:  # the boundary of the program
+        code = _exit_code(error)
+        if debug or code is None:
+            raise
+        _say(f"error: {error}")
+        return code
+
+
+def _exit_code(error: Exception) -> int | None:
+    """None for what is not the user's business: a bug, shown with its traceback."""
+    from data_pipelines.errors import DataError
+
+    if isinstance(error, ConfigError):
+        return 2
+    if isinstance(error, (DataError, commands.TrialsFailed, OSError)):
+        return 1
+    if "jax" in sys.modules:  # otherwise none of these can have been raised
+        from hma_jax.training.loop import DivergedError, Interrupted
+
+        if isinstance(error, (DivergedError, Interrupted)):
+            return 130 if isinstance(error, Interrupted) else 1
+    return None
+
+
+def _say(message: str) -> None:
+    errors.print(message, markup=False, soft_wrap=True)
+
+
+def run_module(axis: str) -> None:
+    """The main of a sweep module: `python -m experiments.scale_width` is `hma sweep width`."""
+    sys.exit(main(["sweep", axis, *sys.argv[1:]]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""What a person sees while work goes on: bars on a terminal, plain lines in a log."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from experiments.ledger import FINISHED
+from experiments.runner import Job, Monitor, State
+
+console = Console(highlight=False)
+errors = Console(stderr=True, highlight=False)
+
+Update = Callable[[int, int, str], None]
+"""Called as update(done, total, note)."""
+
+
+def _bars() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=28),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("[dim]{task.fields[note]}"),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+    )
+
+
+@contextmanager
+def step(title: str) -> Iterator[Update]:
+    """A bar while the block runs, one line with its duration after it."""
+    began = time.monotonic()
+    if not console.is_terminal:
+        console.print(f"{title} ...")
+    with _bars() as bars:
+        task = bars.add_task(title, total=None, note="")
+        yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)
+    console.print(f"[green]done[/] {title} [dim]({_clock(time.monotonic() - began)})")
+
+
+class SweepMonitor(Monitor):
+    """A bar per running trial under one for all of them; a line for each that ends."""
+
+    def __init__(self, total: int, done: int = 0):
+        self.total, self.ended_count = total, done
+        self.bars = _bars()
+        self.tasks: dict[str, TaskID] = {}
+        self.all = self.bars.add_task("trials", total=total, completed=done, note="")
+
+    def __enter__(self) -> SweepMonitor:
+        self.bars.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.bars.stop()
+
+    def started(self, job: Job, resumed: bool) -> None:
+        note = "resumed" if resumed else "starting"
+        self.tasks[job.id] = self.bars.add_task(f"  {job.title}", total=None, note=note)
+
+    def progressed(self, job: Job, phase: str, done: int, total: int) -> None:
+        self.bars.update(self.tasks[job.id], completed=done, total=total, note=phase)
+
+    def ended(self, job: Job, state: State, seconds: float) -> None:
+        self.bars.remove_task(self.tasks.pop(job.id))
+        self.ended_count += 1
+        self.bars.update(self.all, completed=self.ended_count)
+        colour = "green" if state.event == FINISHED else "red"
+        message = f": {state.message}" if state.message else ""
+        self.bars.console.print(
+            f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {job.title} "
+            f"[dim]({_clock(seconds)})[/]{message}"
+        )
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"

@@ -1,0 +1,42 @@
+"""The look of the report: one style sheet, readable in light and dark."""
+
+CSS = """
+:root { color-scheme: light dark; --ink: #22262b; --muted: #6a727b; --line: #dfe3e7; --paper: #ffffff;
+  --soft: #f5f7f8; --good: #2c7a4b; --bad: #b3301e; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e3e6e9; --muted: #99a2ab; --line: #363c43;
+  --paper: #17191c; --soft: #1f2327; --good: #6cc08b; --bad: #ef7e6c; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--paper); color: var(--ink);
+  font: 16px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
+main { max-width: 1060px; margin: 0 auto; padding: 2.5rem 1.25rem 4rem; }
+h1 { font-size: 1.9rem; line-height: 1.2; margin: 0 0 .4rem; font-weight: 650; }
+h1 em { font-style: normal; color: var(--muted); }
+h2 { font-size: 1.25rem; margin: 2.8rem 0 .8rem; padding-top: .9rem; border-top: 1px solid var(--line); }
+h3 { font-size: 1.02rem; margin: 1.6rem 0 .2rem; }
+p { margin: .4rem 0 .8rem; max-width: 46rem; }
+.lead { font-size: 1.08rem; } .meta, .sem { color: var(--muted); }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(220px, 1fr)); gap: .8rem; margin: 1.4rem 0; }
+.card { background: var(--soft); border-radius: 8px; padding: .8rem 1rem; }
+.card small { display: block; color: var(--muted); } .card b { font-size: 1.45rem; font-weight: 600; }
+.card b .sem { font-size: 1rem; font-weight: 400; }
+.warning { color: var(--bad); }
+.plot { display: block; width: 100%; border-radius: 8px; background: white; padding: .5rem; }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; margin: .5rem 0 .8rem; }
+th, td { text-align: right; padding: .28rem .8rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th { color: var(--muted); font-weight: 500; }
+th.text, td.text { text-align: left; } th:first-child, td:first-child { padding-left: 0; }
+td:nth-child(3).text { white-space: normal; min-width: 8rem; }
+.finished { color: var(--good); } .failed, .diverged { color: var(--bad); font-weight: 600; }
+.missing, .interrupted { color: var(--muted); }
+.strip { margin: 1.1rem 0; } .strip figcaption { font-weight: 600; font-size: .92rem; }
+.strip div { display: flex; align-items: center; gap: .8rem; margin: 3px 0; }
+.strip span { flex: 0 0 6.6rem; color: var(--muted); font-size: .82rem; }
+.strip img { flex: 1; min-width: 0; width: 100%; image-rendering: pixelated; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .25rem 1.2rem; font-size: .9rem; }
+dt { color: var(--muted); } dd { margin: 0; overflow-wrap: anywhere; }
+code, pre { font: .86em/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
+pre { background: var(--soft); padding: 1rem; border-radius: 8px; overflow-x: auto; }
+summary { cursor: pointer; color: var(--muted); margin: .8rem 0; }
+@media print { details { display: none; } }
+"""
