@@ -54,8 +54,8 @@ class Checkpoints:
 
     def save(self, step: int, state: Any) -> None:
         """Starts an asynchronous save; the arrays are copied before this returns."""
-        if step != self.latest_step:
-            self._orbax.save_async(step, state, custom_metadata=self.meta)
+        # Without `force` Orbax drops a save that comes while the previous one is being written.
+        self._orbax.save_async(step, state, custom_metadata=self.meta, force=True)
 
     def wait(self) -> None:
         self._orbax.wait()

@@ -1,0 +1,130 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, ModelConfig, MupConfig
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.evaluation.metrics import factored_cross_entropy
+from hma_jax.flops import forward_flops_per_window
+from hma_jax.model import declare_model
+from hma_jax.model.hma import compose, factorise
+from tests.tiny import TABLE, lively_params, model_config, random_batch
+
+
+def logits_of(config, declared, params, batch, actions=True):
+    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], b["actions"] if actions else None,
+                                                   b["embodiment"])[0])
+    return np.asarray(apply(params, batch))
+
+
+def test_factor_zero_holds_the_low_digits():
+    ids = jnp.array([0, 512, 513, 262143])
+    factors = factorise(ids, 2, 512)
+    np.testing.assert_array_equal(factors, [[0, 0], [0, 1], [1, 1], [511, 511]])
+    np.testing.assert_array_equal(compose(factors, 512), ids)
+
+
+def test_an_untrained_model_s_perplexity_is_the_vocabulary_size():
+    config = model_config()
+    declared = declare_model(config, TABLE)
+    batch = random_batch(0, config)
+    logits = logits_of(config, declared, declared.init(0), batch)
+    perplexity = np.exp(np.asarray(factored_cross_entropy(logits, batch["tokens"])).mean())
+    assert abs(perplexity / config.vocab_size - 1) < 0.02
+
+
+def test_the_future_does_not_reach_the_past():
+    config = model_config()
+    declared, params = lively_params(config)
+    batch = random_batch(0, config)
+    changed = dict(batch, tokens=batch["tokens"].copy(), actions=batch["actions"].copy())
+    changed["tokens"][:, 4] = (changed["tokens"][:, 4] + 1) % config.vocab_size
+    changed["actions"][:, 4:] += 1
+    a = logits_of(config, declared, params, batch)
+    b = logits_of(config, declared, params, changed)
+    np.testing.assert_array_equal(a[:, :4], b[:, :4])
+    assert np.abs(a[:, 4:] - b[:, 4:]).min(axis=(0, 2, 3, 4)).max() >= 0
+    assert all(np.abs(a[:, t] - b[:, t]).max() > 1e-3 for t in (4, 5))
+
+
+def test_the_chunk_before_a_frame_changes_its_logits():
+    config = model_config()
+    declared, params = lively_params(config)
+    batch = random_batch(0, config)
+    changed = dict(batch, actions=batch["actions"].copy())
+    changed["actions"][:, 2, :2] += 5.0
+    a = logits_of(config, declared, params, batch)
+    b = logits_of(config, declared, params, changed)
+    assert np.abs(a[:, 3] - b[:, 3]).max() > 1e-3
+
+
+def test_padding_and_dead_dimensions_of_actions_are_ignored():
+    config = model_config()
+    declared, params = lively_params(config)
+    batch = random_batch(0, config)
+    batch["embodiment"][:] = 2  # its second dimension never moves; chunk 9 of 14
+    noisy = dict(batch, actions=batch["actions"].copy())
+    noisy["actions"][:, :, [1, 4, 7]] += 3.0
+    noisy["actions"][:, :, 9:] = 7.0
+    np.testing.assert_array_equal(
+        logits_of(config, declared, params, batch), logits_of(config, declared, params, noisy)
+    )
+
+
+def test_an_example_does_not_depend_on_the_robots_beside_it():
+    config = model_config()
+    declared, params = lively_params(config)
+    batch = random_batch(0, config)
+    alone = {k: v[:1] for k, v in batch.items()}
+    together = logits_of(config, declared, params, batch)[:1]
+    np.testing.assert_allclose(together, logits_of(config, declared, params, alone), atol=2e-4)
+
+
+@pytest.mark.parametrize("change", [{"remat": False}, {"compute_dtype": "bfloat16"}])
+def test_remat_changes_nothing_and_bfloat16_little(change):
+    config = model_config()
+    declared, params = lively_params(config, scale=0.05)
+    batch = random_batch(0, config)
+    other = dataclasses.replace(config, **change)
+    a = logits_of(config, declared, params, batch)
+    b = logits_of(other, declare_model(other, TABLE), params, batch)
+    tolerance = 1e-5 if "remat" in change else 0.1 * np.abs(a).max()
+    assert b.dtype == np.float32
+    np.testing.assert_allclose(a, b, atol=tolerance)
+
+
+def test_flops_grow_with_the_square_of_the_width():
+    base = forward_flops_per_window(ModelConfig(width=256), TABLE)
+    wide = forward_flops_per_window(ModelConfig(width=512), TABLE)
+    assert 3.4 < wide / base < 4.0
+
+
+def test_flops_formula_counts_what_the_program_multiplies():
+    """Against XLA's count of one unscanned, unmodulated block without attention scores."""
+    config = model_config(layers=1, frames=4, tokens=64, action_tokens=1, width=64)
+    table = EmbodimentTable((Embodiment("a", 2, 1, (0.0,) * 2, (1.0,) * 2),))
+    declared = declare_model(config, table)
+    batch = random_batch(0, config, 1, table)
+    apply = jax.jit(lambda p: declared.merge(p)(batch["tokens"], batch["actions"], batch["embodiment"])[0])
+    counted = apply.lower(declared.init(0)).compile().cost_analysis()["flops"]
+    formula = forward_flops_per_window(config, table)
+    # XLA adds element-wise work and full (not causal) temporal scores.
+    assert 0.75 < formula / counted < 1.05
+
+
+def test_heads_must_divide_the_width():
+    with pytest.raises(ConfigError, match="not a multiple of model.heads"):
+        ModelConfig(width=250)
+
+
+def test_mup_scales_attention_with_the_head_and_the_readout_with_the_width():
+    config = model_config(width=64, mup=MupConfig(base_width=32))
+    declared, params = lively_params(config)
+    hma = declared.merge(params)
+    assert hma.trunk.blocks.space.scale == 8.0 / 16
+    x = jnp.ones((1, 64))
+    plain = x @ params["readout"]["kernel"] / 2 + params["readout"]["bias"]
+    np.testing.assert_allclose(hma.logits(x).reshape(1, -1), plain, rtol=1e-5)

@@ -1,0 +1,122 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from hma_jax.config import MupConfig, OptimizerConfig
+from hma_jax.model import declare_model
+from hma_jax.params import is_spec
+from hma_jax.training.optimizer import (
+    apply_adamw,
+    clip_by_global_norm,
+    init_adam,
+    learning_rate_multiplier,
+    make_schedule,
+)
+from tests.tiny import TABLE, lively_params, model_config
+
+CONFIG = OptimizerConfig(learning_rate=1e-2, weight_decay=0.1)
+
+
+def gradients(params, seed=0):
+    leaves, treedef = jax.tree.flatten(params)
+    rng = np.random.default_rng(seed)
+    return jax.tree.unflatten(treedef, [jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in leaves])
+
+
+def update(declared, params, state, present, seed=0, config=CONFIG):
+    ones = jax.tree.map(lambda _: 1.0, declared.specs, is_leaf=is_spec)
+    return apply_adamw(
+        gradients(params, seed), state, params, declared.specs, ones, jnp.array(present), 1e-2, config
+    )
+
+
+def slices(declared, tree, robot):
+    """The given robot's slice of every per-robot array."""
+    specs = declared.leaves()
+    out = {}
+    for path, leaf in jax.tree.leaves_with_path(tree):
+        name = "/".join(str(k.key) for k in path)
+        axis = specs[name].embodiment_axis
+        if axis is not None:
+            out[name] = np.take(np.asarray(leaf), robot, axis)
+    return out
+
+
+def test_robots_absent_from_a_step_do_not_move():
+    declared, params = lively_params(model_config())
+    state = init_adam(params, TABLE.size)
+    params1, state1 = update(declared, params, state, [True, True, True])
+    params2, state2 = update(declared, params1, state1, [True, False, True], seed=1)
+    for name, before in slices(declared, params1, 1).items():
+        np.testing.assert_array_equal(before, slices(declared, params2, 1)[name], err_msg=name)
+    for old, new in ((state1.first, state2.first), (state1.second, state2.second)):
+        for name, before in slices(declared, old, 1).items():
+            np.testing.assert_array_equal(before, slices(declared, new, 1)[name], err_msg=name)
+    assert state2.count_E.tolist() == [2, 1, 2] and int(state2.count) == 2
+    moved = slices(declared, params2, 0)
+    assert all((moved[n] != x).any() for n, x in slices(declared, params1, 0).items() if x.any())
+
+
+def test_a_robot_that_returns_goes_on_as_if_the_steps_between_had_not_been():
+    declared, params = lively_params(model_config())
+    state = init_adam(params, TABLE.size)
+    a, sa = update(declared, params, state, [True, True, True], seed=0)
+    away, s_away = update(declared, a, sa, [True, False, True], seed=5)
+    back, _ = update(declared, away, s_away, [True, True, True], seed=1)
+    direct, _ = update(declared, a, sa, [True, True, True], seed=1)
+    for name, expected in slices(declared, direct, 1).items():
+        np.testing.assert_array_equal(expected, slices(declared, back, 1)[name], err_msg=name)
+
+
+def test_with_everyone_present_it_is_adamw():
+    declared, params = lively_params(model_config())
+    decayed = jax.tree.map(lambda s: s.decay, declared.specs, is_leaf=is_spec)
+    reference = optax.adamw(
+        1e-2, CONFIG.beta1, CONFIG.beta2, CONFIG.epsilon, weight_decay=0.1, mask=decayed
+    )
+    theirs, opt = params, reference.init(params)
+    ours, state = params, init_adam(params, TABLE.size)
+    for seed in range(3):
+        ours, state = update(declared, ours, state, [True] * 3, seed)
+        updates, opt = reference.update(gradients(params, seed), opt, theirs)
+        theirs = optax.apply_updates(theirs, updates)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), ours, theirs)
+
+
+def test_biases_are_never_decayed_and_matrices_are():
+    leaves = declare_model(model_config(), TABLE).leaves()
+    assert all(spec.decay != name.endswith("bias") for name, spec in leaves.items())
+
+
+def test_mup_divides_the_rate_of_hidden_matrices_only():
+    config = model_config(width=128, mup=MupConfig(base_width=32))
+    leaves = declare_model(config, TABLE).leaves()
+    scaled = {n for n, s in leaves.items() if learning_rate_multiplier(s, config) == 0.25}
+    assert {"trunk/blocks/space/qkv", "trunk/blocks/mlp_in/kernel", "stem/out/kernel"} <= scaled
+    for name in ("stem/into/kernel", "readout/kernel", "embed/tables", "positions"):
+        assert name not in scaled
+    assert all(s.role == "hidden" for n, s in leaves.items() if n in scaled)
+
+
+def test_schedules_warm_up_hold_and_fall():
+    rates = lambda **kw: np.array(  # noqa: E731
+        [make_schedule(OptimizerConfig(learning_rate=1.0, **kw), 100)(s) for s in range(100)]
+    )
+    constant = rates(schedule="constant", warmup_steps=10)
+    np.testing.assert_allclose(constant[:10], np.arange(1, 11) / 10, rtol=1e-5)
+    assert (constant[10:] == 1).all()
+    cosine = rates(schedule="cosine", warmup_steps=10)
+    assert cosine[10] == 1 and (np.diff(cosine[10:]) <= 0).all() and 0.1 <= cosine[-1] < 0.102
+    wsd = rates(schedule="wsd", warmup_steps=10)
+    assert (wsd[10:80] == 1).all() and wsd[90] == pytest.approx(0.55, abs=0.02) and wsd[-1] < 0.16
+
+
+def test_clipping_leaves_small_gradients_alone_and_reports_the_norm_before():
+    grads = {"a": jnp.array([3.0, 4.0])}
+    same, norm = clip_by_global_norm(grads, 10.0)
+    np.testing.assert_array_equal(same["a"], grads["a"])
+    small, _ = clip_by_global_norm(grads, 1.0)
+    assert norm == 5.0
+    np.testing.assert_allclose(small["a"], [0.6, 0.8], rtol=1e-6)

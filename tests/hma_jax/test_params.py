@@ -1,0 +1,73 @@
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from hma_jax.config import ConfigError, ModelConfig
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model import declare_model
+from hma_jax.params import declare, normal, param, stack, zeros
+from tests.tiny import TABLE, model_config
+
+ONE_ROBOT = EmbodimentTable((Embodiment("table", 2, 1, (0.0, 0.0), (1.0, 1.0)),))
+
+# The official model also holds an action head and action mask tokens, which forward dynamics
+# never touches: T D + 2 D + 2 parameters with one robot of two action dimensions.
+OFFICIAL = {128: 11_320_962, 256: 43_645_186, 1024: 678_680_578}
+
+
+@pytest.mark.parametrize("width", OFFICIAL)
+def test_parameter_count_is_the_release_s(width: int):
+    unused = 12 * width + 2 * width + 2
+    config = ModelConfig(width=width)
+    assert declare_model(config, ONE_ROBOT).count() == OFFICIAL[width] - unused
+
+
+class Pair(nnx.Module):
+    def __init__(self, extra: bool):
+        self.first = param((3, 4), ("D", None), normal(1.0), role="hidden")
+        if extra:
+            self.second = param((2,), ("E",), normal(1.0), role="vector")
+
+
+def test_adding_a_parameter_leaves_the_others_initial_values_alone():
+    without = declare(lambda: Pair(False)).init(3)
+    with_extra = declare(lambda: Pair(True)).init(3)
+    np.testing.assert_array_equal(without["first"], with_extra["first"])
+
+
+def test_the_seed_decides_the_initial_values():
+    declared = declare(lambda: Pair(True))
+    assert not np.array_equal(declared.init(0)["first"], declared.init(1)["first"])
+    np.testing.assert_array_equal(declared.init(1)["second"], declared.init(1)["second"])
+
+
+def test_stacked_modules_gain_a_layer_axis_and_differ_between_layers():
+    class Tower(nnx.Module):
+        def __init__(self):
+            self.floors = stack(lambda: Pair(False), 5)
+
+    declared = declare(Tower)
+    spec = declared.leaves()["floors/first"]
+    assert spec.shape == (5, 3, 4) and spec.axes == ("N", "D", None)
+    floors = declared.init(0)["floors"]["first"]
+    assert len({float(x) for x in floors[:, 0, 0]}) == 5
+
+
+def test_a_declaration_with_a_missing_axis_name_is_refused():
+    with pytest.raises(ConfigError, match="needs 2 axes"):
+        param((2, 3), ("D",), zeros, role="hidden")
+
+
+def test_every_robot_s_own_parameter_is_known_by_its_axis():
+    leaves = declare_model(model_config(), TABLE).leaves()
+    own = {name for name, spec in leaves.items() if spec.embodiment_axis is not None}
+    assert own == {name for name in leaves if "stem" in name or "modulation" in name}
+    assert all(leaves[n].shape[leaves[n].embodiment_axis] == TABLE.size for n in own)
+
+
+def test_initial_arrays_follow_the_requested_sharding():
+    declared = declare(lambda: Pair(False))
+    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    params = declared.init(0, {"first": device})
+    assert params["first"].sharding == device

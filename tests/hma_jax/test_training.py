@@ -1,0 +1,180 @@
+import dataclasses
+import json
+import signal
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.config import OptimizerConfig
+from hma_jax.training.checkpoints import CheckpointError
+from hma_jax.training.loop import DivergedError, Interrupted, LoopOptions
+from hma_jax.training.train import load_run, train_model
+from tests.tiny import TABLE, batches, model_config, train_config
+
+EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
+
+
+def train(run_dir: Path, *, config=None, make=None, options=EVERY_TWO, provenance=None, **kwargs):
+    model = model_config()
+    return train_model(
+        model,
+        TABLE,
+        config or train_config(),
+        make or batches(model),
+        run_dir=run_dir,
+        provenance=provenance or {"data": "random"},
+        options=options,
+        **kwargs,
+    )
+
+
+def equal_trees(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def dying_batches(after: int):
+    """The usual stream, whose source breaks once `after` batches were taken."""
+    usual = batches(model_config())
+
+    def make(start: int):
+        for number, batch in enumerate(usual(start), start + 1):
+            if number > after:
+                raise OSError("the disk went away")
+            yield batch
+
+    return make
+
+
+def test_a_run_that_broke_and_resumed_is_byte_equal_to_one_that_did_not(tmp_path: Path):
+    whole = train(tmp_path / "whole")
+    with pytest.raises(OSError):
+        train(tmp_path / "broken", make=dying_batches(after=5))
+    resumed = train(tmp_path / "broken")
+    assert resumed.resumed_from in (2, 4)
+    assert resumed.losses == whole.losses
+    assert equal_trees(resumed.state, whole.state)
+    metrics = [(tmp_path / d / "metrics.jsonl").read_bytes() for d in ("whole", "broken")]
+    assert metrics[0] == metrics[1]
+
+
+def test_a_finished_run_is_not_run_again(tmp_path: Path):
+    first = train(tmp_path)
+
+    def no_batches(start: int):
+        raise AssertionError("a finished run asked for data")
+
+    again = train(tmp_path, make=no_batches)
+    assert again.losses == first.losses
+    assert equal_trees(again.state, first.state)
+
+
+def test_a_constant_rate_run_may_be_lengthened_and_another_not(tmp_path: Path):
+    train(tmp_path)
+    longer = train(tmp_path, config=train_config(steps=8))
+    assert len(longer.losses) == 8 and longer.resumed_from == 6
+    straight = train(tmp_path / "straight", config=train_config(steps=8))
+    assert straight.losses == longer.losses
+
+    cosine = OptimizerConfig(learning_rate=1e-3, warmup_steps=2, schedule="cosine")
+    train(tmp_path / "cosine", config=train_config(optimizer=cosine))
+    with pytest.raises(CheckpointError, match="train.steps: 6 -> 8"):
+        train(tmp_path / "cosine", config=train_config(steps=8, optimizer=cosine))
+
+
+def test_a_checkpoint_of_another_configuration_is_refused_by_name(tmp_path: Path):
+    train(tmp_path)
+    with pytest.raises(CheckpointError, match="train.seed: 0 -> 1"):
+        train(tmp_path, config=train_config(seed=1))
+    with pytest.raises(CheckpointError, match="provenance.data: 'random' -> 'other'"):
+        train(tmp_path, provenance={"data": "other"})
+
+
+def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path):
+    def stop_at_three(step: int, steps: int, metrics: dict) -> None:
+        if step == 3:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.raises(Interrupted, match="of 6"):
+        train(tmp_path / "stopped", progress=stop_at_three, options=LoopOptions(log_every=1))
+    resumed = train(tmp_path / "stopped")
+    assert resumed.resumed_from >= 3
+    assert equal_trees(resumed.state, train(tmp_path / "whole").state)
+
+
+def test_divergence_stops_the_run_and_spares_the_last_checkpoint(tmp_path: Path):
+    usual = batches(model_config())
+
+    def poisoned(start: int):
+        for number, batch in enumerate(usual(start), start + 1):
+            if number == 4:
+                batch["actions"][:] = np.nan
+            yield batch
+
+    with pytest.raises(DivergedError, match="loss is nan at step 4"):
+        train(tmp_path, make=poisoned)
+    assert load_run(tmp_path).step == 2
+
+
+def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path: Path):
+    whole = train(tmp_path / "whole")
+    with pytest.raises(OSError):
+        train(tmp_path / "torn", make=dying_batches(after=4))
+    log = tmp_path / "torn" / "metrics.jsonl"
+    log.write_text(log.read_text() + '{"step": 5, "loss": 1.0}\n{"step": 6, "lo')
+    assert train(tmp_path / "torn").losses == whole.losses
+    assert [json.loads(line)["step"] for line in log.read_text().splitlines()] == [1, 2, 3, 4, 5, 6]
+
+
+def test_micro_batches_change_nothing_but_rounding(tmp_path: Path):
+    whole = train(tmp_path / "whole")
+    split = train(tmp_path / "split", config=train_config(accumulate=4))
+    np.testing.assert_allclose(split.losses, whole.losses, rtol=1e-5)
+
+
+def test_training_lowers_the_loss_on_a_repeated_batch(tmp_path: Path):
+    model = model_config()
+    one = next(batches(model)(0))
+
+    def same(start: int):
+        while True:
+            yield one
+
+    config = train_config(
+        steps=60, optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=5, clip_norm=10.0)
+    )
+    losses = train(tmp_path, config=config, make=same, options=LoopOptions()).losses
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_a_run_reads_back_with_everything_it_needs(tmp_path: Path):
+    result = train(tmp_path)
+    run = load_run(tmp_path)
+    assert run.model == model_config() and run.train == train_config() and run.table == TABLE
+    assert run.step == 6 and run.provenance == {"data": "random"}
+    assert equal_trees(run.params, result.state.params)
+
+
+def test_reading_a_directory_without_a_run_says_what_to_do(tmp_path: Path):
+    with pytest.raises(CheckpointError, match="give the directory of a training run"):
+        load_run(tmp_path / "nothing")
+
+
+def test_an_unwritable_run_directory_is_one_clear_message(tmp_path: Path):
+    blocker = tmp_path / "file"
+    blocker.write_text("")
+    with pytest.raises(CheckpointError, match="choose another output directory"):
+        train(blocker / "run")
+
+
+def test_every_step_counts_robots_that_were_present(tmp_path: Path):
+    model = model_config()
+    usual = batches(model)
+
+    def only_pusher(start: int):
+        for batch in usual(start):
+            yield batch | {"embodiment": np.zeros_like(batch["embodiment"])}
+
+    state = train(tmp_path, make=only_pusher, config=dataclasses.replace(train_config(), steps=3)).state
+    assert state.opt_state.count_E.tolist() == [3, 0, 0]

@@ -1,0 +1,79 @@
+"""A tiny world for tests: three robots, a model of a few thousand parameters, random windows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import ModelConfig, MupConfig, OptimizerConfig, TrainConfig
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model import declare_model
+
+TABLE = EmbodimentTable(
+    (
+        Embodiment("pusher", 2, 1, (0.0, 1.0), (1.0, 2.0)),
+        Embodiment("arm", 7, 2, (0.5,) * 7, (0.1,) * 7),
+        Embodiment("base", 3, 3, (0.0,) * 3, (1.0, 0.0, 3.0)),
+    )
+)
+
+
+def model_config(**changes) -> ModelConfig:
+    settings = dict(
+        width=32,
+        layers=2,
+        heads=4,
+        frames=6,
+        tokens=9,
+        action_tokens=2,
+        factors=2,
+        factor_vocab=8,
+        mup=MupConfig(base_width=32),
+    )
+    return ModelConfig(**(settings | changes))
+
+
+def train_config(**changes) -> TrainConfig:
+    settings = dict(
+        steps=6, batch=8, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=2)
+    )
+    return TrainConfig(**(settings | changes))
+
+
+def random_batch(seed: int, config: ModelConfig, batch: int = 8, table=TABLE) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    shape = (batch, config.frames)
+    embodiment = rng.integers(0, table.size, batch, dtype=np.int32)
+    actions = rng.normal(size=(*shape, table.action_width)).astype(np.float32)
+    for row, index in enumerate(embodiment):
+        actions[row, :, table.entries[index].chunk :] = 0
+    return {
+        "tokens": rng.integers(0, config.vocab_size, (*shape, config.tokens), dtype=np.int32),
+        "actions": actions,
+        "embodiment": embodiment,
+    }
+
+
+def batches(config: ModelConfig, batch: int = 8) -> Callable[[int], Iterator[dict[str, np.ndarray]]]:
+    """make_batches(start): an endless stream that is a function of the step."""
+
+    def make(start: int) -> Iterator[dict[str, np.ndarray]]:
+        step = start
+        while True:
+            yield random_batch(step, config, batch)
+            step += 1
+
+    return make
+
+
+def lively_params(config: ModelConfig, table=TABLE, scale: float = 0.2):
+    """(declarations, parameters away from their start, where much is zero or tiny)."""
+    declared = declare_model(config, table)
+    params = declared.init(0)
+    leaves, treedef = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), len(leaves))
+    moved = [x + scale * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    return declared, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in moved])
