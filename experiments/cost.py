@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from rich import box
 from rich.table import Table
 
 from experiments.paper_mixture import PAPER_MIXTURE
@@ -84,28 +85,30 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
     table = Table(
         title=f"Study '{study.name}': {len(trials)} trials of {train.steps:,} steps x batch {train.batch}",
         title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 0, 0, 1),
         caption=(
             f"Total {_flops(total)} for training and evaluation, about {_duration(total / study.flops_per_second)} of computing at "
             f"{_flops(study.flops_per_second)}/s sustained (flops_per_second; compilation and data not "
-            "counted). 'One robot': parameters with a single embodiment of 2 action dimensions. 'Control': "
-            "trained on shuffled actions."
+            "counted). 'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are per "
+            "dataset. 'Control': trained on shuffled actions."
         ),
         caption_justify="left",
     )
-    for name in ("trial", "sets", "traject.", "width", "seed", "params", "one robot", "FLOPs", "time"):
+    for name in ("trial", "sets", "videos", "width", "params", "one robot", "FLOPs", "time"):
         table.add_column(name, justify="left" if name == "trial" else "right", no_wrap=True)
     shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in study.seeds}
     for id, trial in trials.items():
         cost = costs[id]
+        seed = f", seed {trial.train.seed}" if len(study.seeds) > 1 else ""
         table.add_row(
-            "reference" if id in shared else _axes_of(id, sweeps),
+            ("reference" if id in shared else _axes_of(id, sweeps)) + seed,
             f"{len(trial.datasets)}",
-            "all" if trial.max_trajectories is None else f"{trial.max_trajectories:,}",
+            "all" if trial.max_trajectories is None else _short_count(trial.max_trajectories),
             f"{trial.model.width}",
-            f"{trial.train.seed}",
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
-            _flops(cost.flops),
+            _flops(cost.flops).removesuffix("FLOP"),
             _duration(cost.flops / study.flops_per_second),
         )
     return table
@@ -120,6 +123,10 @@ def _axes_of(id: str, sweeps: Sequence[Sweep]) -> str:
 
 def _count(parameters: int) -> str:
     return f"{parameters / 1e6:,.1f} M" if parameters >= 1e6 else f"{parameters / 1e3:,.1f} k"
+
+
+def _short_count(n: int) -> str:
+    return f"{n // 1_000_000:,} M" if n >= 1_000_000 and n % 1_000_000 == 0 else f"{n:,}"
 
 
 def _flops(value: float) -> str:

@@ -20,7 +20,7 @@ from PIL import Image
 
 from experiments.ledger import FINISHED
 from experiments.report_style import CSS
-from experiments.results import OVERALL, CurvePoint, Row, curve, load_result, tally
+from experiments.results import OVERALL, CurvePoint, Row, curve, load_result
 from experiments.runner import State
 from experiments.sweep import Sweep, reference_trial, unique_trials
 from experiments.trial import Provenance, trial_id
@@ -55,7 +55,7 @@ def write_report(
     result = load_result(workspace.trials, reference) if finished else None
     prompt = study.eval.prompt_frames
     body = [
-        _headline(record, sweeps, rows, result),
+        _headline(record, sweeps, rows, states, result),
         _section("Scaling curves", _picture(workspace.figures / "scaling.png", "Scaling curves"), *(
             _axis(sweep, rows) for sweep in sweeps
         )),
@@ -81,11 +81,14 @@ def write_report(
 
 
 def _headline(
-    record: Record, sweeps: Sequence[Sweep], rows: Sequence[Row], result: dict[str, Any] | None
+    record: Record,
+    sweeps: Sequence[Sweep],
+    rows: Sequence[Row],
+    states: dict[str, State],
+    result: dict[str, Any] | None,
 ) -> str:
     study = record.study
     whole = next((s.name for s in sweeps if s.scope == study.dataset_names()), sweeps[0].name)
-    counts = [tally(rows, s.name) for s in sweeps]
     cards = [
         _card("perplexity, reference", _last(curve(rows, whole, "perplexity")), "s.e. over windows and seeds"),
         _card("perplexity, untrained", _last(curve(rows, whole, "perplexity", "untrained")),
@@ -95,7 +98,7 @@ def _headline(
               "dB, must vanish within its error"),
     ]  # fmt: skip
     when = result["run"]["finished"] if result else "reference trial not finished"
-    unfinished = sum(total - done for done, total in counts)
+    unfinished = sum(state.event != FINISHED for state in states.values())
     warning = f'<p class="warning">{unfinished} trial(s) have no result; see the table of trials.</p>'
     return (
         f"<header><h1>HMA scaling study <em>{html.escape(study.name)}</em></h1>"

@@ -1,0 +1,52 @@
+# Two commands: `make study` runs the scaling study, `make test` the tests. Both first create
+# .venv and install into it. PYTHON=python3.12 chooses the interpreter.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= runs/study
+PRESET ?= cpu
+WORKERS ?= 1
+
+.PHONY: help study test test-slow clean
+
+help:
+	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS))"
+	@echo "make test       run the tests that take less than about 20 s each"
+	@echo "make test-slow  run the others too"
+	@echo "make clean      remove the environment and caches; results under runs/ stay"
+
+study: $(VENV)/installed
+	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
+
+test: $(VENV)/installed-test
+	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -m "not slow"
+
+test-slow: $(VENV)/installed-test
+	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q
+
+# constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves.
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+	$$($(BIN)/python -c 'import sys; print("-c constraints.txt" if sys.version_info[:2] == (3, 11) else "")')
+
+$(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV) (about a minute)"
+	@$(INSTALL) -e .
+	@touch $@
+
+$(VENV)/installed-test: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV) (about a minute)"
+	@$(INSTALL) -e '.[test]'
+	@touch $@ $(VENV)/installed
+
+$(BIN)/python:
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) not found: install Python 3.11 or newer"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$$($(PYTHON) --version) is too old: Python 3.11 or newer is needed (make PYTHON=python3.12 ...)"; exit 1; }
+	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
+		{ echo "$(PYTHON) cannot make environments: install it (on Debian: apt install python3-venv)"; exit 1; }
+	@rm -rf $(VENV)
+	@$(PYTHON) -m venv $(VENV)
+
+clean:
+	rm -rf $(VENV) .jax_cache .pytest_cache *.egg-info

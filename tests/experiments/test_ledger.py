@@ -1,0 +1,53 @@
+"""The ledger keeps every whole line through a torn write and refuses a second writer."""
+
+import json
+
+import pytest
+
+from experiments.ledger import Ledger
+from hma_jax.config import ConfigError
+
+
+@pytest.fixture
+def ledger(tmp_path):
+    return Ledger(tmp_path / "ledger.jsonl", clock=lambda: 7.0)
+
+
+def test_last_line_of_a_trial_is_its_state(ledger):
+    ledger.append("a", "started")
+    ledger.append("b", "started")
+    ledger.append("a", "failed", message="no luck")
+    states = ledger.states()
+    assert states["a"] == {"time": 7.0, "trial": "a", "event": "failed", "message": "no luck"}
+    assert states["b"]["event"] == "interrupted"
+
+
+@pytest.mark.parametrize("torn", ['{"trial": "b", "ev', "{", '{"time": 1, "trial": "b", "event": "failed"}'])
+def test_torn_last_line_is_dropped_and_cut(ledger, torn):
+    ledger.append("a", "finished")
+    with open(ledger.path, "a") as file:
+        file.write(torn)  # no newline: the process died here
+    assert list(ledger.states()) == ["a"]
+    ledger.append("c", "started")
+    assert [json.loads(line)["trial"] for line in ledger.path.read_text().splitlines()] == ["a", "c"]
+
+
+def test_torn_only_line(ledger):
+    ledger.path.write_text('{"tri')
+    assert ledger.records() == []
+    ledger.append("a", "started")
+    assert len(ledger.records()) == 1
+
+
+def test_damage_before_the_end_is_reported_with_its_line(ledger):
+    ledger.path.write_text('{"trial": "a", "event": "started"}\ngarbage\n{"trial": "b", "event": "started"}\n')
+    with pytest.raises(ConfigError, match=r"ledger.jsonl, line 2"):
+        ledger.records()
+
+
+def test_second_writer_is_refused(ledger):
+    with ledger.locked(), pytest.raises(ConfigError, match="another study is running"):
+        with Ledger(ledger.path).locked():
+            pass
+    with ledger.locked():
+        pass  # free again

@@ -1,0 +1,102 @@
+"""CSV, figures and page from finished trials; what failed stays visible in all of them."""
+
+import math
+import re
+
+import pytest
+
+from experiments.commands import draw
+from experiments.ledger import Ledger
+from experiments.results import OVERALL, collect, curve, read_csv, tally, write_csv
+from experiments.runner import read_states
+from experiments.scale_datasets import plan as plan_datasets
+from experiments.scale_width import plan as plan_width
+from experiments.sweep import unique_trials
+from hma_jax.config import ConfigError
+from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
+
+
+def rows_of(workspace, sweeps):
+    ids = list(unique_trials(sweeps, PROVENANCE))
+    states = read_states(ids, workspace.trials, Ledger(workspace.ledger))
+    return collect(sweeps, PROVENANCE, workspace.trials, states)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """A study in which one width diverged, with everything drawn."""
+    root = tmp_path_factory.mktemp("study")
+    workspace = finished_study(root, broken={"width 8 · seed 1": "diverged"})
+    draw(workspace, record_of())
+    return workspace
+
+
+def test_rows_carry_hashes_and_average_over_the_scope(drawn):
+    rows = rows_of(drawn, [plan_datasets(STUDY)])
+    first = next(r for r in rows if r.metric == "perplexity" and r.scope == OVERALL)
+    each = [r for r in rows if r.trial == first.trial and r.metric == "perplexity" and r.scope != OVERALL]
+    assert [r.scope for r in each] == ["arm", "rover"]  # the reference knows three, the axis judges two
+    assert first.mean == pytest.approx(sum(r.mean for r in each) / 2)
+    assert first.sem == pytest.approx(0.2 / math.sqrt(2)) and first.n == 20
+    assert (first.store, first.code) == (PROVENANCE.store, PROVENANCE.code)
+
+
+def test_csv_reads_back_what_was_written(drawn, tmp_path):
+    rows = rows_of(drawn, [plan_width(STUDY)])
+    write_csv(tmp_path / "a.csv", rows)
+    again = read_csv(tmp_path / "a.csv")
+    write_csv(tmp_path / "b.csv", again)
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+    assert [r for r in again if r.metric] == [r for r in rows if r.metric]
+
+
+def test_curve_joins_seeds_and_windows(drawn):
+    points = curve(rows_of(drawn, [plan_width(STUDY)]), "width", "perplexity")
+    assert [p.x for p in points] == [8, 16]
+    assert len(points[0].seeds) == 1 and len(points[1].seeds) == 2  # one seed of width 8 diverged
+    both = points[1]
+    assert both.mean == pytest.approx(sum(both.seeds) / 2)
+    spread = (both.seeds[0] - both.seeds[1]) ** 2 / 4
+    assert both.sem == pytest.approx(math.sqrt(spread + 0.04 / 3))
+
+
+def test_control_and_untrained_stay_off_the_curve(drawn):
+    rows = rows_of(drawn, [plan_width(STUDY)])
+    assert curve(rows, "width", "delta_psnr", "control")[0].mean == pytest.approx(1.0)  # 0 + 1 + 2 over 3
+    assert curve(rows, "width", "perplexity", "untrained")[0].mean == 256
+    assert all(r.role == "point" for r in rows if r.metric == "delta_psnr" and r.seed == 1)
+
+
+def test_diverged_trial_is_in_csv_and_tally(drawn):
+    rows = read_csv(drawn.results)
+    lost = [r for r in rows if r.status == "diverged"]
+    assert [(r.sweep, r.x, r.seed, r.metric) for r in lost] == [("width", 8, 1, "")]
+    assert tally(rows, "width") == (4, 5)  # two widths, two seeds, one control
+
+
+def test_page_is_self_contained_and_names_what_failed(drawn):
+    page = drawn.report.read_text()
+    assert not re.findall(r'(?:src|href)="(?!data:)', page) and "http" not in page
+    assert page.count("data:image/png;base64,") >= 1 + 3 * 3  # curves, and three strips of three datasets
+    assert 'class="diverged"' in page and "the loss is &lt;nan&gt; at step 2" in page
+    for fact in ("hma study", PROVENANCE.tokenizer, "abacus", "1 trial(s) have no result"):
+        assert fact in page
+
+
+def test_figures_are_pictures(drawn):
+    for name in ("datasets", "trajectories", "width", "scaling"):
+        assert (drawn.figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_page_without_any_finished_trial(tmp_path):
+    workspace = finished_study(tmp_path, broken={"": "failed"})
+    draw(workspace, record_of())
+    assert "0 of 11 finished" in workspace.report.read_text()
+
+
+def test_unreadable_result_names_its_file(tmp_path):
+    workspace = finished_study(tmp_path)
+    broken = next(workspace.trials.glob("*/result.json"))
+    broken.write_text("{")
+    with pytest.raises(ConfigError, match=str(broken)):
+        draw(workspace, record_of())

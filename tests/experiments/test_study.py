@@ -1,0 +1,124 @@
+"""Studies, overrides and the three plans: shared reference, nested points, stable ids."""
+
+import dataclasses
+from dataclasses import replace
+
+import pytest
+
+from experiments import scale_datasets, scale_trajectories, scale_width
+from experiments.cost import ONE_ROBOT, declared_table, estimate
+from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
+from experiments.study import on_user_data, override
+from experiments.sweep import reference_trial, unique_trials
+from experiments.trial import Provenance, trial_id
+from hma_jax.config import ConfigError, from_dict, to_dict
+
+PLANS = (scale_datasets.plan, scale_trajectories.plan, scale_width.plan)
+PROVENANCE = Provenance("store", "manifest", "tokenizer", "code")
+
+
+@pytest.mark.parametrize("study", PRESETS.values(), ids=PRESETS)
+def test_axes_share_one_reference_and_one_control(study):
+    sweeps = [plan(study) for plan in PLANS]
+    trials = unique_trials(sweeps, PROVENANCE)
+    points = len(study.dataset_counts) + len(study.trajectory_counts) + len(study.widths) - 2
+    assert len(trials) == points * len(study.seeds) + 1
+    reference = trial_id(reference_trial(study, study.seeds[0]), PROVENANCE)
+    assert all(any(trial_id(p.trial, PROVENANCE) == reference for p in s.points) for s in sweeps)
+    assert sum(t.shuffle_actions for t in trials.values()) == 1
+    assert sum(t.measure_untrained for t in trials.values()) == len(study.seeds)
+
+
+def test_points_of_an_axis_are_nested_and_judged_alike():
+    sweep = scale_datasets.plan(CPU)
+    trials = [p.trial for p in sweep.points if p.role == "point"]
+    for small, large in zip(trials, trials[1:], strict=False):
+        assert large.datasets[: len(small.datasets)] == small.datasets
+    assert all(set(sweep.scope) <= set(t.evaluated) <= set(t.datasets) for t in trials)
+    assert len({(t.train.steps, t.train.batch) for t in trials}) == 1  # total samples held fixed
+
+
+def test_only_the_axis_changes_along_it():
+    for plan, field in ((scale_trajectories.plan, "max_trajectories"), (scale_width.plan, "model")):
+        points = [p.trial for p in plan(SMOKE).points if p.role == "point"]
+        same = {f.name for f in dataclasses.fields(points[0])} - {field, "measure_untrained"}
+        assert all(len({getattr(t, name) for t in points}) == 1 for name in same)
+    widths = [p.trial.model for p in scale_width.plan(SMOKE).points]
+    assert len({replace(m, width=16) for m in widths}) == 1
+
+
+def test_id_changes_with_everything_that_determines_a_trial():
+    trial = reference_trial(replace(SMOKE, datasets=("a", "b", "c")), seed=0)
+    changed = [
+        replace(trial, datasets=("a", "c", "b")),
+        replace(trial, max_trajectories=3),
+        replace(trial, evaluated=("a",)),
+        replace(trial, model=replace(trial.model, mlp_ratio=2.0)),
+        replace(trial, train=replace(trial.train, seed=1)),
+        replace(trial, eval=replace(trial.eval, seed=1)),
+        replace(trial, tau=1.0),
+        replace(trial, shuffle_actions=True),
+    ]
+    ids = {trial_id(t, PROVENANCE) for t in [trial, *changed]}
+    ids |= {trial_id(trial, replace(PROVENANCE, **{f: "other"})) for f in ("store", "manifest", "tokenizer", "code")}
+    assert len(ids) == 1 + len(changed) + 4
+    same = from_dict(type(trial), to_dict(trial))  # through job.json
+    assert trial_id(same, PROVENANCE) == trial_id(trial, PROVENANCE)
+
+
+def test_user_data_cuts_the_counts():
+    study = on_user_data(CPU, ["bridge_dataset"])
+    assert study.dataset_names() == ("bridge_dataset",) and study.dataset_counts == (1,)
+    assert on_user_data(CPU, list("abcdefg")).dataset_counts == (5, 7)
+
+
+def test_override_sets_nested_fields_and_lists():
+    study = override(SMOKE, ["model.frames=3", "widths=4,16", "train.optimizer.learning_rate=1", "seeds=[0,1]",
+                             "model.compute_dtype=bfloat16", "store.frame_step=1", "model.remat=false"])  # fmt: skip
+    assert (study.model.frames, study.widths, study.seeds) == (3, (4, 16), (0, 1))
+    assert study.train.optimizer.learning_rate == 1.0 and study.store.frame_step == 1
+    assert study.model.compute_dtype == "bfloat16" and study.model.remat is False
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("model.frame=4", "did you mean model.frames"),
+        ("model.frames", "path=value"),
+        ("model.frames=many", "not a number"),
+        ("model.frames=2.5", "expected a value like"),
+        ("model.remat=3", "expected a value like"),
+        ("eval.prompt_frames=4", "leaves nothing to predict"),
+        ("model.tokens=9", "the tokenizer makes 16"),
+        ("widths=4,8", "must contain model.width"),
+        ("trajectory_counts=8,4", "must increase"),
+    ],
+)
+def test_wrong_override_names_the_field(setting, message):
+    with pytest.raises(ConfigError, match=message):
+        override(SMOKE, [setting])
+
+
+def test_unknown_preset_lists_the_known():
+    with pytest.raises(ConfigError, match="smoke, cpu, accelerator, paper"):
+        get_preset("gpu")
+
+
+def test_paper_preset_has_the_papers_sizes():
+    assert PAPER.dataset_counts == (5, 10, 20, 30, 40) and len(PAPER.datasets) == 40
+    assert (PAPER.model.frames, PAPER.model.tokens, PAPER.model.layers, PAPER.model.action_tokens) == (12, 256, 32, 64)
+    reference = reference_trial(PAPER, 0)
+    counts = {
+        w: estimate(replace(reference, datasets=PAPER.datasets[:1], model=replace(PAPER.model, width=w)))
+        for w in (256, 1024)
+    }
+    assert round(counts[256].parameters_one_robot / 1e6, 1) == 43.6
+    assert round(counts[1024].parameters_one_robot / 1e6, 1) == 678.7
+
+
+def test_declared_table_knows_paper_and_registry():
+    table = declared_table(["bc_z", "bridge_dataset"])
+    assert [(e.action_dim, e.stride) for e in table.entries] == [(70, 5), (7, 2)]
+    assert ONE_ROBOT.action_width == 2
+    with pytest.raises(ConfigError, match="unknown dataset"):
+        declared_table(["bridge_datase"])
