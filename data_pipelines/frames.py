@@ -65,7 +65,7 @@ def make_frame_loader(
             continue
         seed_here = stream_seed(seed, "frames", split, spec.name)
         streams[spec.name] = _FrameGroups(source, spec.image_key, episodes, image_size, group, seed_here)
-    mixture = make_mixture(counts, tau, dict.fromkeys(counts, f"it has no {split} episode."))
+    mixture = make_mixture(counts, tau, dict.fromkeys(counts, f"it has no {split} episode"))
     mixed = grain.MapDataset.mix(
         [grain.MapDataset.source(streams[n]) for n in mixture.names], mixture.weights
     )

@@ -35,15 +35,15 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.
     return powers / powers.sum()
 
 
-def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] = {}) -> Mixture:
+def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] | None = None) -> Mixture:
     """The mixture of the datasets in `counts` (name -> examples).
 
     Those with none are left out; `reasons` may say why. If none remains: DataError with all
     the reasons.
     """
-    dropped = {n: reasons.get(n, "it is empty") for n, c in counts.items() if c == 0}
+    dropped = {n: (reasons or {}).get(n, "it is empty") for n, c in counts.items() if c == 0}
     if len(dropped) == len(counts):
-        raise DataError("no dataset can be used. " + " ".join(f"{n}: {why}" for n, why in dropped.items()))
+        raise DataError("no dataset can be used: " + "; ".join(f"{n}: {why}" for n, why in dropped.items()))
     names = tuple(n for n in counts if n not in dropped)
     weights = mixture_weights([counts[n] for n in names], tau)
     return Mixture(names, tuple(weights.tolist()), dropped)

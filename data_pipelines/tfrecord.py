@@ -102,6 +102,8 @@ def read_record(file: str | Path, offset: int, length: int, verify: bool = True)
     fd = _open(Path(file))
     try:
         body = os.pread(fd, length + FOOTER, offset + HEADER)
+    except OSError as error:
+        raise CorruptRecordError(file, offset, f"it cannot be read ({error.strerror})") from error
     finally:
         os.close(fd)
     if len(body) < length + FOOTER:

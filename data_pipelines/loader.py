@@ -1,0 +1,144 @@
+"""Batches for training: windows of many embodiments mixed in every batch.
+
+Owns the global order of training windows. Row r of the global batch of step s is a pure
+function of (store, config, s, r): it does not depend on the number of processes, and a run
+resumes from its step alone, without iterator state.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import grain
+import numpy as np
+
+from data_pipelines.mixture import Mixture, make_mixture
+from data_pipelines.order import endless_shuffle, random_below, stream_seed
+from data_pipelines.store import TokenStore
+from data_pipelines.windows import WindowSet, cut_actions, cut_frames, require_windows, train_windows
+from hma_jax.config import require
+from hma_jax.embodiments import EmbodimentTable
+
+
+@dataclass(frozen=True)
+class LoaderConfig:
+    """What determines the order of training windows."""
+
+    frames: int = 12  # T
+    batch: int = 64  # B, global
+    tau: float = 3.0  # datasets are drawn with p ∝ windows^(1/tau)
+    seed: int = 0  # of the order and of the subset of trajectories
+    max_trajectories: int | None = None  # per dataset
+    datasets: tuple[str, ...] = ()  # empty: all of the store
+    shuffle_actions: bool = False  # control: actions of another window
+
+    def __post_init__(self):
+        require(self.frames >= 1, f"loader.frames must be at least 1, got {self.frames}")
+        require(self.batch >= 1, f"loader.batch must be at least 1, got {self.batch}")
+        require(self.tau > 0, f"loader.tau must be positive, got {self.tau}")
+        require(
+            len(set(self.datasets)) == len(self.datasets),
+            f"loader.datasets repeat: {', '.join(self.datasets)}",
+        )
+
+
+@dataclass(frozen=True)
+class TrainingWindows:
+    """The windows a config draws from, and how often. `too_short` counts episodes per dataset."""
+
+    sets: dict[str, WindowSet]
+    mixture: Mixture
+
+    @property
+    def too_short(self) -> dict[str, int]:
+        return {name: s.too_short for name, s in self.sets.items() if s.too_short}
+
+
+def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
+    """Counts windows and weighs datasets. Raises DataError if not one window is left."""
+    names = config.datasets or store.names
+    sets = {n: train_windows(store, n, config.frames, config.max_trajectories, config.seed) for n in names}
+    require_windows(sets)
+    counts = {name: len(s) for name, s in sets.items()}
+    return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.shortage() for n, s in sets.items()}))
+
+
+def make_loader(
+    store: TokenStore,
+    table: EmbodimentTable,
+    config: LoaderConfig,
+    *,
+    start_step: int = 0,
+    process_index: int = 0,
+    process_count: int = 1,
+    prefetch: int = 2,
+    threads: int = 2,
+) -> Iterator[dict[str, np.ndarray]]:
+    """Endless batches from step `start_step` on.
+
+    A batch: `tokens` int32 [B, T, S], `actions` float32 [B, T, U] in raw units, zero-padded,
+    `embodiment` int32 [B], index into `table`. Process p of n yields rows [p B/n, (p+1) B/n)
+    of the global batch. `threads` read ahead by `prefetch` batches each.
+
+    Raises ConfigError for unknown datasets or a batch that does not split, DataError if no
+    episode is long enough for one window.
+    """
+    require(
+        process_count >= 1 and config.batch % process_count == 0,
+        f"loader.batch {config.batch} does not split over {process_count} processes",
+    )
+    require(0 <= process_index < process_count, f"process {process_index} of {process_count}")
+    selected = select_windows(store, config)
+    grids = {store.manifest(name).tokenizer for name in selected.mixture.names}
+    require(len(grids) == 1, f"the datasets were tokenised differently: {sorted(map(str, grids))}")
+    store.check_table(table, selected.mixture.names)
+    streams = [_Stream(store, table, selected.sets[name], config) for name in selected.mixture.names]
+    mixed = grain.MapDataset.mix(
+        [grain.MapDataset.source(stream) for stream in streams], selected.mixture.weights
+    )
+    # Batches of B/n rows, of which this process takes every n-th: contiguous rows of the
+    # global batch. (Single rows in turn could give each process its own dataset.)
+    mine = mixed.batch(config.batch // process_count)[process_index::process_count]
+    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads * prefetch, 1))
+    iterator = iter(mine.to_iter_dataset(options))
+    iterator.set_state({"next_index": start_step})
+    return iterator
+
+
+@dataclass(frozen=True)
+class _Stream:
+    """Endless shuffled windows of one dataset: element i is the i-th window ever drawn."""
+
+    store: TokenStore
+    table: EmbodimentTable
+    windows: WindowSet
+    config: LoaderConfig
+
+    def __len__(self) -> int:
+        return sys.maxsize
+
+    def __getitem__(self, i: int) -> dict[str, np.ndarray]:
+        windows, frames = self.windows, self.config.frames
+        manifest = self.store.manifest(windows.name)
+        at = endless_shuffle(i, len(windows), self._seed("order"))
+        episode, start = windows.locate(at)
+        item = self.store.episode(windows.name, "train", episode)
+        tokens = cut_frames(item.tokens, start, frames, manifest).astype(np.int32)
+        if self.config.shuffle_actions:
+            episode, start = windows.locate(self._other(at, i))
+            item = self.store.episode(windows.name, "train", episode)
+        actions = np.zeros((frames, self.table.action_width), np.float32)
+        chunk = cut_actions(item, start, frames, manifest)
+        actions[:, : chunk.shape[1]] = chunk
+        embodiment = np.int32(self.table.index(windows.name))
+        return {"tokens": tokens, "actions": actions, "embodiment": embodiment}
+
+    def _other(self, at: int, i: int) -> int:
+        """Another window than `at`, drawn anew on every visit so that no pair can be learnt."""
+        n = len(self.windows)
+        return at if n == 1 else (at + 1 + random_below(n - 1, i, self._seed("shuffled actions"))) % n
+
+    def _seed(self, purpose: str) -> int:
+        return stream_seed(self.config.seed, purpose, self.windows.name)

@@ -1,0 +1,126 @@
+"""The manifest of one tokenised dataset: what it was made from, how, and what it holds.
+
+Owns the facts and their JSON. It holds no path and no time, so tokenising the same data in
+the same way gives the same manifest, and its hash identifies the data of a run.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from data_pipelines.errors import DataError
+from data_pipelines.registry import DatasetSpec
+from hma_jax.config import ConfigError, from_dict, require, stable_hash, to_dict
+from hma_jax.embodiments import Embodiment
+
+FILE = "manifest.json"
+SPLITS = ("train", "val")
+
+
+@dataclass(frozen=True)
+class TokenizerFacts:
+    """Which tokenizer, and the shape of what it makes."""
+
+    identity: str  # hash of its configuration and weights
+    image_size: int
+    grid: int
+    tokens: int  # S
+    vocab_size: int
+    factors: int  # Q
+    factor_vocab: int  # V
+
+
+@dataclass(frozen=True)
+class JobSettings:
+    """What a tokenising job may choose. Equal settings on equal input give equal stores."""
+
+    val_fraction: float = 0.05
+    min_val: int = 2
+    max_val: int = 200
+    keep_frames: str = "val"  # which splits keep raw frames: none, val or all
+    frame_step: int = 1  # stored frames are every frame_step-th native one
+
+    def __post_init__(self):
+        require(0 <= self.val_fraction < 1, f"val_fraction must lie in [0, 1), got {self.val_fraction}")
+        require(0 <= self.min_val <= self.max_val, f"min_val {self.min_val} exceeds max_val {self.max_val}")
+        require(
+            self.keep_frames in ("none", "val", "all"),
+            f"keep_frames must be none, val or all, got {self.keep_frames!r}",
+        )
+
+
+@dataclass(frozen=True)
+class SplitFacts:
+    """The episodes of one split, in store order."""
+
+    episodes: tuple[int, ...] = ()  # index in the source
+    steps: tuple[int, ...] = ()  # native frames N
+    content: str = ""  # hash over all records
+
+    @property
+    def native_frames(self) -> int:
+        return sum(self.steps)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything a reader must know of `<store>/<dataset>`."""
+
+    spec: DatasetSpec
+    tokenizer: TokenizerFacts
+    settings: JobSettings
+    source: str  # fingerprint of the shards
+    source_version: str
+    action_mean: tuple[float, ...]  # over native actions of the train split, raw units
+    action_std: tuple[float, ...]
+    train: SplitFacts
+    val: SplitFacts
+    skipped: dict[str, int] = field(default_factory=dict)  # reason -> episodes left out
+    format: int = 1
+
+    @property
+    def stride(self) -> int:
+        """Native frames per model frame."""
+        return self.spec.stride
+
+    @property
+    def frame_step(self) -> int:
+        """Native frames per stored frame."""
+        return self.settings.frame_step
+
+    def split(self, name: str) -> SplitFacts:
+        require(name in SPLITS, f"split must be 'train' or 'val', got {name!r}")
+        return self.train if name == "train" else self.val
+
+    def embodiment(self) -> Embodiment:
+        """The model's view of this dataset's actions."""
+        return Embodiment(
+            self.spec.name, self.spec.action_dim, self.stride, self.action_mean, self.action_std
+        )
+
+    def hash(self) -> str:
+        return stable_hash(self)
+
+    def to_text(self) -> str:
+        """Deterministic JSON, long lists on one line."""
+        values = to_dict(self)
+        lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]
+        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def load_manifest(path: Path) -> Manifest:
+    """Reads a manifest. Raises DataError if it is missing, damaged or of another format."""
+    advice = "Remove the dataset from the store and tokenise it again."
+    try:
+        values = json.loads(path.read_text())
+        if values.get("format") != 1:
+            raise DataError(f"{path}: manifest format {values.get('format')!r}; this reads 1. {advice}")
+        return from_dict(Manifest, values)
+    except OSError as error:
+        raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
+    except (ValueError, AttributeError, TypeError) as error:
+        if isinstance(error, ConfigError):
+            raise DataError(f"{path}: not a manifest of this program: {error}. {advice}") from error
+        raise DataError(f"{path}: the manifest is damaged ({error}). {advice}") from error
