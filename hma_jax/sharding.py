@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.params import Declared, ParamSpec
+from hma_jax.params import Declared, ParamSpec, is_spec
 
 RULES: dict[str, str | tuple[str, ...]] = {
     "B": ("data", "fsdp"),
@@ -118,7 +118,7 @@ def describe_sharding(decisions: list[Decision]) -> str:
 def param_shardings(declared: Declared, mesh: Mesh, config: MeshConfig) -> Any:
     """A tree of NamedSharding with the structure of the parameters."""
     layouts = {d.name: NamedSharding(mesh, d.partition) for d in plan_sharding(declared, mesh, config)}
-    treedef = jax.tree.structure(declared.specs, is_leaf=lambda s: isinstance(s, ParamSpec))
+    treedef = jax.tree.structure(declared.specs, is_leaf=is_spec)
     return jax.tree.unflatten(treedef, list(layouts.values()))
 
 

@@ -1,0 +1,105 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, EvalConfig
+from hma_jax.evaluation.protocol import Evaluation, evaluate, random_actions
+from hma_jax.model import declare_model
+from tests.tiny import TABLE, lively_params, model_config, random_batch
+
+SIZE = 8
+EVAL = EvalConfig(prompt_frames=2, unmask_steps=1, random_actions=3, batch=4)
+
+
+class GreyTokenizer:
+    """Decodes ids to flat grey images whose level is the mean id: enough for pixel metrics."""
+
+    def decode(self, ids: np.ndarray) -> np.ndarray:
+        level = (ids.mean(-1) * 4).astype(np.uint8)
+        return np.broadcast_to(level[:, None, None, None], (len(ids), SIZE, SIZE, 3)).copy()
+
+
+def eval_batches(config, names=("pusher", "arm"), batch=4, batches_each=2):
+    window = 0
+    for name in names:
+        for index in range(batches_each):
+            arrays = random_batch(window, config, batch)
+            arrays["embodiment"][:] = TABLE.index(name)
+            rng = np.random.default_rng(window)
+            valid = np.arange(batch) < (2 if index == batches_each - 1 else batch)
+            yield arrays | {
+                "dataset": name,
+                "window": np.arange(window, window + batch, dtype=np.int32),
+                "valid": valid,
+                "frames": rng.integers(0, 255, (batch, config.frames, SIZE, SIZE, 3)).astype(np.uint8),
+            }
+            window += batch
+
+
+def run(params, config, **kwargs) -> Evaluation:
+    return evaluate(params, config, TABLE, GreyTokenizer(), eval_batches(config, **kwargs), EVAL)
+
+
+def test_metrics_cover_the_valid_windows_of_each_dataset():
+    config = model_config()
+    _, params = lively_params(config)
+    result = run(params, config)
+    assert set(result.datasets) == {"pusher", "arm"}
+    assert all(result.datasets[name]["psnr"].n == 6 for name in result.datasets)
+    assert result.overall["delta_psnr"].n == 12
+    pusher, arm = (result.datasets[n]["ssim"].mean for n in ("pusher", "arm"))
+    assert result.overall["ssim"].mean == pytest.approx((pusher + arm) / 2)
+    assert Evaluation.from_dict(result.to_dict()).datasets == result.datasets
+
+
+def test_padding_rows_do_not_count():
+    config = model_config()
+    _, params = lively_params(config)
+    padded = run(params, config, names=("arm",), batches_each=1)
+    assert padded.datasets["arm"]["psnr"].n == 2
+
+
+def test_a_model_deaf_to_actions_has_no_delta_psnr():
+    """Common random numbers: only actions may make a difference."""
+    config = model_config()
+    _, params = lively_params(config)
+    deaf = jax.tree.map(lambda x: x, params)
+    deaf["stem"]["out"] = jax.tree.map(jnp.zeros_like, params["stem"]["out"])
+    assert abs(run(deaf, config).overall["delta_psnr"].mean) < 1e-12
+    heard = run(params, config).datasets["arm"]["delta_psnr"]
+    assert heard.sem > 0
+
+
+def test_an_untrained_model_has_the_perplexity_of_the_vocabulary():
+    config = model_config()
+    result = run(declare_model(config, TABLE).init(0), config)
+    assert result.overall["perplexity"].mean == pytest.approx(config.vocab_size, rel=0.02)
+    assert result.overall["perplexity_corpus"].mean <= result.overall["perplexity"].mean
+
+
+def test_random_actions_follow_the_robot_s_statistics_and_the_window_number():
+    window = jnp.arange(400)
+    draws = random_actions(0, window, jnp.full(400, 2), TABLE, (3, 6))
+    assert draws.shape == (400, 3, 6, TABLE.action_width)
+    np.testing.assert_allclose(np.asarray(draws[..., :3]).std((0, 1, 2)), [1.0, 0.0, 3.0], rtol=0.05)
+    assert (np.asarray(draws[..., 9:]) == 0).all()
+    again = random_actions(0, window[7:9], jnp.full(2, 2), TABLE, (3, 6))
+    np.testing.assert_array_equal(again, draws[7:9])
+
+
+def test_samples_show_true_predicted_and_randomly_driven_clips():
+    config = model_config()
+    _, params = lively_params(config)
+    clip = run(params, config).samples["arm"]
+    assert {k: v.shape for k, v in clip.items()} == {
+        k: (1, config.frames, SIZE, SIZE, 3) for k in ("true", "predicted", "random")
+    }
+    np.testing.assert_array_equal(clip["true"][:, :2], clip["predicted"][:, :2])
+
+
+def test_a_prompt_that_fills_the_window_is_refused():
+    config = model_config()
+    _, params = lively_params(config)
+    with pytest.raises(ConfigError, match="leaves nothing to predict"):
+        evaluate(params, config, TABLE, GreyTokenizer(), iter([]), EvalConfig(prompt_frames=6))
