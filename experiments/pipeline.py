@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from experiments.progress import console, step
 from experiments.study import Study
@@ -21,6 +21,10 @@ from hma_jax.config import require, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
+    from data_pipelines.store import TokenStore
+
+STAMP = "made_from.txt"
+"""Holds the hash of a directory's inputs."""
 
 Source = tuple["DatasetSpec", Path]
 """A dataset: how it is read, and its RLDS directory."""
@@ -78,39 +82,47 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
     from data_pipelines.rlds import RldsDataset
     from hma_jax.tokenizers.train import train_tokenizer
 
+    corrupt = study.store.corrupt
     made_from = stable_hash(
         {
             "config": to_dict(study.tokenizer),
             "training": to_dict(study.tokenizer_training),
             "store": to_dict(study.store),  # decides which episodes are held out
-            "data": [RldsDataset(path, spec.split).fingerprint() for spec, path in sources],
+            "data": [RldsDataset(path, spec.split, corrupt=corrupt).fingerprint() for spec, path in sources],
             "code": source_hash(("hma_jax/tokenizers",)),
         }
     )
-    stamp = workspace.tokenizer / "made_from.txt"
-    if stamp.exists() and stamp.read_text() == made_from:
+    stamp = workspace.tokenizer / STAMP
+    if _reads(stamp, made_from):
         console.print("[green]done[/] train the tokenizer [dim](before)[/]")
         return
-    stamp.unlink(missing_ok=True)
     aside = workspace.root / f"tokenizer.{made_from}"  # another configuration never resumes this one
     with step("train the tokenizer") as update:
         train_tokenizer(study, sources, aside, update)
+    write_atomically(aside / STAMP, made_from)
     shutil.rmtree(workspace.tokenizer, ignore_errors=True)
     os.replace(aside, workspace.tokenizer)
-    write_atomically(stamp, made_from)
 
 
 def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """Tokens of every source; a dataset already tokenised from the same input is kept."""
+    """Tokens of every source. Datasets already tokenised in the same way are kept."""
     from data_pipelines.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
     tokenizer = load_tokenizer(workspace.tokenizer)
-    options = to_dict(study.store)
+    made_from = stable_hash({"tokenizer": tokenizer.identity, "store": to_dict(study.store)})
+    stamp = workspace.store / STAMP
+    if not _reads(stamp, made_from):  # tokens of another tokenizer are of no use
+        shutil.rmtree(workspace.store, ignore_errors=True)
+        workspace.store.mkdir()
+        write_atomically(stamp, made_from)
     with step(f"tokenise {len(sources)} dataset(s)") as update:
-        for done, (spec, path) in enumerate(sources):
-            update(done, len(sources), spec.name)
-            tokenize_dataset(spec, path, tokenizer, workspace.store, **options)
+        for i, (spec, path) in enumerate(sources):
+            note = f"{spec.name} ({i + 1} of {len(sources)})"
+            tokenize_dataset(
+                spec, path, tokenizer, workspace.store, **to_dict(study.store),
+                progress=lambda done, total, note=note: update(done, total, note),
+            )  # fmt: skip
 
 
 def freeze_windows(study: Study, workspace: Workspace) -> Provenance:
@@ -122,32 +134,53 @@ def freeze_windows(study: Study, workspace: Workspace) -> Provenance:
     names, frames = study.dataset_names(), study.model.frames
     manifest = freeze_manifest(store, names, frames, study.eval.windows_per_dataset, study.eval.seed)
     manifest.save(workspace.manifest)
+    judged = names[: study.dataset_counts[0]]
+    require(
+        bool(set(judged) & set(manifest.names)),
+        f"none of {', '.join(judged)}, by which the datasets axis is judged, has a held-out window of "
+        f"{frames} frames; choose fewer with --set model.frames=... or put other datasets first",
+    )
     summary = summarise(store, names, frames)
     write_atomically(workspace.data_summary, json.dumps(summary, indent=1))
     for name, facts in summary.items():
-        if facts["too_short"]:
-            console.print(
-                f"[yellow]note[/] {name}: {facts['too_short']} of {facts['episodes']} episodes are shorter than "
-                f"a window of {frames} frames and are left out"
-            )
-    identity = {store.manifest(name).tokenizer for name in names}
-    require(len(identity) == 1, f"the token store {workspace.store} mixes tokenizers; delete it")
-    return Provenance(store.hash(), manifest.hash, identity.pop(), source_hash())
+        _remark(name, facts, manifest.empty.get(name, ""), frames)
+    (identity,) = {store.manifest(name).tokenizer.identity for name in names}
+    return Provenance(store.hash(names), manifest.hash(), identity, source_hash())
 
 
-def summarise(store: Any, names: Sequence[str], frames: int) -> dict[str, dict[str, int]]:
-    """Training episodes, those too short for a window, and windows, per dataset."""
+def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str, dict[str, int]]:
+    """Per dataset: training episodes, those too short for a window, windows, episodes skipped."""
     from data_pipelines.windows import train_windows
 
     summary = {}
     for name in names:
-        windows = train_windows(store, name, frames)
+        manifest, windows = store.manifest(name), train_windows(store, name, frames)
         summary[name] = {
-            "episodes": len(store.manifest(name).train_frames),
+            "episodes": len(manifest.train.episodes),
             "too_short": windows.too_short,
-            "windows": len(windows.start),
+            "windows": len(windows),
+            "skipped": sum(manifest.skipped.values()),
         }
     return summary
+
+
+def _remark(name: str, facts: dict[str, int], no_evaluation: str, frames: int) -> None:
+    """Says what of a dataset is not used."""
+    remarks = []
+    if facts["too_short"]:
+        remarks.append(
+            f"{facts['too_short']} of {facts['episodes']} training episodes are too short for {frames} frames"
+        )
+    if facts["skipped"]:
+        remarks.append(f"{facts['skipped']} damaged episodes are left out")
+    if no_evaluation:
+        remarks.append(f"it is not evaluated: {no_evaluation}")
+    if remarks:
+        console.print(f"[yellow]note[/] {name}: {'; '.join(remarks)}", soft_wrap=True)
+
+
+def _reads(path: Path, text: str) -> bool:
+    return path.exists() and path.read_text() == text
 
 
 def _cores() -> int:

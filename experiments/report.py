@@ -165,12 +165,12 @@ def _dataset_table(rows: Sequence[Row], sweeps: Sequence[Sweep], workspace: Work
         return _pm(at[0]) if at else "–"
 
     metrics = ("perplexity", "accuracy", "psnr", "psnr_copy", "ssim", "delta_psnr")
-    head = ["dataset", "episodes", "too short", "windows", "perplexity", "accuracy", "PSNR (dB)",
+    head = ["dataset", "episodes", "too short", "skipped", "windows", "perplexity", "accuracy", "PSNR (dB)",
             "copying (dB)", "SSIM", "ΔPSNR (dB)"]  # fmt: skip
     lines = []
     for name in (*sweep.scope, OVERALL):
         facts = data.get(name, {})
-        counts = [str(facts.get(k, "–")) for k in ("episodes", "too_short", "windows")]
+        counts = [str(facts.get(k, "–")) for k in ("episodes", "too_short", "skipped", "windows")]
         lines.append([html.escape(name), *counts, *(cell(name, metric) for metric in metrics)])
     return (
         "<p>PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR "

@@ -99,8 +99,9 @@ def _rows(
         parts.append(("untrained", Evaluation.from_dict(result["untrained"])))
     rows = []
     for role, evaluation in parts:
-        scopes = {OVERALL: evaluation.over(sweep.scope)}
-        scopes |= {name: evaluation.datasets[name] for name in sweep.scope}
+        judged = [name for name in sweep.scope if name in evaluation.datasets]  # those with windows
+        scopes = {OVERALL: evaluation.over(judged)}
+        scopes |= {name: evaluation.datasets[name] for name in judged}
         for scope, metrics in scopes.items():
             rows += [row(role, scope, m, s.mean, s.sem, s.n) for m, s in sorted(metrics.items())]
     return rows

@@ -12,7 +12,7 @@ import difflib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 from hma_jax.config import (
     ConfigError,
@@ -52,6 +52,7 @@ class StoreConfig:
     min_val: int = 2  # held-out episodes per dataset, at least
     max_val: int = 200  # and at most
     frame_step: int | None = None  # None: only the 2 Hz frames
+    corrupt: Literal["raise", "skip"] = "raise"  # damaged records: stop, or leave out and count
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,8 @@ def train_trial(
     progress: Progress = lambda *_: None,
 ) -> FitResult:
     """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train_model`."""
+    import jax
+
     from data_pipelines.loader import LoaderConfig, make_loader
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
@@ -139,11 +141,14 @@ def train_trial(
         trial.model,
         table,
         trial.train,
-        lambda start: make_loader(store, table, loader, start_step=start),
+        lambda start: make_loader(
+            store, table, loader, start_step=start,
+            process_index=jax.process_index(), process_count=jax.process_count(),
+        ),
         mesh=mesh,
         run_dir=run_dir,
         provenance={
-            "store": store.hash(),
+            "store": store.hash(trial.datasets),
             "tokenizer": materials.tokenizer.identity,
             "loader": to_dict(loader),
         },
@@ -167,8 +172,9 @@ def evaluate_on(
     from data_pipelines.evalset import eval_batches
     from hma_jax.evaluation.protocol import evaluate
 
-    batches = eval_batches(materials.store, table, materials.manifest, config.batch, names)
-    windows = len(names) * config.windows_per_dataset  # at most
+    manifest = materials.manifest
+    batches = eval_batches(materials.store, table, manifest, config.batch, names)
+    windows = sum(len(d.windows) for d in manifest.datasets if d.dataset in names)
     progress("evaluating", 0, windows)
     return evaluate(
         params,

@@ -1,0 +1,120 @@
+"""The command line: one message and the right exit code for every mistake, fast and full help."""
+
+import subprocess
+import sys
+
+import pytest
+
+from experiments import commands, pipeline
+from experiments.cli import main
+from experiments.ledger import Ledger
+from experiments.runner import read_states
+from experiments.workspace import Workspace, load_record, save_record
+from tests.experiments.fakes import PROVENANCE, finished_study, record_of
+
+COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "tokenizer", "tokenizer train", "tokenize",
+            "train", "evaluate", "report")  # fmt: skip
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_of_every_command(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*command.split(), "--help"])
+    assert end.value.code == 0
+    assert "usage: hma" in capsys.readouterr().out
+
+
+def test_help_needs_no_jax():
+    code = "import sys, experiments.cli; sys.exit('jax' in sys.modules or 'matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["study", "--preset", "smoke", "--set", "model.frame=4"], 2, "did you mean model.frames"),
+        (["study", "--preset", "paper"], 2, "--data"),
+        (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot make"),
+        (["study", "--preset", "smoke", "--data", "{empty}"], 1, "{empty}"),
+        (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
+        (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge,b,c"], 2, "bridge_dataset"),
+        (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
+        (["report", "--out", "{empty}"], 2, "no study"),
+        (["evaluate", "{empty}", "--preset", "smoke"], 2, "checkpoint"),
+    ],
+)
+def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("")
+    places = {"empty": tmp_path / "empty", "file": tmp_path / "file"}
+    assert main([a.format(**places) for a in arguments]) == code
+    said = capsys.readouterr()
+    assert said.err.startswith("error: ") and "Traceback" not in said.err
+    assert message.format(**places) in said.err
+
+
+def test_wrong_choice_exits_with_2(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["sweep", "widths"])
+    assert end.value.code == 2
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    with pytest.raises(Exception, match="no study"):
+        main(["report", "--out", str(tmp_path), "--debug"])
+
+
+def test_paper_plan_prints_the_papers_sizes(capsys):
+    assert main(["sweep", "width", "--preset", "paper", "--dry-run"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for width, size in (("256", "43.6"), ("1024", "678.7")):
+        assert any(width in words and size in words for words in lines)
+
+
+def test_sweep_modules_run_as_programs():
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.scale_width", "--preset", "smoke", "--dry-run"],
+        capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0 and "control" in done.stdout, done.stderr
+
+
+def test_report_is_drawn_again_from_disk(tmp_path, capsys):
+    workspace = finished_study(tmp_path)
+    save_record(workspace, record_of())
+    assert main(["report", "--out", str(tmp_path)]) == 0
+    assert "report.html" in capsys.readouterr().out and workspace.report.exists()
+
+
+@pytest.fixture
+def instant_trials(monkeypatch):
+    """Nothing is prepared; trials have fake results, but those of width 8 fail."""
+
+    def run_missing(jobs, trials, ledger, **_):
+        finished_study(trials.parent, load_study(trials.parent), broken={"width 8 ": "failed"})
+        return read_states([job.id for job in jobs], trials, Ledger(ledger.path))
+
+    def load_study(root):
+        return load_record(Workspace(root)).study
+
+    monkeypatch.setattr(pipeline, "prepare", lambda *_: PROVENANCE)
+    monkeypatch.setattr(commands, "run_missing", run_missing)
+
+
+def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp_path, capsys):
+    assert main(["study", "--preset", "smoke", "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert "1 of 5 trials have no result" in said.err and "width 8" in said.err and "--retry-failed" in said.err
+    assert "failed" in (tmp_path / "results.csv").read_text()
+    assert (tmp_path / "report.html").exists()
+
+
+def test_axes_of_one_study_share_a_report(instant_trials, tmp_path):
+    for axis in ("trajectories", "datasets"):
+        main(["sweep", axis, "--preset", "smoke", "--out", str(tmp_path)])
+        for trial in (tmp_path / "trials").iterdir():
+            [path.unlink() for path in trial.iterdir()]
+            trial.rmdir()
+    assert load_record(Workspace(tmp_path)).axes == ("trajectories", "datasets")
+    main(["sweep", "width", "--preset", "smoke", "--out", str(tmp_path), "--set", "tau=1"])
+    assert load_record(Workspace(tmp_path)).axes == ("width",)  # another study: nothing in common
