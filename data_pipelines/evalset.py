@@ -183,11 +183,8 @@ def _window(
 ) -> dict[str, np.ndarray]:
     facts = store.manifest(name)
     item = store.episode(name, "val", episode)
-    actions = np.zeros((frames, table.action_width), np.float32)
-    chunk = cut_actions(item, start, frames, facts)
-    actions[:, : chunk.shape[1]] = chunk
     return {
         "tokens": cut_frames(item.tokens, start, frames, facts).astype(np.int32),
-        "actions": actions,
+        "actions": cut_actions(item, start, frames, facts, table.action_width),
         "frames": cut_frames(item.frames, start, frames, facts),
     }

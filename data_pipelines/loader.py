@@ -107,38 +107,34 @@ def make_loader(
     return iterator
 
 
-@dataclass(frozen=True)
 class _Stream:
     """Endless shuffled windows of one dataset: element i is the i-th window ever drawn."""
 
-    store: TokenStore
-    table: EmbodimentTable
-    windows: WindowSet
-    config: LoaderConfig
+    def __init__(self, store: TokenStore, table: EmbodimentTable, windows: WindowSet, config: LoaderConfig):
+        self.store, self.windows = store, windows
+        self.manifest = store.manifest(windows.name)
+        self.embodiment = np.int32(table.index(windows.name))
+        self.action_width = table.action_width
+        self.shuffle_actions = config.shuffle_actions
+        self.order_seed = stream_seed(config.seed, "order", windows.name)
+        self.action_seed = stream_seed(config.seed, "shuffled actions", windows.name)
 
     def __len__(self) -> int:
         return sys.maxsize
 
     def __getitem__(self, i: int) -> dict[str, np.ndarray]:
-        windows, frames = self.windows, self.config.frames
-        manifest = self.store.manifest(windows.name)
-        at = endless_shuffle(i, len(windows), self._seed("order"))
+        windows, frames = self.windows, self.windows.frames
+        at = endless_shuffle(i, len(windows), self.order_seed)
         episode, start = windows.locate(at)
         item = self.store.episode(windows.name, "train", episode)
-        tokens = cut_frames(item.tokens, start, frames, manifest).astype(np.int32)
-        if self.config.shuffle_actions:
+        tokens = cut_frames(item.tokens, start, frames, self.manifest).astype(np.int32)
+        if self.shuffle_actions:
             episode, start = windows.locate(self._other(at, i))
             item = self.store.episode(windows.name, "train", episode)
-        actions = np.zeros((frames, self.table.action_width), np.float32)
-        chunk = cut_actions(item, start, frames, manifest)
-        actions[:, : chunk.shape[1]] = chunk
-        embodiment = np.int32(self.table.index(windows.name))
-        return {"tokens": tokens, "actions": actions, "embodiment": embodiment}
+        actions = cut_actions(item, start, frames, self.manifest, self.action_width)
+        return {"tokens": tokens, "actions": actions, "embodiment": self.embodiment}
 
     def _other(self, at: int, i: int) -> int:
         """Another window than `at`, drawn anew on every visit so that no pair can be learnt."""
         n = len(self.windows)
-        return at if n == 1 else (at + 1 + random_below(n - 1, i, self._seed("shuffled actions"))) % n
-
-    def _seed(self, purpose: str) -> int:
-        return stream_seed(self.config.seed, purpose, self.windows.name)
+        return at if n == 1 else (at + 1 + random_below(n - 1, i, self.action_seed)) % n

@@ -62,10 +62,11 @@ class TokenStore:
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
         """Episode `i` of a split, in store order. Raises DataError for a damaged record."""
-        path = self._path(name, split)
+        reader = self._reader(name, split)
         try:
-            return decode_episode(self._reader(name, split).read([i])[0])
+            return decode_episode(reader.read([i])[0])
         except (RuntimeError, ValueError) as error:
+            path = self._path(name, split)
             raise DataError(
                 f"{path}: episode {i} cannot be read: {error}. "
                 f"Remove {path.parent} and tokenise the dataset again."

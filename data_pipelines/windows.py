@@ -136,7 +136,14 @@ def cut_frames(array: np.ndarray, start: int, frames: int, manifest: Manifest) -
     return array[start : start + frames * step : step]
 
 
-def cut_actions(item: StoredEpisode, start: int, frames: int, manifest: Manifest) -> np.ndarray:
-    """float32 [T, stride x A]: the action chunk of each frame, sub-step-major, raw units."""
+def cut_actions(
+    item: StoredEpisode, start: int, frames: int, manifest: Manifest, width: int
+) -> np.ndarray:
+    """float32 [T, U = width]: the action chunk of each frame, sub-step-major, raw units,
+    followed by zeros.
+    """
     stride, first = manifest.stride, start * manifest.frame_step
-    return item.actions[first : first + frames * stride].reshape(frames, -1)
+    chunk = item.actions[first : first + frames * stride].reshape(frames, -1)
+    padded = np.zeros((frames, width), np.float32)
+    padded[:, : chunk.shape[1]] = chunk
+    return padded
