@@ -1,0 +1,57 @@
+"""kill -9 in the middle of training, then the same command again."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.training.checkpoints import read_checkpoint
+
+ROOT = Path(__file__).parents[2]
+
+
+def start(run_dir: Path) -> subprocess.Popen:
+    command = [sys.executable, "-m", "tests.integration.train_slowly", str(run_dir)]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+
+
+def finish(run_dir: Path) -> None:
+    process = start(run_dir)
+    process.communicate(timeout=300)
+    assert process.returncode == 0
+
+
+def kill_after(run_dir: Path, step: int) -> None:
+    process = start(run_dir)
+    for line in process.stdout:
+        if int(line) >= step:
+            process.send_signal(signal.SIGKILL)
+            break
+    process.wait(timeout=60)
+    assert process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("step", [5, 9])
+def test_a_killed_run_continued_is_byte_equal_to_one_never_killed(
+    tmp_path: Path, whole: Path, step: int
+):
+    kill_after(tmp_path, step)
+    finish(tmp_path)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
+    (step_a, a, _), (step_b, b, _) = (read_checkpoint(d / "checkpoints") for d in (tmp_path, whole))
+    assert step_a == step_b == 12
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("whole")
+    finish(directory)
+    return directory

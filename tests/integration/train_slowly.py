@@ -1,0 +1,27 @@
+"""Trains the tiny model, a pause per step, announcing each; a parent process kills it."""
+
+import sys
+import time
+from pathlib import Path
+
+from hma_jax.training.loop import LoopOptions
+from hma_jax.training.train import train_model
+from tests.tiny import TABLE, batches, model_config, train_config
+
+
+def announce(step: int, steps: int, metrics: dict) -> None:
+    print(step, flush=True)
+    time.sleep(0.05)
+
+
+if __name__ == "__main__":
+    train_model(
+        model_config(),
+        TABLE,
+        train_config(steps=12),
+        batches(model_config()),
+        run_dir=Path(sys.argv[1]),
+        provenance={},
+        options=LoopOptions(checkpoint_every=3, log_every=1),
+        progress=announce,
+    )
