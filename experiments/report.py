@@ -251,15 +251,23 @@ def _pm(p: CurvePoint) -> str:
     """Mean ± standard error, with the digits that the error leaves meaningful."""
     if math.isnan(p.sem) or p.sem <= 0:
         return f"{p.mean:.4g}"
-    digits = min(max(1 - math.floor(math.log10(p.sem)), 0), 4)
-    return f"{p.mean:.{digits}f} <span class=sem>± {p.sem:.{digits}f}</span>"
+    return f"{_number(p.mean, p.sem)} <span class=sem>± {_number(p.sem, p.sem)}</span>"
 
 
 def _change(points: Sequence[CurvePoint]) -> str:
+    """From the first to the last point, and how many standard errors lie between them."""
     first, last = points[0], points[-1]
     error = math.hypot(first.sem, last.sem)
-    size = f" ({abs(last.mean - first.mean) / error:.1f} standard errors)" if error > 0 else ""
-    return f"{first.mean:.3g} → {last.mean:.3g}{size}"
+    if not error > 0:  # also nan: a single window
+        return f"{first.mean:.3g} → {last.mean:.3g}"
+    size = abs(last.mean - first.mean) / error
+    return f"{_number(first.mean, error)} → {_number(last.mean, error)} ({size:.1f} standard errors)"
+
+
+def _number(value: float, error: float) -> str:
+    """`value` to two digits of `error`."""
+    digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
+    return f"{value:.{digits}f}".replace("-", "\u2212")
 
 
 def _last(points: Sequence[CurvePoint]) -> CurvePoint | None:

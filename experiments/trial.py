@@ -216,7 +216,7 @@ def run_trial(
     evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, progress=progress)
     untrained = None
     if trial.measure_untrained:  # what it says of one batch it says of all: it has learnt nothing
-        fresh = declared.init(trial.train.seed)
+        fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))
         untrained = evaluate_on(trial.evaluated, fresh, *subject, first_batches=True).to_dict()
 
     write_samples(directory / "samples.npz", evaluation.samples)
