@@ -15,6 +15,10 @@ from data_pipelines.suite.bodies import Pose
 from data_pipelines.suite.spec import Camera, EmbodimentSpec
 from data_pipelines.suite.world import Rollout
 
+CONTRAST = 0.7
+"""Colours are drawn towards mid-grey by this factor, as a real camera's are. It sets the scale
+of all squared errors alike, so differences of PSNR do not depend on it."""
+
 CHUNK = 48
 """Frames drawn together: about what keeps canvas and windows in the cache."""
 
@@ -59,7 +63,8 @@ def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
 
     def colours(base: np.ndarray, spread: float) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
-        lit = np.clip((base + spread * rng.standard_normal(base.shape)) * light, 8, 247)
+        lit = (base + spread * rng.standard_normal(base.shape)) * light
+        lit = np.clip(128 + CONTRAST * (lit - 128), 8, 247)
         return np.pad(lit, ((0, 0), (0, 0), (0, 1))).astype(np.float32)
 
     floor = np.array([look.floor]) + look.shade * rng.standard_normal((n, 1, 1))
@@ -75,7 +80,7 @@ def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
         objects=colours(things[0], 4.0),
         goal=colours(goal, 2.0),
         distractors=colours(things[1] * 0.75 + 40, 4.0),
-        slope=rng.uniform(-18, 18, (n, 2)).astype(np.float32),
+        slope=rng.uniform(-10, 10, (n, 2)).astype(np.float32),
     )
 
 

@@ -22,9 +22,14 @@ def arm(
     swing: float | None = None,
     speed: float = 2.4,
     paint: int = 0,
+    fist: float = 0.0,
 ) -> Body:
     """A chain of revolute links. `heading` (degrees) is straight out; the first joint swings
-    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner."""
+    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner.
+
+    The last link pushes objects; with a `fist` (its radius) only that does, and the arm
+    passes above them.
+    """
     swing = bend if swing is None else swing
     links, joints = [], []
     for i, length in enumerate(lengths):
@@ -37,11 +42,13 @@ def arm(
                 length=length,
                 radius=radius * taper**i,
                 paint=(paint + i) % 3,
-                touches=i == len(lengths) - 1,
+                touches=i == len(lengths) - 1 and not fist,
             )
         )
         limit = math.radians(swing if i == 0 else bend)
         joints.append(Joint(-limit, limit, speed))
+    if fist:
+        links.append(Link(parent=len(links) - 1, radius=fist, paint=2, touches=True))
     return Body(tuple(links), tuple(joints), (len(links) - 1,), (-1,))
 
 
@@ -131,10 +138,11 @@ def gantry(
     rail: bool = False,
     turns: bool = False,
     bar: float = 0.3,
+    thick: float = 0.1,
     touches: bool = True,
 ) -> Body:
     """A head that slides along x and y, drawn as a disc; with `rail` also its moving beam;
-    with `turns` the head carries a bar that rotates."""
+    with `turns` the head carries a rotating bar of half-length `bar`, half-width `thick`."""
     links = [Link(joint=0, kind="slide_x")]
     if rail:
         links.append(Link(parent=0, mount=(0.0, -1.2), angle=math.pi / 2, length=2.4, radius=0.09))
@@ -146,7 +154,7 @@ def gantry(
     tool = len(links) - 1
     if turns:
         links.append(
-            Link(parent=tool, mount=(-bar, 0.0), length=2 * bar, radius=0.1, paint=2, touches=touches)
+            Link(parent=tool, mount=(-bar, 0.0), length=2 * bar, radius=thick, paint=2, touches=touches)
         )
     return Body(tuple(links), tuple(joints), (tool,), (-1,))
 
