@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import pickle
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from data_pipelines.episode_record import StoredEpisode, decode_episode, encode_episode, token_dtype
+from data_pipelines.errors import DataError
+from data_pipelines.store import TokenStore
+from hma_jax.config import ConfigError
+
+
+def make_item(**changes) -> StoredEpisode:
+    rng = np.random.default_rng(0)
+    values = dict(
+        episode=17,
+        success=None,
+        tokens=rng.integers(0, 60000, (3, 5)).astype(np.uint16),
+        actions=rng.normal(size=(6, 7)).astype(np.float32),
+        frames=rng.integers(0, 255, (3, 8, 8, 3)).astype(np.uint8),
+    )
+    return StoredEpisode(**(values | changes))
+
+
+@pytest.mark.parametrize("success", [None, True, False])
+@pytest.mark.parametrize("dtype", [np.uint16, np.uint32])
+@pytest.mark.parametrize("frames", [True, False])
+def test_record_keeps_everything(success, dtype, frames):
+    item = make_item(success=success)
+    item = make_item(success=success, tokens=item.tokens.astype(dtype), frames=item.frames if frames else None)
+    back = decode_episode(encode_episode(item))
+    assert (back.episode, back.success) == (17, success)
+    assert back.tokens.dtype == dtype and np.array_equal(back.tokens, item.tokens)
+    assert np.array_equal(back.actions, item.actions)
+    assert np.array_equal(back.frames, item.frames) if frames else back.frames is None
+
+
+def test_record_of_another_length_or_version_is_refused():
+    data = encode_episode(make_item())
+    for bad in (data[:-1], data + b"\0", data[:10], b"\2" + data[1:]):
+        with pytest.raises(ValueError, match="episode record|no episode"):
+            decode_episode(bad)
+
+
+def test_small_vocabularies_take_two_bytes():
+    assert token_dtype(65536) == np.uint16 and token_dtype(65537) == np.uint32
+
+
+def test_table_follows_the_order_asked_for(store):
+    table = store.embodiment_table(("hand", "arm"))
+    assert table.names == ("hand", "arm")
+    hand = table.entries[0]
+    assert (hand.action_dim, hand.stride, hand.chunk) == (6, 5, 30)
+    assert hand.mean == store.manifest("hand").action_mean
+
+
+def test_hash_covers_the_chosen_datasets_only(store):
+    assert store.hash(("arm", "base")) == store.hash(("base", "arm"))
+    assert len({store.hash(), store.hash(("arm",)), store.hash(("base",))}) == 3
+
+
+def test_pickled_store_and_many_threads_read_the_same(store):
+    expected = [store.episode("arm", "train", i).tokens[0, 0] for i in range(38)]
+    copy = pickle.loads(pickle.dumps(store))
+    with ThreadPoolExecutor(8) as pool:
+        read = pool.map(lambda i: copy.episode("arm", "train", i % 38).tokens[0, 0], range(380))
+        assert list(read) == expected * 10
+
+
+def test_unknown_dataset_lists_those_there(store):
+    with pytest.raises(ConfigError, match="'leg' is not in the token store .* it has arm, base, hand"):
+        store.manifest("leg")
+
+
+def test_missing_or_empty_store(tmp_path):
+    with pytest.raises(DataError, match="no such token store"):
+        TokenStore(tmp_path / "absent")
+    with pytest.raises(DataError, match="no dataset in this token store"):
+        TokenStore(tmp_path)
+
+
+@pytest.fixture
+def copy(store_root, tmp_path):
+    shutil.copytree(store_root / "arm", tmp_path / "arm")
+    return tmp_path
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"format": 1, "spec": 3}', '{"format": 2}'])
+def test_damaged_manifest(copy, content):
+    (copy / "arm/manifest.json").write_text(content)
+    with pytest.raises(DataError, match=r"arm/manifest.json: .*tokenise it again"):
+        TokenStore(copy)
+
+
+def test_flipped_bit_is_an_error_not_another_token(copy):
+    path = copy / "arm/train.array_record"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    store = TokenStore(copy)
+    errors = 0
+    for i in range(38):
+        try:
+            assert (store.episode("arm", "train", i).tokens // 256 == store.manifest("arm").train.episodes[i]).all()
+        except DataError as error:
+            errors += 1
+            assert str(path) in str(error) and "tokenise the dataset again" in str(error)
+    assert errors >= 1
+
+
+@pytest.mark.parametrize("spoil", ["truncate", "remove", "empty"])
+def test_damaged_or_missing_file(copy, spoil):
+    path = copy / "arm/train.array_record"
+    if spoil == "remove":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if spoil == "truncate" else 0])
+    with pytest.raises(DataError, match=r"train.array_record: .*tokenise the dataset again"):
+        TokenStore(copy).episode("arm", "train", 0)
