@@ -13,12 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.table import Table
-
 from experiments import scale_datasets, scale_trajectories, scale_width
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
-from experiments.progress import SweepMonitor, console, step
+from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
@@ -106,7 +104,7 @@ def draw(workspace: Workspace, record: Record) -> None:
     """CSV, figures and page from whatever trials are finished."""
     from experiments.plots import plot_overview, plot_sweep
     from experiments.report import write_report
-    from experiments.results import collect, read_csv, write_csv
+    from experiments.rows import collect, read_csv, write_csv
 
     provenance = record.provenance
     if provenance is None:
@@ -158,14 +156,16 @@ def _short(path: Path) -> str:
 def list_datasets() -> None:
     from data_pipelines.registry import all_specs
 
-    table = Table(title="Datasets that the registry knows", title_justify="left")
-    for name, justify in (
-        ("name", "left"), ("actions", "right"), ("Hz", "right"), ("stride", "right"), ("image", "left"), ("", "left")
-    ):  # fmt: skip
-        table.add_column(name, justify=justify)
+    table = tidy_table("Datasets that the registry knows", "name", "dims", "Hz", "stride", "image")
+    table.add_column("what it is", justify="left", no_wrap=True)
     for spec in all_specs():
         table.add_row(
-            spec.name, f"{spec.action_dim}", f"{spec.hz:g}", f"{spec.stride}", spec.image_key, spec.note
+            spec.name,
+            f"{spec.action_dim}",
+            f"{spec.hz:g}",
+            f"{spec.stride}",
+            spec.image_key.removeprefix("observation/"),
+            spec.note,
         )
     console.print(table)
     console.print("A dataset of your own is one more entry in data_pipelines/registry.py.")
@@ -235,10 +235,8 @@ def evaluate(setting: Setting, run: Path) -> None:
             setting.study.eval,
             progress=lambda phase, done, total: update(done, total, phase),
         )
-    table = Table(title=f"{_short(run)}, step {trained.step:,}", title_justify="left")
     metrics = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr")
-    for name in ("dataset", *metrics):
-        table.add_column(name, justify="left" if name == "dataset" else "right")
+    table = tidy_table(f"{_short(run)}, step {trained.step:,}", "dataset", *metrics)
     for name, stats in [*evaluation.datasets.items(), ("overall", evaluation.overall)]:
         table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
     console.print(table)

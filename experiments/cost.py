@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rich import box
 from rich.table import Table
 
 from experiments.paper_mixture import PAPER_MIXTURE
+from experiments.progress import tidy_table
 from experiments.study import Study
 from experiments.sweep import Sweep, reference_trial, unique_trials
 from experiments.trial import Provenance, Trial, trial_id
@@ -82,21 +82,17 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
     costs = {id: estimate(trial) for id, trial in trials.items()}
     total = sum(c.flops for c in costs.values())
     train = study.train
-    table = Table(
-        title=f"Study '{study.name}': {len(trials)} trials of {train.steps:,} steps x batch {train.batch}",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 0, 0, 1),
-        caption=(
-            f"Total {_flops(total)} for training and evaluation, about {_duration(total / study.flops_per_second)} of computing at "
-            f"{_flops(study.flops_per_second)}/s sustained (flops_per_second; compilation and data not "
-            "counted). 'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are per "
-            "dataset. 'Control': trained on shuffled actions."
-        ),
-        caption_justify="left",
+    table = tidy_table(
+        f"Study '{study.name}': {len(trials)} trials of {train.steps:,} steps x batch {train.batch}",
+        "trial", "sets", "videos", "width", "params", "one robot", "FLOPs", "time",
+    )  # fmt: skip
+    table.caption = (
+        f"Total {_flops(total)} for training and evaluation, about "
+        f"{_duration(total / study.flops_per_second)} of computing at {_flops(study.flops_per_second)}/s "
+        "sustained (flops_per_second; compilation and data not counted). 'One robot': parameters with a "
+        "single embodiment of 2 action dimensions. 'Videos' are per dataset. 'Control': trained on shuffled "
+        "actions."
     )
-    for name in ("trial", "sets", "videos", "width", "params", "one robot", "FLOPs", "time"):
-        table.add_column(name, justify="left" if name == "trial" else "right", no_wrap=True)
     shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in study.seeds}
     for id, trial in trials.items():
         cost = costs[id]

@@ -105,22 +105,24 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
 
 
 def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """Tokens of every source. Datasets already tokenised in the same way are kept."""
+    """Tokens of every source. Those made in the same way from the same shards are kept."""
+    from data_pipelines.rlds import RldsDataset
     from data_pipelines.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
-    tokenizer = load_tokenizer(workspace.tokenizer)
-    made_from = stable_hash({"tokenizer": tokenizer.identity, "store": to_dict(study.store)})
-    stamp = workspace.store / STAMP
-    if not _reads(stamp, made_from):  # tokens of another tokenizer are of no use
-        shutil.rmtree(workspace.store, ignore_errors=True)
-        workspace.store.mkdir()
-        write_atomically(stamp, made_from)
+    tokenizer, settings = load_tokenizer(workspace.tokenizer), to_dict(study.store)
+    workspace.store.mkdir(exist_ok=True)
     with step(f"tokenise {len(sources)} dataset(s)") as update:
         for i, (spec, path) in enumerate(sources):
             note = f"{spec.name} ({i + 1} of {len(sources)})"
+            shards = RldsDataset(path, spec.split, corrupt=study.store.corrupt).fingerprint()
+            made_from = stable_hash([tokenizer.identity, settings, to_dict(spec), shards])
+            stamp = workspace.store / f"{spec.name}.{STAMP}"
+            if not _reads(stamp, made_from):  # tokens of other data or another tokenizer are of no use
+                shutil.rmtree(workspace.store / spec.name, ignore_errors=True)
+                write_atomically(stamp, made_from)
             tokenize_dataset(
-                spec, path, tokenizer, workspace.store, **to_dict(study.store),
+                spec, path, tokenizer, workspace.store, **settings,
                 progress=lambda done, total, note=note: update(done, total, note),
             )  # fmt: skip
 

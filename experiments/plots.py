@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from experiments.results import CurvePoint, Row, curve, tally
+from experiments.rows import CurvePoint, Row, curve, tally
 
 INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
 COLOURS = {"perplexity": "#2b5c8a", "delta_psnr": "#b3541e"}

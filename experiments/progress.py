@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 from experiments.ledger import FINISHED
 from experiments.runner import Job, Monitor, State
 
-console = Console(highlight=False)
+console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)
 
 Update = Callable[[int, int, str], None]
@@ -42,6 +45,16 @@ def step(title: str) -> Iterator[Update]:
         task = bars.add_task(title, total=None, note="")
         yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)
     console.print(f"[green]done[/] {title} [dim]({_clock(time.monotonic() - began)})")
+
+
+def tidy_table(title: str, *columns: str) -> Table:
+    """A plain table: words in the first column, numbers in the others."""
+    table = Table(
+        title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
+    )
+    for i, name in enumerate(columns):
+        table.add_column(name, justify="right" if i else "left", no_wrap=True)
+    return table
 
 
 class SweepMonitor(Monitor):

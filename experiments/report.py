@@ -20,7 +20,7 @@ from PIL import Image
 
 from experiments.ledger import FINISHED
 from experiments.report_style import CSS
-from experiments.results import OVERALL, CurvePoint, Row, curve, load_result
+from experiments.rows import OVERALL, CurvePoint, Row, curve, load_result
 from experiments.runner import State
 from experiments.sweep import Sweep, reference_trial, unique_trials
 from experiments.trial import Provenance, trial_id

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.commands import draw
 from experiments.ledger import Ledger
-from experiments.results import OVERALL, collect, curve, read_csv, tally, write_csv
+from experiments.rows import OVERALL, collect, curve, read_csv, tally, write_csv
 from experiments.runner import read_states
 from experiments.scale_datasets import plan as plan_datasets
 from experiments.scale_width import plan as plan_width
