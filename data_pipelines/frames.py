@@ -7,7 +7,6 @@ function of (datasets, seed, s, r), so a run resumes from its step alone.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.images import fit_image
 from data_pipelines.mixture import make_mixture
-from data_pipelines.order import endless_shuffle, random_below, stream_seed
+from data_pipelines.order import ENDLESS, endless_shuffle, random_below, stream_seed
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds import MAX_SKIPPED, RldsDataset
 from data_pipelines.splits import held_out
@@ -87,7 +86,7 @@ class _FrameGroups:
     seed: int
 
     def __len__(self) -> int:
-        return sys.maxsize
+        return ENDLESS
 
     def __getitem__(self, i: int) -> np.ndarray:
         at = endless_shuffle(i, len(self.episodes), self.seed)

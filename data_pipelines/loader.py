@@ -7,7 +7,6 @@ resumes from its step alone, without iterator state.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -15,7 +14,7 @@ import grain
 import numpy as np
 
 from data_pipelines.mixture import Mixture, make_mixture
-from data_pipelines.order import endless_shuffle, random_below, stream_seed
+from data_pipelines.order import ENDLESS, endless_shuffle, random_below, stream_seed
 from data_pipelines.store import TokenStore
 from data_pipelines.windows import WindowSet, cut_actions, cut_frames, require_windows, train_windows
 from hma_jax.config import require
@@ -120,7 +119,7 @@ class _Stream:
         self.action_seed = stream_seed(config.seed, "shuffled actions", windows.name)
 
     def __len__(self) -> int:
-        return sys.maxsize
+        return ENDLESS
 
     def __getitem__(self, i: int) -> dict[str, np.ndarray]:
         windows, frames = self.windows, self.windows.frames

@@ -43,7 +43,8 @@ def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[s
     """
     dropped = {n: (reasons or {}).get(n, "it is empty") for n, c in counts.items() if c == 0}
     if len(dropped) == len(counts):
-        raise DataError("no dataset can be used: " + "; ".join(f"{n}: {why}" for n, why in dropped.items()))
+        reasons = "; ".join(f"{name}: {why}" for name, why in dropped.items())
+        raise DataError(f"no dataset can be used: {reasons}.")
     names = tuple(n for n in counts if n not in dropped)
     weights = mixture_weights([counts[n] for n in names], tau)
     return Mixture(names, tuple(weights.tolist()), dropped)

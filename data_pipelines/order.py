@@ -15,6 +15,10 @@ import numpy as np
 SMALL = 1 << 16
 """Up to here a whole epoch's permutation is made and kept; beyond, it is a block cipher."""
 
+ENDLESS = 1 << 40
+"""Length that an endless source states: more draws than any run makes, yet small enough for
+the sums that grain does with lengths."""
+
 
 def stream_seed(*parts: str | int) -> int:
     """A 63-bit seed for the stream called `parts`, independent of every other name."""

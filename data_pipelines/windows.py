@@ -67,6 +67,8 @@ class WindowSet:
 
     def shortage(self) -> str:
         """Why there are no windows, for a message."""
+        if not self.longest:
+            return f"it has no {self.split} episode"
         return (
             f"{self.frames} frames need {self.needed} native frames, the longest of its "
             f"{self.too_short} {self.split} episodes has {self.longest}"
@@ -80,9 +82,12 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
     fits = {name: s.longest * s.frames // s.needed for name, s in sets.items()}
     name = max(fits, key=fits.__getitem__)
     s = sets[name]
+    advice = f"use at most {fits[name]} frames, or datasets with longer episodes"
+    if not fits[name]:
+        advice = "use datasets with more or longer episodes"
     raise DataError(
         f"no {s.split} episode is long enough for a window. {name}: {s.shortage()} at stride "
-        f"{s.needed // s.frames}. Use at most {fits[name]} frames, or datasets with longer episodes."
+        f"{s.needed // s.frames}; {advice}."
     )
 
 

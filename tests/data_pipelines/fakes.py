@@ -104,11 +104,12 @@ def _write_metadata(directory: Path, spec: DatasetSpec, counts: list[int]) -> No
 
     parts = [tensor(dim) for dim in spec.action_dims]
     named = {f"part_{i}": part for i, part in enumerate(parts)}
+    image = tf.Image(shape=(8, 8, 3), encoding_format="png")
     features = tf.FeaturesDict(
         {
             "steps": tf.Dataset(
                 {
-                    "observation": tf.FeaturesDict({"image": tf.Image(shape=(8, 8, 3), encoding_format="png")}),
+                    "observation": tf.FeaturesDict({"image": image}),
                     "action": parts[0] if len(parts) == 1 else tf.FeaturesDict(named),
                     "is_last": tf.Scalar(dtype=np.bool_),
                     "language_instruction": tf.Text(),

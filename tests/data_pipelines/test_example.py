@@ -25,7 +25,8 @@ def test_real_records_equal_what_tfds_decodes(records):
         assert ours["episode_metadata/episode_id"].tolist() == [theirs["episode_metadata"]["episode_id"]]
         for t, step in enumerate(theirs["steps"]):
             assert np.array_equal(ours["steps/action"].reshape(10, 7)[t], step["action"])
-            assert np.array_equal(ours["steps/observation/state"].reshape(10, 7)[t], step["observation"]["state"])
+            state = step["observation"]["state"]
+            assert np.array_equal(ours["steps/observation/state"].reshape(10, 7)[t], state)
             for key in ("reward", "discount", "is_first", "is_last", "is_terminal"):
                 assert ours[f"steps/{key}"][t] == step[key]
             assert ours["steps/language_instruction"][t] == step["language_instruction"]

@@ -98,7 +98,7 @@ def test_second_run_does_nothing_and_other_settings_are_refused(tmp_path, rlds):
     described = replace(SPEC, note="words", camera="more words")
     assert tokenize_dataset(described, rlds, FakeTokenizer(), tmp_path / "store") == first
     assert (tmp_path / "store/toy/train.array_record").stat().st_mtime_ns == stamp
-    with pytest.raises(ConfigError, match="already tokenised in another way.*tokenizer.identity: 'fake' -> 'new'"):
+    with pytest.raises(ConfigError, match="in another way.*tokenizer.identity: 'fake' -> 'new'"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer("new"), tmp_path / "store")
     with pytest.raises(ConfigError, match="settings.keep_frames: 'val' -> 'all'"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", keep_frames="all")
@@ -120,7 +120,7 @@ def test_interrupted_job_leaves_no_dataset_and_can_be_repeated(tmp_path, rlds):
 
 def test_unwritable_directory_is_one_clear_message(tmp_path, rlds):
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match=r"file/store/toy: the token store cannot be written there \(Not a dir"):
+    with pytest.raises(ConfigError, match=r"file/store/toy: .* cannot be written there \(Not a dir"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "file" / "store")
 
 
