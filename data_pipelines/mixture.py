@@ -35,7 +35,9 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.
     return powers / powers.sum()
 
 
-def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] | None = None) -> Mixture:
+def make_mixture(
+    counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] | None = None
+) -> Mixture:
     """The mixture of the datasets in `counts` (name -> examples).
 
     Those with none are left out; `reasons` may say why. If none remains: DataError with all
@@ -43,8 +45,8 @@ def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[s
     """
     dropped = {n: (reasons or {}).get(n, "it is empty") for n, c in counts.items() if c == 0}
     if len(dropped) == len(counts):
-        reasons = "; ".join(f"{name}: {why}" for name, why in dropped.items())
-        raise DataError(f"no dataset can be used: {reasons}.")
+        details = "; ".join(f"{name}: {why}" for name, why in dropped.items())
+        raise DataError(f"no dataset can be used: {details}.")
     names = tuple(n for n in counts if n not in dropped)
     weights = mixture_weights([counts[n] for n in names], tau)
     return Mixture(names, tuple(weights.tolist()), dropped)

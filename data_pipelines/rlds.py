@@ -81,11 +81,12 @@ class RldsDataset:
         return len(self._lengths)
 
     def fingerprint(self) -> str:
-        """Hash over the shards' names and sizes and the length of every record."""
+        """Hash over the shards' names and sizes and the length and checksum of every record."""
         digest = hashlib.sha256()
         for path, size in zip(self._paths, self._sizes, strict=True):
             digest.update(f"{path.name}:{size};".encode())
         digest.update(self._lengths.astype("<i8").tobytes())
+        digest.update(self._checksums.astype("<u4").tobytes())
         return digest.hexdigest()[:16]
 
     # --- episodes ----------------------------------------------------------------------------
@@ -168,7 +169,7 @@ class RldsDataset:
     # --- inside ------------------------------------------------------------------------------
 
     def _index(self, shards: list[Path], expected: list[int]) -> None:
-        offsets, lengths, shard_of, sizes = [], [], [], []
+        offsets, lengths, checksums, shard_of, sizes = [], [], [], [], []
         for n, (path, count) in enumerate(zip(shards, expected, strict=True)):
             try:
                 index, damage = scan_shard(path)
@@ -183,11 +184,13 @@ class RldsDataset:
             self._check_count(path, len(index), count, damage)
             offsets.append(index.offsets)
             lengths.append(index.lengths)
+            checksums.append(index.checksums)
             shard_of.append(np.full(len(index), n, np.int32))
             sizes.append(path.stat().st_size)
         self._paths, self._sizes = shards, sizes
         self._offsets = np.concatenate(offsets or [np.zeros(0, np.int64)])
         self._lengths = np.concatenate(lengths or [np.zeros(0, np.int64)])
+        self._checksums = np.concatenate(checksums or [np.zeros(0, np.uint32)])
         self._shard_of = np.concatenate(shard_of or [np.zeros(0, np.int32)])
         if not len(self):
             raise DataError(f"{self.directory}: split {self.split!r} has no readable episode.")

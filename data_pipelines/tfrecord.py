@@ -27,11 +27,12 @@ FOOTER = 4  # bytes: checksum of the payload
 
 @dataclass(frozen=True)
 class ShardIndex:
-    """Where the records of one file are: byte offset of each header, byte length of each payload."""
+    """Where the records of one file are, and the checksums that stand behind them."""
 
     path: Path
-    offsets: np.ndarray  # int64 [records]
-    lengths: np.ndarray  # int64 [records]
+    offsets: np.ndarray  # int64 [records]: first byte of the header
+    lengths: np.ndarray  # int64 [records]: bytes of the payload
+    checksums: np.ndarray  # uint32 [records]: of the payload, as stored, not verified
 
     def __len__(self) -> int:
         return len(self.offsets)
@@ -44,7 +45,7 @@ def masked_crc32c(data: bytes) -> int:
 
 
 def index_shard(path: str | Path) -> ShardIndex:
-    """The place of every record, from a scan that reads the headers only.
+    """The place of every record, from a scan that skips the payloads.
 
     Raises CorruptRecordError where a header's checksum is wrong or the file ends inside a
     record; payload checksums are verified by `read_record`. A file of 0 bytes has 0 records.
@@ -64,13 +65,14 @@ def scan_shard(path: str | Path) -> tuple[ShardIndex, CorruptRecordError | None]
     path = Path(path)
     offsets: list[int] = []
     lengths: list[int] = []
+    checksums: list[int] = []
     damage = None
     fd = _open(path)
     try:
         size = os.fstat(fd).st_size
         offset = 0
+        header = os.pread(fd, HEADER, offset)
         while offset < size:
-            header = os.pread(fd, HEADER, offset)
             if len(header) < HEADER:
                 reason = f"the file ends inside a record header, at byte {size}"
                 damage = CorruptRecordError(path, offset, reason)
@@ -85,12 +87,20 @@ def scan_shard(path: str | Path) -> tuple[ShardIndex, CorruptRecordError | None]
                 reason = f"the file is truncated: the record needs bytes up to {end}, the file has {size}"
                 damage = CorruptRecordError(path, offset, reason)
                 break
+            between = os.pread(fd, FOOTER + HEADER, end - FOOTER)  # this footer, the next header
             offsets.append(offset)
             lengths.append(length)
-            offset = end
+            checksums.append(struct.unpack("<I", between[:FOOTER])[0])
+            offset, header = end, between[FOOTER:]
     finally:
         os.close(fd)
-    return ShardIndex(path, np.asarray(offsets, np.int64), np.asarray(lengths, np.int64)), damage
+    index = ShardIndex(
+        path,
+        np.asarray(offsets, np.int64),
+        np.asarray(lengths, np.int64),
+        np.asarray(checksums, np.uint32),
+    )
+    return index, damage
 
 
 def read_record(file: str | Path, offset: int, length: int, verify: bool = True) -> bytes:

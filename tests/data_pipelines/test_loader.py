@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import itertools
+import resource
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from hma_jax.config import ConfigError
 from hma_jax.embodiments import EmbodimentTable
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 
+STATM = Path("/proc/self/statm")
 CONFIG = LoaderConfig(frames=6, batch=16, seed=3)
 
 
@@ -114,6 +117,22 @@ def test_resuming_with_other_processes_and_threads_continues_exactly(store, tabl
 
 def test_far_steps_cost_nothing(store, table):
     assert take(store, table, 1, start_step=10**9)[0]["tokens"].shape == (16, 6, 4)
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="needs /proc")
+def test_memory_stays_flat(store, table):
+    """A loader that keeps what it has read grows by 20 kB a batch here."""
+
+    def resident() -> int:
+        return int(STATM.read_text().split()[1]) * resource.getpagesize()
+
+    loader = make_loader(store, table, CONFIG)
+    for _ in range(200):
+        next(loader)
+    before = resident()
+    for _ in range(600):
+        next(loader)
+    assert resident() - before < 6e6
 
 
 def test_seed_changes_the_order(store, table):

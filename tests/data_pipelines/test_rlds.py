@@ -90,6 +90,11 @@ def test_fingerprint_tells_contents_apart_not_places(tmp_path):
     assert a == RldsDataset(write_rlds(tmp_path / "b", SPEC, lengths)).fingerprint()
     assert a != RldsDataset(write_rlds(tmp_path / "c", SPEC, [5, 7])).fingerprint()
 
+    def change(episode, features):  # same number of bytes
+        features["steps/action"][0, 0] = 9
+
+    assert a != RldsDataset(write_rlds(tmp_path / "d", SPEC, lengths, change=change)).fingerprint()
+
 
 # --- damage: one clear message each -----------------------------------------------------------
 

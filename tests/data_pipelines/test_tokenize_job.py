@@ -65,7 +65,8 @@ def test_content_hash_sees_a_single_pixel(tmp_path):
     hashes = set()
     for change in (None, spoil):
         root = tmp_path / str(change is None)
-        tokenize_dataset(SPEC, write_rlds(root, SPEC, [6] * 4, change=change), FakeTokenizer(), root / "store")
+        rlds = write_rlds(root, SPEC, [6] * 4, change=change)
+        tokenize_dataset(SPEC, rlds, FakeTokenizer(), root / "store")
         hashes.add(TokenStore(root / "store").hash())
     assert len(hashes) == 2
 
