@@ -156,8 +156,9 @@ def _short(path: Path) -> str:
 def list_datasets() -> None:
     from data_pipelines.registry import all_specs
 
-    table = tidy_table("Datasets that the registry knows", "name", "dims", "Hz", "stride", "image")
-    table.add_column("what it is", justify="left", no_wrap=True)
+    table = tidy_table("Datasets that the registry knows", "name", "dims", "Hz", "stride")
+    table.add_column("image", overflow="fold")
+    table.add_column("what it is", min_width=30)
     for spec in all_specs():
         table.add_row(
             spec.name,

@@ -53,7 +53,7 @@ def tidy_table(title: str, *columns: str) -> Table:
         title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
     )
     for i, name in enumerate(columns):
-        table.add_column(name, justify="right" if i else "left", no_wrap=True)
+        table.add_column(name, justify="right" if i else "left", no_wrap=True, min_width=len(name))
     return table
 
 
