@@ -9,9 +9,11 @@ import json
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from rich.markup import escape
 
 from experiments import scale_datasets, scale_trajectories, scale_width
 from experiments.ledger import FINISHED, Ledger
@@ -77,27 +79,33 @@ def run_study(
             "the paper's forty datasets are not simulated: give their RLDS directories with --data, or "
             "add --dry-run to see the plan"
         )
-    workspace.create()
-    record = Record(study, setting.data, merge_axes(workspace, study, axes), command_line())
-    provenance = prepare(study, workspace, setting.data)
-    record = replace(record, provenance=provenance)
-    save_record(workspace, record)
     sweeps = [AXES[axis](study) for axis in axes]
-    jobs = [
-        Job(id, trial.title, {"trial": to_dict(trial), "provenance": to_dict(provenance), "mesh": to_dict(mesh)})
-        for id, trial in unique_trials(sweeps, provenance).items()
-    ]
+    with workspace.claimed():
+        all_axes = merge_axes(workspace, study, axes)
+        provenance = prepare(study, workspace, setting.data)
+        record = Record(study, setting.data, all_axes, command_line(), provenance)
+        save_record(workspace, record)
+        trials = unique_trials(sweeps, provenance)
+        common = {"provenance": to_dict(provenance), "mesh": to_dict(mesh)}
+        jobs = [Job(id, trial.title, {"trial": to_dict(trial), **common}) for id, trial in trials.items()]
+        states = run_jobs(jobs, workspace, workers, retry_failed)
+        draw(workspace, record)
+    complain(jobs, states)
+
+
+def run_jobs(
+    jobs: Sequence[Job], workspace: Workspace, workers: int, retry_failed: bool
+) -> dict[str, State]:
+    """Runs what is missing, visibly."""
     ledger = Ledger(workspace.ledger)
     before = read_states([job.id for job in jobs], workspace.trials, ledger)
     kept = sum(state.event == FINISHED for state in before.values())
     if kept:
         console.print(f"{kept} of {len(jobs)} trials are finished already")
     with SweepMonitor(len(jobs), kept) as monitor:
-        states = run_missing(
+        return run_missing(
             jobs, workspace.trials, ledger, workers=workers, retry_failed=retry_failed, monitor=monitor
         )
-    draw(workspace, record)
-    complain(jobs, states)
 
 
 def draw(workspace: Workspace, record: Record) -> None:
@@ -133,9 +141,9 @@ def complain(jobs: Sequence[Job], states: dict[str, State]) -> None:
 
 def wrote(*paths: Path, then: str = "") -> None:
     for path in paths:
-        console.print(f"wrote [bold]{_short(path)}[/]", soft_wrap=True)
+        console.print(f"wrote [bold]{escape(_short(path))}[/]", soft_wrap=True)
     if then:
-        console.print(f"next: {then}", soft_wrap=True)
+        console.print(f"next: {escape(then)}", soft_wrap=True)
 
 
 def command_line() -> str:
@@ -175,8 +183,8 @@ def list_datasets() -> None:
 def write_suite(setting: Setting) -> None:
     from experiments.pipeline import make_suite
 
-    setting.workspace.create()
-    make_suite(setting.study, setting.workspace)
+    with setting.workspace.claimed():
+        make_suite(setting.study, setting.workspace)
     wrote(setting.workspace.suite, then=_next("tokenizer train", setting))
 
 
@@ -184,17 +192,17 @@ def train_tokenizer(setting: Setting) -> None:
     from experiments.pipeline import find_sources, make_suite, make_tokenizer
 
     study, workspace = setting.study, setting.workspace
-    workspace.create()
-    sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace)
-    make_tokenizer(study, workspace, sources)
+    with workspace.claimed():
+        sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace)
+        make_tokenizer(study, workspace, sources)
     wrote(workspace.tokenizer, then=_next("tokenize", setting))
 
 
 def tokenize(setting: Setting) -> None:
     from experiments.pipeline import prepare
 
-    setting.workspace.create()
-    prepare(setting.study, setting.workspace, setting.data)
+    with setting.workspace.claimed():
+        prepare(setting.study, setting.workspace, setting.data)
     wrote(setting.workspace.store, setting.workspace.manifest, then=_next("train", setting))
 
 
@@ -204,8 +212,8 @@ def train(setting: Setting, run: Path | None, mesh: MeshConfig) -> None:
 
     study, workspace = setting.study, setting.workspace
     run = run or workspace.root / "model"
-    workspace.create()
-    prepare(study, workspace, setting.data)
+    with workspace.claimed():
+        prepare(study, workspace, setting.data)
     trial = reference_trial(study, study.seeds[0])
     with step(f"train: {trial.title}") as update:
         result = train_trial(

@@ -1,18 +1,16 @@
 """The ledger: an append-only record of what happened to every trial.
 
 One JSON object per line, on disk before `append` returns. A process killed while it writes
-leaves a torn last line, which the next writer cuts off. One writer at a time, held by a lock
-that dies with its process.
+leaves a torn last line, which the next writer cuts off. There must be one writer at a time:
+see `Workspace.claimed`.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -54,25 +52,13 @@ class Ledger:
         return last
 
     def append(self, trial: str, event: str, **details: Any) -> None:
-        """Adds one line and waits until it is on disk. Call within `locked`."""
+        """Adds one line and waits until it is on disk."""
         line = json.dumps({"time": round(self.clock(), 3), "trial": trial, "event": event, **details})
         with open(self.path, "ab+") as file:
             _cut_torn_line(file)
             file.write(line.encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
-
-    @contextmanager
-    def locked(self) -> Iterator[None]:
-        """The right to write. Raises ConfigError if another process holds it."""
-        with open(self.path.with_suffix(".lock"), "a+") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise ConfigError(
-                    f"another study is running in {self.path.parent}; wait for it or use another --out"
-                ) from None
-            yield
 
 
 def _cut_torn_line(file: Any) -> None:

@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
+
 from experiments.progress import console, step
 from experiments.study import Study
 from experiments.trial import Provenance, source_hash, write_atomically
@@ -178,7 +180,7 @@ def _remark(name: str, facts: dict[str, int], no_evaluation: str, frames: int) -
     if no_evaluation:
         remarks.append(f"it is not evaluated: {no_evaluation}")
     if remarks:
-        console.print(f"[yellow]note[/] {name}: {'; '.join(remarks)}", soft_wrap=True)
+        console.print(f"[yellow]note[/] {name}: {escape('; '.join(remarks))}", soft_wrap=True)
 
 
 def _reads(path: Path, text: str) -> bool:

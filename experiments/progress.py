@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -85,7 +86,7 @@ class SweepMonitor(Monitor):
         self.ended_count += 1
         self.bars.update(self.all, completed=self.ended_count)
         colour = "green" if state.event == FINISHED else "red"
-        message = f": {state.message}" if state.message else ""
+        message = f": {escape(state.message)}" if state.message else ""
         self.bars.console.print(
             f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {job.title} "
             f"[dim]({_clock(seconds)})[/]{message}"

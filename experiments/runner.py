@@ -87,7 +87,8 @@ def run_missing(
     """Brings every job to an end and returns their states.
 
     Failed and diverged trials of earlier runs are left alone unless `retry_failed`. On
-    KeyboardInterrupt the running trials save their state before it is raised again.
+    KeyboardInterrupt the running trials save their state before it is raised again. One runner
+    at a time: see `Workspace.claimed`.
     """
     monitor = monitor or Monitor()
     ids = [job.id for job in jobs]
@@ -95,31 +96,31 @@ def run_missing(
     again = {MISSING, INTERRUPTED} | ({FAILED, DIVERGED} if retry_failed else set())
     waiting = [job for job in jobs if before[job.id].event in again]
     running: dict[int, _Running] = {}
-    with ledger.locked():
-        for job in jobs:  # a runner killed between a result and its line in the ledger
-            if before[job.id].event == FINISHED and not _says_finished(ledger, job.id):
-                ledger.append(job.id, FINISHED)
-        try:
-            while waiting or running:
-                for slot in range(workers):
-                    if slot not in running and waiting:
-                        job = waiting.pop(0)
-                        if before[job.id].event in (FAILED, DIVERGED):
-                            shutil.rmtree(trials / job.id, ignore_errors=True)
-                        running[slot] = _start(job, trials, ledger, slot, workers, command)
-                        monitor.started(job, before[job.id].event == INTERRUPTED)
-                time.sleep(poll_seconds)
-                for slot, child in list(running.items()):
-                    if child.process.poll() is None:
-                        _pass_on_progress(child, monitor)
-                        continue
-                    del running[slot]
-                    state, seconds = _outcome(child), time.monotonic() - child.began
-                    details = {"message": state.message} if state.message else {}
-                    ledger.append(child.job.id, state.event, seconds=round(seconds, 1), **details)
-                    monitor.ended(child.job, state, seconds)
-        finally:
-            _stop([child.process for child in running.values()])
+    recorded = {id for id, record in ledger.states().items() if record["event"] == FINISHED}
+    for id, state in before.items():  # a runner was killed between a result and its line in the ledger
+        if state.event == FINISHED and id not in recorded:
+            ledger.append(id, FINISHED)
+    try:
+        while waiting or running:
+            for slot in range(workers):
+                if slot not in running and waiting:
+                    job = waiting.pop(0)
+                    if before[job.id].event in (FAILED, DIVERGED):
+                        shutil.rmtree(trials / job.id, ignore_errors=True)
+                    running[slot] = _start(job, trials, ledger, slot, workers, command)
+                    monitor.started(job, before[job.id].event == INTERRUPTED)
+            time.sleep(poll_seconds)
+            for slot, child in list(running.items()):
+                if child.process.poll() is None:
+                    _pass_on_progress(child, monitor)
+                    continue
+                del running[slot]
+                state, seconds = _outcome(child), time.monotonic() - child.began
+                details = {"message": state.message} if state.message else {}
+                ledger.append(child.job.id, state.event, seconds=round(seconds, 1), **details)
+                monitor.ended(child.job, state, seconds)
+    finally:
+        _stop([child.process for child in running.values()])
     return read_states(ids, trials, ledger)
 
 
@@ -130,10 +131,6 @@ class _Running:
     process: subprocess.Popen
     began: float
     shown: str = ""
-
-
-def _says_finished(ledger: Ledger, id: str) -> bool:
-    return ledger.states().get(id, {}).get("event") == FINISHED
 
 
 def _start(

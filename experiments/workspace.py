@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,14 +64,27 @@ class Workspace:
     def report(self) -> Path:
         return self.root / "report.html"
 
-    def create(self) -> None:
-        """Raises ConfigError if the directory cannot be made or written."""
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Makes the directory and holds the right to write in it; a lock that dies with its process.
+
+        Raises ConfigError if the directory cannot be written or another process holds it.
+        """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
+            lock = open(self.root / ".lock", "a+")
         except OSError as error:
-            raise ConfigError(f"cannot make {self.root}: {error.strerror}; choose another --out") from error
-        if not os.access(self.root, os.W_OK | os.X_OK):
-            raise ConfigError(f"cannot write to {self.root}; choose another --out or fix its permissions")
+            raise ConfigError(
+                f"cannot write to {self.root}: {error.strerror}; choose another --out or fix its permissions"
+            ) from error
+        with lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ConfigError(
+                    f"another command is at work in {self.root}; wait for it or choose another --out"
+                ) from None
+            yield
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def test_help_needs_no_jax():
     [
         (["study", "--preset", "smoke", "--set", "model.frame=4"], 2, "did you mean model.frames"),
         (["study", "--preset", "paper"], 2, "--data"),
-        (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot make"),
+        (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot write"),
         (["study", "--preset", "smoke", "--data", "{empty}"], 1, "{empty}"),
         (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge,b,c"], 2, "bridge_dataset"),

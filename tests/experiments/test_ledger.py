@@ -1,10 +1,11 @@
-"""The ledger keeps every whole line through a torn write and refuses a second writer."""
+"""The ledger keeps every whole line through a torn write; a workspace has one writer at a time."""
 
 import json
 
 import pytest
 
 from experiments.ledger import Ledger
+from experiments.workspace import Workspace
 from hma_jax.config import ConfigError
 
 
@@ -45,9 +46,9 @@ def test_damage_before_the_end_is_reported_with_its_line(ledger):
         ledger.records()
 
 
-def test_second_writer_is_refused(ledger):
-    with ledger.locked(), pytest.raises(ConfigError, match="another study is running"):
-        with Ledger(ledger.path).locked():
+def test_second_writer_is_refused(tmp_path):
+    with Workspace(tmp_path).claimed(), pytest.raises(ConfigError, match="another command is at work"):
+        with Workspace(tmp_path).claimed():
             pass
-    with ledger.locked():
+    with Workspace(tmp_path).claimed():
         pass  # free again
