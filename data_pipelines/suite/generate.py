@@ -20,7 +20,7 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import VERSION, write_dataset
 from hma_jax.config import ConfigError, require
 
-GENERATOR = 4
+GENERATOR = 5
 """Raise it when simulation, rendering or encoding change: older datasets are then remade."""
 
 MIN_EPISODES = 8
@@ -84,7 +84,7 @@ def generate_suite(
     except OSError as error:
         raise ConfigError(f"cannot make the suite's directory {root}: {error.strerror}") from error
     if not os.access(root, os.W_OK):
-        raise ConfigError(f"cannot write to the suite's directory {root}; choose another or fix its permissions")
+        raise ConfigError(f"cannot write to the suite's directory {root}: no permission; choose another")
 
     paths = [root / spec.name / VERSION for spec in specs]
     missing = []
@@ -123,8 +123,9 @@ def _make(name: str, root: Path, scale: float, seed: int) -> None:
     """One dataset: written aside, then renamed into place."""
     (spec,) = select([name])
     final = root / name / VERSION
+    for left in (root / name).glob(f".{VERSION}.incomplete.*"):  # by a run that was killed
+        shutil.rmtree(left)
     aside = root / name / f".{VERSION}.incomplete.{os.getpid()}"
-    shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
     try:
         write_dataset(

@@ -11,13 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_pipelines.suite.appearance import Appearance
 from data_pipelines.suite.bodies import Pose
 from data_pipelines.suite.spec import Camera, EmbodimentSpec
 from data_pipelines.suite.world import Rollout
-
-CONTRAST = 0.7
-"""Colours are drawn towards mid-grey by this factor, as a real camera's are. It sets the scale
-of all squared errors alike, so differences of PSNR do not depend on it."""
 
 CHUNK = 48
 """Frames drawn together: about what keeps canvas and windows in the cache."""
@@ -40,59 +37,6 @@ class Shapes:
     half: np.ndarray
     radius: np.ndarray
     colour: np.ndarray
-
-
-@dataclass(frozen=True)
-class Appearance:
-    """What differs between episodes: colours [n, ., 4] 0..255 and a light gradient [n, 2]."""
-
-    floor: np.ndarray
-    outside: np.ndarray
-    robot: np.ndarray
-    objects: np.ndarray
-    goal: np.ndarray
-    distractors: np.ndarray
-    slope: np.ndarray
-
-
-def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
-    """The looks of n episodes: pure in (spec, n, seed)."""
-    rng = np.random.default_rng([seed, 4])
-    look = spec.look
-    light = rng.uniform(0.86, 1.1, (n, 1, 1)) * (1 + 0.025 * rng.standard_normal((n, 1, 3)))
-
-    def colours(base: np.ndarray, spread: float) -> np.ndarray:
-        base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
-        lit = (base + spread * rng.standard_normal(base.shape)) * light
-        lit = np.clip(128 + CONTRAST * (lit - 128), 8, 247)
-        return np.pad(lit, ((0, 0), (0, 0), (0, 1))).astype(np.float32)
-
-    floor = np.array([look.floor]) + look.shade * rng.standard_normal((n, 1, 1))
-    things = [_hues(rng, (n, k)) for k in (spec.task.objects, look.distractors)]
-    if spec.task.objects:
-        goal = 0.55 * things[0][:, :1] + 0.45 * floor  # the mark has a pale shade of its object
-    else:
-        goal = 0.4 * np.array(look.robot[:1]) + 0.6 * floor
-    return Appearance(
-        floor=colours(floor, 5.0),
-        outside=colours(np.array([look.outside]), 8.0),
-        robot=colours(np.array(look.robot), 7.0),
-        objects=colours(things[0], 4.0),
-        goal=colours(goal, 2.0),
-        distractors=colours(things[1] * 0.75 + 40, 4.0),
-        slope=rng.uniform(-10, 10, (n, 2)).astype(np.float32),
-    )
-
-
-def _hues(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Random strong colours [*shape, 3], all of similar brightness."""
-    phase = rng.uniform(0, 2 * np.pi, (*shape, 1)) + np.array([0.0, 2.1, 4.2])
-    return 130 + 95 * np.cos(phase)
-
-
-def render(spec: EmbodimentSpec, rollout: Rollout, looks: Appearance, camera: Camera, episode: int) -> np.ndarray:
-    """uint8 [T, H, W, 3]: the frames of one episode, T = its length."""
-    return render_frames(spec, rollout, looks, camera, *frame_index(rollout, [episode]))
 
 
 def frame_index(rollout: Rollout, episodes: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -225,8 +169,8 @@ def _paint(canvas, centre, angle, half, radius, colour) -> None:
     """Blends one rounded box per frame into `canvas` [F, H, W, 4], in place. Pixel units."""
     frames, height, width = canvas.shape[:3]
     cos, sin = np.cos(angle), np.sin(angle)
-    width_height = np.abs(cos) * half[0] + np.abs(sin) * half[1], np.abs(sin) * half[0] + np.abs(cos) * half[1]
-    extent = np.stack(width_height, 1) + radius + 1.0
+    turned = np.abs([[cos, sin], [sin, cos]])  # how far each half extent reaches along x and y
+    extent = np.einsum("aef,e->fa", turned, half) + radius + 1.0
     size = np.minimum(np.ceil(2 * extent.max(0)).astype(int) + 1, (width, height))
     corner = np.clip(np.floor(centre - extent).astype(int), 0, np.array([width, height]) - size)
     dx = (corner[:, :1] + np.arange(size[0]) - centre[:, :1])[:, None, :].astype(np.float32)

@@ -192,8 +192,8 @@ def rover(
             )
         )
     links.append(Link(parent=2, mount=(0.45 * length, 0.0), length=0.3 * length, radius=0.1, paint=1))
-    joints = (Joint(-reach, reach, speed), Joint(-reach, reach, speed), Joint(-math.pi, math.pi, turn, wraps=True))
-    return Body(tuple(links), joints, (2,), (-1,))
+    slide, heading = Joint(-reach, reach, speed), Joint(-math.pi, math.pi, turn, wraps=True)
+    return Body(tuple(links), (slide, slide, heading), (2,), (-1,))
 
 
 def claw(fingers: int, phalanges: int, *, length: float = 0.17, radius: float = 0.06) -> Body:

@@ -1,8 +1,8 @@
 """The simulator: many episodes of one embodiment at once, quasi-static, in numpy.
 
-Owns the state, contact, grasping, distractors and the scripted behaviour's loop. All
-episodes advance together; a rollout is a pure function of (spec, episodes, seed) or, when
-actions are given, of those. Nothing is drawn here.
+Owns the state, contact, grasping, distractors and the loop. All episodes advance together; a
+rollout is a pure function of (spec, episodes, seed) or, when actions are given, of those.
+Nothing is drawn here.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_pipelines.suite.behaviour import Behaviour
 from data_pipelines.suite.bodies import Pose
 from data_pipelines.suite.spec import EmbodimentSpec
 
@@ -93,7 +94,8 @@ class World:
         self.tool_radius = max((body.links[i].radius for i in self.pushers), default=0.1)
         self.grasp = task.size + 0.1
         self.pose: Pose = body.pose(self.q)
-        self._separate()
+        for _ in range(20):  # random places overlap; nothing may move by itself later
+            self._separate()
         distance = (
             np.linalg.norm(self.tools - self.objects[:, :1], axis=-1)
             if task.objects
@@ -180,55 +182,3 @@ class World:
         self.distractors += self.drift * h
         outside = (np.abs(self.distractors) > 0.95) & (self.distractors * self.drift > 0)
         self.drift[outside] *= -1.0
-
-
-class Behaviour:
-    """Scripted and restless: part of the time on the task, part on wishes of its own.
-
-    Wishes change at random moments, so that the future cannot be told from the past alone:
-    a video model must look at the actions.
-    """
-
-    def __init__(self, world: World, rng: np.random.Generator):
-        n = len(world.q)
-        self.world, self.rng = world, rng
-        self.purpose = world.spec.purpose * rng.uniform(0.0, 2.0, n)  # some only play
-        self.on_task = rng.random(n) < self.purpose
-        self.wish = world.body.random(rng, n)
-        self.bias = np.zeros_like(world.q)
-
-    def act(self) -> np.ndarray:
-        """[n, A] actions for the present state."""
-        world, spec, body, rng = self.world, self.world.spec, self.world.body, self.rng
-        n = len(world.q)
-        change = rng.random(n) < spec.restless * world.dt
-        self.on_task = np.where(change, rng.random(n) < self.purpose, self.on_task) & ~world.done
-        arrived = np.abs(self.wish - world.q).max(1) < 0.15
-        wish = body.random(rng, n)
-        for grip in body.grips:
-            if grip >= 0:
-                wish[:, grip] = rng.random(n) < 0.5
-        change = (rng.random(n) < spec.restless * world.dt) | arrived
-        self.wish = np.where(change[:, None], wish, self.wish)
-
-        goal = np.where(self.on_task[:, None], self._task_goal(), self.wish)
-        fade = np.exp(-world.dt / 0.5)
-        kick = np.sqrt(1 - fade**2) * rng.standard_normal(goal.shape)
-        self.bias = fade * self.bias + kick
-        goal = np.clip(goal + self.bias * spec.noise * body.speed * 0.5, body.low, body.high)
-        return np.concatenate([c.encode(body, world.q, goal, world.dt) for c in spec.controls], 1)
-
-    def _task_goal(self) -> np.ndarray:
-        """[n, C]: the configuration that serves the task; joints it does not need explore."""
-        world, body = self.world, self.world.body
-        target, opening = world.spec.task.plan(world)
-        move = target - world.tools
-        far = np.linalg.norm(move, axis=-1, keepdims=True)
-        move = move * np.minimum(1.0, 0.4 / np.maximum(far, 1e-9))
-        goal = world.q + body.solve(world.pose, move)
-        busy = body.tool_joints[world.hand] if world.objects.shape[1] else body.tool_joints.any(0)
-        goal = np.where(busy, goal, self.wish)
-        for m, grip in enumerate(body.grips):
-            if grip >= 0:
-                goal[:, grip] = np.where(np.isnan(opening[:, m]), self.wish[:, grip], opening[:, m])
-        return goal

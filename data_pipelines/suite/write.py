@@ -14,7 +14,8 @@ import numpy as np
 import simplejpeg
 
 from data_pipelines.example import encode_example
-from data_pipelines.suite.render import Appearance, draw_appearance, frame_index, render_frames
+from data_pipelines.suite.appearance import Appearance, draw_appearance
+from data_pipelines.suite.render import frame_index, render_frames
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import Rollout, simulate
 from data_pipelines.tfrecord import write_shard
@@ -74,7 +75,8 @@ def write_dataset(spec: EmbodimentSpec, directory: Path, *, episodes: int, seed:
     lengths, size = [], 0
     for k in range(shards):
         path = directory / f"{spec.name}-train.tfrecord-{k:05d}-of-{shards:05d}"
-        lengths.append(write_shard(path, episode_records(spec, rollout, looks, bounds[k], bounds[k + 1], seed)))
+        records = episode_records(spec, rollout, looks, bounds[k], bounds[k + 1], seed)
+        lengths.append(write_shard(path, records))
         size += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
     _write_info(spec, directory, lengths, size, metadata)
     return frames
