@@ -1,0 +1,1 @@
+"""Tokenizers: frames to discrete ids and back, behind one interface (`base.Tokenizer`)."""

@@ -1,0 +1,97 @@
+"""What every tokenizer offers, and how images are fed through one in equal pieces.
+
+Code outside this package depends on `Tokenizer` alone: any model that turns frames into ids
+and back can stand behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from hma_jax.config import require
+from hma_jax.params import Params
+
+PIECE = 64
+"""Images per call of a jitted encoder or decoder; smaller batches are padded to it."""
+
+
+class Tokenizer(Protocol):
+    """Images to S token ids each, and back.
+
+    Ids run over a square grid row by row. An id is sum_q digit_q V^q: factor 0 in the low
+    digits. Both directions are deterministic, and an image's result does not depend on the
+    others of its batch: tokens made in one job equal those made in another.
+    """
+
+    @property
+    def image_size(self) -> int: ...
+    @property
+    def grid(self) -> int:
+        """Tokens along one side of the image."""
+        ...
+
+    @property
+    def tokens(self) -> int:
+        """S = grid^2."""
+        ...
+
+    @property
+    def vocab_size(self) -> int:
+        """V^Q."""
+        ...
+
+    @property
+    def factors(self) -> int:
+        """Q."""
+        ...
+
+    @property
+    def factor_vocab(self) -> int:
+        """V."""
+        ...
+
+    @property
+    def identity(self) -> str:
+        """Hash of configuration and weights: equal means the same ids for the same images."""
+        ...
+
+    @property
+    def params(self) -> Params: ...
+
+    def encode(self, images: np.ndarray) -> np.ndarray:
+        """uint8 [B, image_size, image_size, 3] -> int32 [B, S]."""
+        ...
+
+    def decode(self, ids: np.ndarray) -> np.ndarray:
+        """Ids [B, S] -> uint8 [B, image_size, image_size, 3]."""
+        ...
+
+    def decode_fn(self, params: Params, ids: jax.Array) -> jax.Array:
+        """Pure, for use inside a jit: ids [B, S] -> float32 [B, ...] in 0..255."""
+        ...
+
+    def save(self, directory: Path) -> None:
+        """Writes what `tokenizers.io.load_tokenizer` reads."""
+        ...
+
+
+def in_pieces(function: Callable[[np.ndarray], Any], rows: np.ndarray, size: int = PIECE) -> np.ndarray:
+    """`function` over consecutive pieces of exactly `size` rows; the last one is padded.
+
+    One static shape means one compilation, and rounding that does not vary with the number
+    of rows: a latent near zero must not change its bit with the batch it came in.
+    """
+    require(len(rows) > 0, "an empty batch cannot be encoded or decoded")
+    results = []
+    for start in range(0, len(rows), size):
+        piece = rows[start : start + size]
+        missing = size - len(piece)
+        if missing:
+            piece = np.concatenate([piece, np.zeros((missing, *piece.shape[1:]), piece.dtype)])
+        results.append(function(piece))  # dispatched; the device works while the next is cut
+    return np.concatenate([np.asarray(r) for r in results])[: len(rows)]
