@@ -6,27 +6,34 @@ was cut short is made again. What was prepared is named by the hashes of `Proven
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.markup import escape
 
 from experiments.progress import console, step
 from experiments.study import Study
-from experiments.trial import Provenance, source_hash, write_atomically
+from experiments.trial import CHECKPOINTS, Provenance, source_hash, write_atomically
 from experiments.workspace import Workspace
 from hma_jax.config import require, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
     from data_pipelines.store import TokenStore
+    from hma_jax.tokenizers.base import Tokenizer
 
 STAMP = "made_from.txt"
 """Holds the hash of a directory's inputs."""
+
+QUALITY = "quality.json"
+QUALITY_FRAMES = 1024
+"""Held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
 
 Source = tuple["DatasetSpec", Path]
 """A dataset: how it is read, and its RLDS directory."""
@@ -80,30 +87,60 @@ def make_suite(study: Study, workspace: Workspace) -> list[Source]:
 
 
 def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """A tokenizer trained on frames of all sources, skipped if nothing it depends on changed."""
+    """A tokenizer trained on frames of all sources, skipped if nothing it depends on changed.
+
+    Beside it lies quality.json: its reconstruction PSNR on held-out frames.
+    """
+    from data_pipelines.frames import make_frame_loader
     from data_pipelines.rlds import RldsDataset
     from hma_jax.tokenizers.train import train_tokenizer
+    from hma_jax.training.loop import LoopOptions
 
-    corrupt = study.store.corrupt
-    made_from = stable_hash(
-        {
-            "config": to_dict(study.tokenizer),
-            "training": to_dict(study.tokenizer_training),
-            "store": to_dict(study.store),  # decides which episodes are held out
-            "data": [RldsDataset(path, spec.split, corrupt=corrupt).fingerprint() for spec, path in sources],
-            "code": source_hash(("hma_jax/tokenizers",)),
-        }
-    )
+    config, train, settings = study.tokenizer, study.tokenizer_train, study.store
+    inputs = {
+        "config": to_dict(config),
+        "train": to_dict(train),
+        "held_out": [settings.val_fraction, settings.min_val, settings.max_val],
+        "data": [RldsDataset(p, spec.split, corrupt=settings.corrupt).fingerprint() for spec, p in sources],
+        "code": source_hash(("hma_jax/tokenizers",)),
+    }
+    made_from = stable_hash(inputs)
     stamp = workspace.tokenizer / STAMP
     if _reads(stamp, made_from):
         console.print("[green]done[/] train the tokenizer [dim](before)[/]")
         return
-    aside = workspace.root / f"tokenizer.{made_from}"  # another configuration never resumes this one
+
+    def frames(start: int, split: str = "train") -> Iterator[np.ndarray]:
+        return make_frame_loader(
+            sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
+            val_fraction=settings.val_fraction, min_val=settings.min_val, max_val=settings.max_val,
+            corrupt=settings.corrupt,
+        )  # fmt: skip
+
+    aside = workspace.root / f"tokenizer.{made_from}"  # never resumed with other inputs
     with step("train the tokenizer") as update:
-        train_tokenizer(study, sources, aside, update)
+        tokenizer = train_tokenizer(
+            config, train, frames, aside, provenance=inputs,
+            options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
+            progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
+        )  # fmt: skip
+        quality = reconstruction_psnr(tokenizer, frames(0, "val"))
+    console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
+    write_atomically(aside / QUALITY, json.dumps(quality))
     write_atomically(aside / STAMP, made_from)
     shutil.rmtree(workspace.tokenizer, ignore_errors=True)
     os.replace(aside, workspace.tokenizer)
+
+
+def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> dict[str, float]:
+    """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames: mean, sem, n."""
+    from hma_jax.evaluation.metrics import mean_and_sem, psnr
+
+    values: list[float] = []
+    while len(values) < QUALITY_FRAMES:
+        images = next(batches)
+        values += np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)).tolist()
+    return dataclasses.asdict(mean_and_sem(values))
 
 
 def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:

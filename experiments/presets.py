@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from experiments.paper_mixture import PAPER_MIXTURE
-from experiments.study import StoreConfig, Study, SuiteConfig, TokenizerTraining
+from experiments.study import StoreConfig, Study, SuiteConfig
 from hma_jax.config import (
     ConfigError,
     EvalConfig,
@@ -12,6 +12,7 @@ from hma_jax.config import (
     MupConfig,
     OptimizerConfig,
     TokenizerConfig,
+    TokenizerTrainConfig,
     TrainConfig,
 )
 
@@ -19,7 +20,7 @@ SMOKE = Study(
     name="smoke",  # seconds: proves that every part runs; its numbers mean nothing
     suite=SuiteConfig(scale=0.02),
     tokenizer=TokenizerConfig(image_size=16, downsample=4, bits=8, channels=8, max_channels=16),
-    tokenizer_training=TokenizerTraining(steps=3, batch=4),
+    tokenizer_train=TokenizerTrainConfig(steps=3, batch=4),
     model=ModelConfig(
         width=16, layers=2, heads=2, frames=4, tokens=16, action_tokens=2, factor_vocab=16,
         mup=MupConfig(base_width=16),
@@ -37,7 +38,7 @@ CPU = Study(
     name="cpu",  # the study of the README: two cores, minutes
     suite=SuiteConfig(scale=1.0),
     tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=12),
-    tokenizer_training=TokenizerTraining(steps=1000, batch=32),
+    tokenizer_train=TokenizerTrainConfig(steps=1000, batch=32),
     model=ModelConfig(
         width=64, layers=4, heads=4, frames=12, tokens=16, action_tokens=4, factor_vocab=64,
         mup=MupConfig(base_width=64),
@@ -57,7 +58,7 @@ ACCELERATOR = Study(
     name="accelerator",  # one GPU, hours
     suite=SuiteConfig(scale=20.0),
     tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=16, channels=64, max_channels=256),
-    tokenizer_training=TokenizerTraining(steps=10_000, batch=128, learning_rate=5e-4),
+    tokenizer_train=TokenizerTrainConfig(steps=10_000, batch=128, learning_rate=5e-4),
     model=ModelConfig(
         width=256, layers=12, heads=8, frames=12, tokens=64, action_tokens=16, factor_vocab=256,
         compute_dtype="bfloat16",
@@ -79,7 +80,7 @@ PAPER = Study(
     datasets=tuple(PAPER_MIXTURE),
     tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=128, max_channels=512,
                               res_blocks=2),
-    tokenizer_training=TokenizerTraining(steps=200_000, batch=64, learning_rate=1e-4),
+    tokenizer_train=TokenizerTrainConfig(steps=200_000, batch=64, learning_rate=1e-4),
     model=ModelConfig(compute_dtype="bfloat16"),
     train=TrainConfig(steps=60_000, batch=64),
     eval=EvalConfig(windows_per_dataset=500),

@@ -55,7 +55,7 @@ def write_report(
     result = load_result(workspace.trials, reference) if finished else None
     prompt = study.eval.prompt_frames
     body = [
-        _headline(record, sweeps, rows, states, result),
+        _headline(workspace, record, sweeps, rows, states, result),
         _section("Scaling curves", _picture(workspace.figures / "scaling.png", "Scaling curves"), *(
             _axis(sweep, rows) for sweep in sweeps
         )),
@@ -81,6 +81,7 @@ def write_report(
 
 
 def _headline(
+    workspace: Workspace,
     record: Record,
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
@@ -96,6 +97,7 @@ def _headline(
         _card("ΔPSNR, reference", _last(curve(rows, whole, "delta_psnr")), "dB, last frame: true minus random actions"),
         _card("ΔPSNR, shuffled actions", _last(curve(rows, whole, "delta_psnr", "control")),
               "dB, must vanish within its error"),
+        _card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"),
     ]  # fmt: skip
     when = result["run"]["finished"] if result else "reference trial not finished"
     unfinished = sum(state.event != FINISHED for state in states.values())
@@ -108,6 +110,14 @@ def _headline(
         f"<p class=meta>{html.escape(when)}</p></header>"
         f'<div class=cards>{"".join(cards)}</div>{warning if unfinished else ""}'
     )
+
+
+def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
+    path = workspace.tokenizer / "quality.json"
+    if not path.exists():
+        return None
+    quality = json.loads(path.read_text())
+    return CurvePoint(0, quality["mean"], quality["sem"], (), 0)
 
 
 def _axis(sweep: Sweep, rows: Sequence[Row]) -> str:

@@ -15,7 +15,7 @@ h2 { font-size: 1.25rem; margin: 2.8rem 0 .8rem; padding-top: .9rem; border-top:
 h3 { font-size: 1.02rem; margin: 1.6rem 0 .2rem; }
 p { margin: .4rem 0 .8rem; max-width: 46rem; }
 .lead { font-size: 1.08rem; } .meta, .sem { color: var(--muted); }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(220px, 1fr)); gap: .8rem; margin: 1.4rem 0; }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(185px, 1fr)); gap: .8rem; margin: 1.4rem 0; }
 .card { background: var(--soft); border-radius: 8px; padding: .8rem 1rem; }
 .card small { display: block; color: var(--muted); } .card b { font-size: 1.45rem; font-weight: 600; }
 .card b .sem { font-size: 1rem; font-weight: 400; }

@@ -19,6 +19,7 @@ from hma_jax.config import (
     EvalConfig,
     ModelConfig,
     TokenizerConfig,
+    TokenizerTrainConfig,
     TrainConfig,
     from_dict,
     require,
@@ -31,16 +32,6 @@ class SuiteConfig:
     """The simulated datasets; not used when a study runs on the user's own."""
 
     scale: float = 1.0  # multiplies every dataset's number of episodes
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class TokenizerTraining:
-    """How the tokenizer is trained, on frames of every dataset of the study."""
-
-    steps: int = 2000
-    batch: int = 32
-    learning_rate: float = 1e-3
     seed: int = 0
 
 
@@ -68,7 +59,7 @@ class Study:
     trajectory_counts: tuple[int, ...]  # per dataset
     widths: tuple[int, ...]
     tokenizer: TokenizerConfig = field(default_factory=TokenizerConfig)
-    tokenizer_training: TokenizerTraining = field(default_factory=TokenizerTraining)
+    tokenizer_train: TokenizerTrainConfig = field(default_factory=TokenizerTrainConfig)
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
     datasets: tuple[str, ...] = ()  # in the order they are added; () takes the suite's own order
