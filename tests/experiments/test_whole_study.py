@@ -1,0 +1,64 @@
+"""The real thing, small: from nothing to CSV, figures and page, through processes and kills."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.rows import curve, read_csv
+
+
+def hma(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "experiments.cli", *arguments]
+
+
+def finish(command: list[str]) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def starts(out: Path) -> int:
+    return sum(json.loads(line)["event"] == "started" for line in (out / "ledger.jsonl").read_text().splitlines())
+
+
+def test_one_command_goes_from_nothing_to_a_page(tmp_path):
+    """Not marked slow, though it takes half a minute: the only fast test of the whole chain."""
+    finish(hma("sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path), "--set", "trajectory_counts=4"))
+    rows = read_csv(tmp_path / "results.csv")
+    assert {(r.role, r.status) for r in rows} == {(r, "finished") for r in ("point", "control", "untrained")}
+    (untrained,) = curve(rows, "trajectories", "perplexity", "untrained")
+    assert untrained.mean == pytest.approx(256, rel=0.02)  # the vocabulary of the smoke tokenizer
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("data:image/png") == 1 + 3 * 3
+
+
+@pytest.mark.slow
+def test_killed_study_ends_with_the_same_csv(tmp_path):
+    """kill -9 in the middle, the same command again: nothing runs twice, a trial that is made
+    again gives the same bytes."""
+    command = hma("study", "--preset", "smoke", "--out", str(tmp_path))
+    study = subprocess.Popen(command, start_new_session=True)
+    deadline = time.monotonic() + 400
+    while not ((tmp_path / "ledger.jsonl").exists() and starts(tmp_path) == 2):
+        assert time.monotonic() < deadline and study.poll() is None
+        time.sleep(0.2)
+    time.sleep(3)
+    os.kill(study.pid, signal.SIGKILL)
+    study.wait()
+
+    finish(command)
+    csv = (tmp_path / "results.csv").read_bytes()
+    assert starts(tmp_path) == 6  # five trials, one of them twice
+    finish(command)
+    assert starts(tmp_path) == 6 and (tmp_path / "results.csv").read_bytes() == csv
+
+    interrupted = json.loads((tmp_path / "ledger.jsonl").read_text().splitlines()[2])["trial"]
+    shutil.rmtree(tmp_path / "trials" / interrupted)  # never killed, this time
+    finish(command)
+    assert starts(tmp_path) == 7 and (tmp_path / "results.csv").read_bytes() == csv
