@@ -19,7 +19,7 @@ from hma_jax.config import (
 SMOKE = Study(
     name="smoke",  # seconds: proves that every part runs; its numbers mean nothing
     suite=SuiteConfig(scale=0.02),
-    tokenizer=TokenizerConfig(image_size=16, downsample=4, bits=8, channels=8, max_channels=16),
+    tokenizer=TokenizerConfig(image_size=16, downsample=4, bits=8, channels=16),
     tokenizer_train=TokenizerTrainConfig(steps=3, batch=4),
     model=ModelConfig(
         width=16, layers=2, heads=2, frames=4, tokens=16, action_tokens=2, factor_vocab=16,
@@ -37,27 +37,27 @@ SMOKE = Study(
 CPU = Study(
     name="cpu",  # the study of the README: two cores, minutes
     suite=SuiteConfig(scale=1.0),
-    tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=12),
-    tokenizer_train=TokenizerTrainConfig(steps=1000, batch=32),
+    tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=16),
+    tokenizer_train=TokenizerTrainConfig(steps=1600, batch=32),
     model=ModelConfig(
-        width=64, layers=4, heads=4, frames=12, tokens=16, action_tokens=4, factor_vocab=64,
-        mup=MupConfig(base_width=64),
+        width=64, layers=3, heads=4, frames=12, tokens=16, action_tokens=1, factor_vocab=256,
+        mup=MupConfig(base_width=64), remat=False,
     ),
     train=TrainConfig(
-        steps=500, batch=16,
-        optimizer=OptimizerConfig(learning_rate=2e-3, warmup_steps=50, schedule="wsd"),
+        steps=300, batch=16,
+        optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
     ),
-    eval=EvalConfig(windows_per_dataset=16, batch=16),
+    eval=EvalConfig(windows_per_dataset=8, batch=8),
     dataset_counts=(5, 10, 20, 40),
-    trajectory_counts=(3, 10, 30, 100),
-    widths=(16, 32, 64),
+    trajectory_counts=(2, 8, 32, 320),
+    widths=(16, 32, 64, 96),
     flops_per_second=3e10,
 )
 
 ACCELERATOR = Study(
     name="accelerator",  # one GPU, hours
     suite=SuiteConfig(scale=20.0),
-    tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=16, channels=64, max_channels=256),
+    tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=16, channels=512),
     tokenizer_train=TokenizerTrainConfig(steps=10_000, batch=128, learning_rate=5e-4),
     model=ModelConfig(
         width=256, layers=12, heads=8, frames=12, tokens=64, action_tokens=16, factor_vocab=256,
@@ -78,8 +78,8 @@ ACCELERATOR = Study(
 PAPER = Study(
     name="paper",  # section 4 of the paper, as stated; bring the forty datasets with --data
     datasets=tuple(PAPER_MIXTURE),
-    tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=128, max_channels=512,
-                              res_blocks=2),
+    tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=1024,
+                              encoder_blocks=3, decoder_blocks=6),
     tokenizer_train=TokenizerTrainConfig(steps=200_000, batch=64, learning_rate=1e-4),
     model=ModelConfig(compute_dtype="bfloat16"),
     train=TrainConfig(steps=60_000, batch=64),

@@ -109,34 +109,26 @@ class TokenizerConfig:
     """The small convolutional tokenizer with lookup-free quantisation (`tokenizers.lfq`).
 
     An image of `image_size` x `image_size` becomes (image_size / downsample)^2 tokens of
-    `bits` binary channels, split evenly into `factors` vocabulary factors. The network sees
-    the image in patches of `patch` x `patch` pixels: convolutions at full resolution would
-    take most of the time and add little.
+    `bits` binary channels, split evenly into `factors` vocabulary factors.
     """
 
     image_size: int = 32
     downsample: int = 8
-    bits: int = 12
+    bits: int = 16
     factors: int = 2
-    patch: int = 4
-    channels: int = 64  # at one position per patch; doubled at each halving up to `max_channels`
-    max_channels: int = 128
-    res_blocks: int = 2  # per resolution
-    entropy_weight: float = 0.02
+    channels: int = 256
+    encoder_blocks: int = 1
+    decoder_blocks: int = 2
+    entropy_weight: float = 0.0
     entropy_temperature: float = 1.0  # of the soft code assignment that the entropy is taken of
-    commitment_weight: float = 0.1
+    commitment_weight: float = 0.0
 
     def __post_init__(self):
-        for name in ("downsample", "patch"):
-            d = getattr(self, name)
-            require(d >= 2 and d & (d - 1) == 0, f"tokenizer.{name} must be a power of two, got {d}")
+        d = self.downsample
+        require(d >= 2 and d & (d - 1) == 0, f"tokenizer.downsample must be a power of two, got {d}")
         require(
-            self.image_size % self.downsample == 0,
-            f"tokenizer.image_size {self.image_size} is not a multiple of downsample {self.downsample}",
-        )
-        require(
-            self.patch <= self.downsample,
-            f"tokenizer.patch {self.patch} exceeds tokenizer.downsample {self.downsample}",
+            self.image_size % d == 0,
+            f"tokenizer.image_size {self.image_size} is not a multiple of downsample {d}",
         )
         require(
             self.factors >= 1 and self.bits >= 1 and self.bits % self.factors == 0,
@@ -148,11 +140,10 @@ class TokenizerConfig:
             f"tokenizer.factors {self.factors}: a factor of {self.bits // self.factors} bits is too wide "
             "for the entropy loss (at most 12); use more factors",
         )
-        for name in ("channels", "max_channels", "res_blocks"):
-            require(getattr(self, name) >= 1, f"tokenizer.{name} must be at least 1")
-        require(self.entropy_temperature > 0, "tokenizer.entropy_temperature must be positive")
-        for name in ("entropy_weight", "commitment_weight"):
+        require(self.channels >= 1, "tokenizer.channels must be at least 1")
+        for name in ("encoder_blocks", "decoder_blocks", "entropy_weight", "commitment_weight"):
             require(getattr(self, name) >= 0, f"tokenizer.{name} must not be negative")
+        require(self.entropy_temperature > 0, "tokenizer.entropy_temperature must be positive")
 
     @property
     def grid(self) -> int:
@@ -180,9 +171,9 @@ class TokenizerTrainConfig:
 
     steps: int = 2000
     batch: int = 64
-    learning_rate: float = 2e-3
-    warmup_steps: int = 100
-    final_fraction: float = 0.02  # of the learning rate, at the end of the cosine
+    learning_rate: float = 3e-3
+    warmup_steps: int = 50
+    final_fraction: float = 0.01  # of the learning rate, at the end of the cosine
     weight_decay: float = 1e-4
     clip_norm: float = 1.0
     seed: int = 0

@@ -12,7 +12,7 @@ import numpy as np
 
 from data_pipelines.suite.spec import EmbodimentSpec
 
-CONTRAST = 0.7
+CONTRAST = 0.6
 """Colours are drawn towards mid-grey by this factor, as a real camera's are. It sets the scale
 of all squared errors alike, so differences of PSNR do not depend on it."""
 

@@ -1,9 +1,8 @@
 """The convolutional encoder and decoder around the quantiser. NHWC, no batch statistics.
 
-An image is cut into patches (space to depth), so the first convolution already works at one
-position per patch: the network spends its time where channels are wide, and matrix products
-are efficient on CPUs and accelerators alike. Then residual blocks, halving the resolution
-until one position is one token; the decoder mirrors it.
+The encoder is one convolution with the stride of a token and 1x1 layers after it: a token
+depends on its own patch of the image alone. So a patch in which nothing moves keeps its token,
+whatever happens beside it, and a world model can copy it. Only the decoder looks around.
 """
 
 from __future__ import annotations
@@ -20,20 +19,26 @@ from hma_jax.params import bias, normal, ones, param
 
 
 class Conv(nnx.Module):
-    """A stride-1 convolution with bias, "same" padding: [B, H, W, c_in] -> [B, H, W, c_out]."""
+    """A stride-1 convolution with bias, "same" padding: [B, H, W, c_in] -> [B, H, W, c_out].
 
-    def __init__(self, c_in: int, c_out: int, size: int, gain: float = 1.0):
+    Written as one matrix product over shifted copies: XLA's gradient of a convolution is many
+    times slower on CPUs, and on accelerators both become the same product.
+    """
+
+    def __init__(self, c_in: int, c_out: int, size: int = 1, gain: float = 1.0):
         std = gain / math.sqrt(size * size * c_in)
-        self.kernel = param(
-            (size, size, c_in, c_out), (None, None, "C_in", "C_out"), normal(std), role="hidden"
-        )
+        self.kernel = param((size * size * c_in, c_out), ("C_in", "C_out"), normal(std), role="hidden")
         self.bias = bias((c_out,), ("C_out",))
+        self.size = size
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        y = jax.lax.conv_general_dilated(
-            x, self.kernel[...], (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-        )
-        return y + self.bias[...]
+        if self.size > 1:
+            height, width, reach = x.shape[1], x.shape[2], self.size // 2
+            padded = jnp.pad(x, ((0, 0), (reach, reach), (reach, reach), (0, 0)))
+            offsets = [(i, j) for i in range(self.size) for j in range(self.size)]
+            shifted = [padded[:, i : i + height, j : j + width] for i, j in offsets]
+            x = jnp.concatenate(shifted, axis=-1)
+        return x @ self.kernel[...] + self.bias[...]
 
 
 class Norm(nnx.Module):
@@ -47,63 +52,53 @@ class Norm(nnx.Module):
 
 
 class ResBlock(nnx.Module):
-    """x + conv(swish(conv(swish(norm(x))))); the last convolution starts small."""
+    """x + conv(swish(conv(norm(x)))); the last convolution starts small."""
 
     def __init__(self, channels: int):
         self.norm = Norm(channels)
-        self.conv_in = Conv(channels, channels, 3, gain=1.4)
-        self.conv_out = Conv(channels, channels, 3, gain=0.3)
+        self.conv_in = Conv(channels, channels, gain=1.4)
+        self.conv_out = Conv(channels, channels, gain=0.3)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        return x + self.conv_out(jax.nn.silu(self.conv_in(jax.nn.silu(self.norm(x)))))
+        return x + self.conv_out(jax.nn.silu(self.conv_in(self.norm(x))))
 
 
 class Encoder(nnx.Module):
-    """Images [B, H, W, 3] in -1..1 -> latents [B, S, bits]."""
+    """Images [B, H, W, 3] in -1..1 -> latents [B, S, bits] in -1..1."""
 
     def __init__(self, config: TokenizerConfig):
-        widths = _widths(config)
-        self.patch = config.patch
-        self.stem = Conv(3 * config.patch**2, widths[0], 3)
-        self.levels = nnx.List(
-            [nnx.List([ResBlock(w) for _ in range(config.res_blocks)]) for w in widths]
-        )
-        self.down = nnx.List([Conv(4 * a, b, 1) for a, b in zip(widths, widths[1:])])
-        self.norm = Norm(widths[-1])
-        self.head = Conv(widths[-1], config.bits, 1)
+        width = config.channels
+        self.patch = config.downsample
+        self.stem = Conv(3 * self.patch**2, width)
+        self.blocks = nnx.List([ResBlock(width) for _ in range(config.encoder_blocks)])
+        self.norm = Norm(width)
+        self.head = Conv(width, config.bits)
 
     def __call__(self, images: jax.Array) -> jax.Array:
-        x = self.stem(_space_to_depth(images, self.patch))
-        for i, blocks in enumerate(self.levels):
-            if i > 0:
-                x = self.down[i - 1](_space_to_depth(x, 2))
-            for block in blocks:
-                x = block(x)
-        return rearrange(self.head(self.norm(x)), "b h w c -> b (h w) c")
+        x = self.stem(rearrange(images, "b (h p) (w q) c -> b h w (p q c)", p=self.patch, q=self.patch))
+        for block in self.blocks:
+            x = block(x)
+        # Bounded: an unbounded latent far from zero would hardly ever change its sign.
+        return rearrange(jnp.tanh(self.head(self.norm(x))), "b h w c -> b (h w) c")
 
 
 class Decoder(nnx.Module):
     """Codes [B, S, bits] in {-1, +1} -> images [B, H, W, 3], about -1..1."""
 
     def __init__(self, config: TokenizerConfig):
-        widths = _widths(config)[::-1]
-        self.patch, self.grid = config.patch, config.grid
-        self.stem = Conv(config.bits, widths[0], 3)
-        self.levels = nnx.List(
-            [nnx.List([ResBlock(w) for _ in range(config.res_blocks)]) for w in widths]
-        )
-        self.up = nnx.List([Conv(a, 4 * b, 1) for a, b in zip(widths, widths[1:])])
-        self.norm = Norm(widths[-1])
-        self.head = Conv(widths[-1], 3 * config.patch**2, 3, gain=0.5)
+        width = config.channels
+        self.patch, self.grid = config.downsample, config.grid
+        self.stem = Conv(config.bits, width, 3)
+        self.blocks = nnx.List([ResBlock(width) for _ in range(config.decoder_blocks)])
+        self.norm = Norm(width)
+        self.head = Conv(width, 3 * self.patch**2, gain=0.5)
 
     def __call__(self, codes: jax.Array) -> jax.Array:
         x = self.stem(rearrange(codes, "b (h w) c -> b h w c", h=self.grid))
-        for i, blocks in enumerate(self.levels):
-            if i > 0:
-                x = _depth_to_space(self.up[i - 1](x), 2)
-            for block in blocks:
-                x = block(x)
-        return _depth_to_space(self.head(self.norm(x)), self.patch)
+        for block in self.blocks:
+            x = block(x)
+        x = self.head(self.norm(x))
+        return rearrange(x, "b h w (p q c) -> b (h p) (w q) c", p=self.patch, q=self.patch)
 
 
 class Autoencoder(nnx.Module):
@@ -122,17 +117,3 @@ def normalise(images: jax.Array) -> jax.Array:
 def to_pixels(images: jax.Array) -> jax.Array:
     """Network output to float32 in 0..255, clipped."""
     return jnp.clip((images + 1.0) * 127.5, 0.0, 255.0)
-
-
-def _widths(config: TokenizerConfig) -> list[int]:
-    """Channels at each resolution, from one position per patch to one per token."""
-    levels = (config.downsample // config.patch).bit_length()
-    return [min(config.channels * 2**i, config.max_channels) for i in range(levels)]
-
-
-def _space_to_depth(x: jax.Array, size: int) -> jax.Array:
-    return rearrange(x, "b (h p) (w q) c -> b h w (p q c)", p=size, q=size)
-
-
-def _depth_to_space(x: jax.Array, size: int) -> jax.Array:
-    return rearrange(x, "b h w (p q c) -> b (h p) (w q) c", p=size, q=size)
