@@ -23,6 +23,9 @@ from hma_jax.tokenizers.lfq import LfqTokenizer
 
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
+UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
+"""What numpy raises for a damaged archive: RuntimeError when a flipped bit claims encryption or an
+unknown compression, EOFError for an empty file."""
 
 
 def save_tokenizer(tokenizer: LfqTokenizer, directory: Path) -> None:
@@ -69,7 +72,11 @@ def load_tokenizer(directory: Path, expect: TokenizerConfig | None = None) -> To
             f"the tokenizer at {directory} has another configuration; give another directory or "
             "change these fields:\n  " + "\n  ".join(diff(config, expect))
         )
-    tokenizer = LfqTokenizer(config, _read_weights(directory))
+    weights = _read_weights(directory)
+    try:
+        tokenizer = LfqTokenizer(config, weights)
+    except ConfigError as error:
+        raise ConfigError(f"{directory / WEIGHTS}: {error}; train or copy the tokenizer again") from error
     require(
         tokenizer.identity == description["identity"],
         f"{directory / WEIGHTS} is not the file {DESCRIPTION} describes (identity "
@@ -88,6 +95,10 @@ def _read_description(directory: Path) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); train or copy the tokenizer again") from error
+    require(
+        isinstance(description, dict),
+        f"{path} cannot be read (not a JSON object); train or copy the tokenizer again",
+    )
     missing = {"kind", "config", "identity"} - set(description)
     require(not missing, f"{path}: missing field(s) {', '.join(sorted(missing))}")
     return description
@@ -100,6 +111,6 @@ def _read_weights(directory: Path) -> Params:
             flat = {tuple(name.split("/")): jnp.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
         raise ConfigError(f"{path} is missing; train or copy the tokenizer again") from None
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise ConfigError(f"{path} is damaged ({error}); train or copy the tokenizer again") from error
     return nnx.traversals.unflatten_mapping(flat)

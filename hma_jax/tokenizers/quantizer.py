@@ -34,20 +34,19 @@ def split_factors(ids: jax.Array, factors: int, factor_vocab: int) -> jax.Array:
     return ids[..., None] // factor_vocab ** jnp.arange(factors, dtype=ids.dtype) % factor_vocab
 
 
-def join_factors(digits: jax.Array, factor_vocab: int) -> jax.Array:
-    """Token ids [...] of factor ids [..., Q]; the inverse of `split_factors`."""
-    return jnp.sum(digits * factor_vocab ** jnp.arange(digits.shape[-1], dtype=digits.dtype), axis=-1)
+def nearest_code(z: jax.Array) -> jax.Array:
+    """Code values in {-1, +1} of latents, without a gradient; 0 counts as negative."""
+    return jax.lax.stop_gradient(jnp.where(z > 0, 1.0, -1.0).astype(z.dtype))
 
 
 def quantize(z: jax.Array) -> jax.Array:
-    """sign(z) in {-1, +1} with the gradient of the identity (straight-through)."""
-    codes = jnp.where(z > 0, 1.0, -1.0).astype(z.dtype)
-    return z + jax.lax.stop_gradient(codes - z)
+    """`nearest_code` with the gradient of the identity (straight-through)."""
+    return z + jax.lax.stop_gradient(nearest_code(z) - z)
 
 
 def commitment(z: jax.Array) -> jax.Array:
     """Mean squared distance of latents to their own code: holds them near +-1."""
-    return jnp.mean((z - jax.lax.stop_gradient(jnp.sign(z))) ** 2)
+    return jnp.mean((z - nearest_code(z)) ** 2)
 
 
 def entropies(z: jax.Array, factors: int, temperature: float) -> tuple[jax.Array, jax.Array]:

@@ -1,0 +1,290 @@
+"""The tokenizer: what ids mean, what a token depends on, and that training teaches it something."""
+
+import itertools
+import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
+from hma_jax.model.hma import compose, factorise
+from hma_jax.params import Declared, ParamSpec, normal
+from hma_jax.tokenizers import quantizer
+from hma_jax.tokenizers.base import PIECE
+from hma_jax.tokenizers.lfq import LfqTokenizer, code_usage, declare_tokenizer, reconstruction_psnr
+from hma_jax.tokenizers.quantizer import (
+    commitment,
+    ids_to_codes,
+    latents_to_ids,
+    nearest_code,
+    quantize,
+    split_factors,
+)
+from hma_jax.tokenizers.train import make_optimizer, tokenizer_loss, train_tokenizer
+from hma_jax.training.checkpoints import CheckpointError
+from hma_jax.training.loop import LoopOptions
+
+CONFIG = TokenizerConfig(
+    image_size=16, downsample=4, bits=6, factors=2, channels=16, encoder_blocks=1, decoder_blocks=1
+)
+TRAIN = TokenizerTrainConfig(steps=40, batch=8, learning_rate=1e-2, warmup_steps=2)
+
+entropies = jax.jit(quantizer.entropies, static_argnums=(1, 2))
+
+
+@pytest.fixture(scope="module")
+def tokenizer():
+    """Untrained: random weights do for everything but quality."""
+    return LfqTokenizer(CONFIG, declare_tokenizer(CONFIG).init(0))
+
+
+def noise(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (count, 16, 16, 3), np.uint8)
+
+
+def scenes(count: int, seed: int = 0) -> np.ndarray:
+    """A bright square somewhere on a dim background: simple enough to be learnt in seconds."""
+    rng = np.random.default_rng(seed)
+    images = np.full((count, 16, 16, 3), 40, np.uint8)
+    for image, (row, column), colour in zip(
+        images, rng.integers(0, 12, (count, 2)), rng.integers(128, 256, (count, 3)), strict=True
+    ):
+        image[row : row + 5, column : column + 5] = colour
+    return images
+
+
+# --- Ids -------------------------------------------------------------------------------------
+
+
+def test_every_id_survives_the_way_through_codes():
+    ids = jnp.arange(CONFIG.vocab_size, dtype=jnp.int32)
+    codes = ids_to_codes(ids, CONFIG.bits)
+    assert set(np.unique(codes)) == {-1.0, 1.0} and len(np.unique(codes, axis=0)) == CONFIG.vocab_size
+    assert np.array_equal(latents_to_ids(codes), ids)
+    assert np.array_equal(latents_to_ids(0.01 * codes), ids)  # the sign counts, not the size
+
+
+def test_bit_k_of_an_id_is_channel_k():
+    only_k = 2 * jnp.eye(CONFIG.bits) - 1
+    assert latents_to_ids(only_k).tolist() == [2**k for k in range(CONFIG.bits)]
+
+
+@pytest.mark.parametrize("factors", [1, 2, 3])
+def test_factors_are_those_of_the_model(factors):
+    config = replace(CONFIG, factors=factors)
+    ids = jnp.arange(config.vocab_size, dtype=jnp.int32)
+    digits = split_factors(ids, factors, config.factor_vocab)
+    assert np.array_equal(digits, factorise(ids, factors, config.factor_vocab))
+    assert np.array_equal(compose(digits, config.factor_vocab), ids)
+    low = config.bits // factors  # factor 0 is the low channels
+    assert np.array_equal(digits[:, 0], latents_to_ids(ids_to_codes(ids, config.bits)[:, :low]))
+
+
+# --- Quantiser -------------------------------------------------------------------------------
+
+
+def test_gradient_passes_the_quantiser_unchanged():
+    z = jnp.asarray(np.random.default_rng(0).normal(size=(5, 6)), jnp.float32).at[0, 0].set(0.0)
+    codes, pull = jax.vjp(quantize, z)
+    np.testing.assert_allclose(codes, np.where(z > 0, 1, -1), atol=1e-6)
+    arriving = jnp.arange(30.0).reshape(5, 6)
+    assert np.array_equal(pull(arriving)[0], arriving)
+
+
+def test_codes_used_in_training_are_those_of_the_ids():
+    z = jnp.asarray(np.random.default_rng(1).normal(size=(50, 6)), jnp.float32).at[0].set(0.0)
+    assert np.array_equal(nearest_code(z), ids_to_codes(latents_to_ids(z), 6))
+
+
+def test_commitment_pulls_latents_to_their_own_code():
+    z = jnp.array([[0.5, -0.25, 1.0]])
+    value, gradient = jax.value_and_grad(commitment)(z)
+    assert value == pytest.approx((0.5**2 + 0.75**2) / 3)
+    np.testing.assert_allclose(gradient, 2 / 3 * np.array([[-0.5, 0.75, 0.0]]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("factors", [1, 2, 3])
+def test_entropies_are_those_of_a_softmax_over_all_codes(factors):
+    """Against the definition, with every code of a factor written out."""
+    z = np.random.default_rng(2).normal(size=(7, 2, 6)).astype(np.float32)
+    temperature, width = 0.7, 6 // factors
+    codes = np.array(list(itertools.product([-1, 1], repeat=width)))
+    parts = z.reshape(14, factors, 1, width)
+    p = np.exp(-((parts - codes) ** 2).sum(-1) / temperature)
+    p /= p.sum(-1, keepdims=True)
+    mean = p.mean(0)
+    expected = [-(q * np.log(q)).sum(-1).mean() / width for q in (p, mean)]
+    np.testing.assert_allclose(entropies(jnp.asarray(z), factors, temperature), expected, rtol=1e-5)
+
+
+def test_entropies_reach_their_bounds():
+    every_code = ids_to_codes(jnp.arange(64), 6)
+    uncertainty, diversity = entropies(every_code, 2, 0.05)
+    assert uncertainty == pytest.approx(0, abs=1e-6) and diversity == pytest.approx(np.log(2), abs=1e-5)
+    uncertainty, diversity = entropies(jnp.zeros((9, 6)), 2, 1.0)
+    assert uncertainty == pytest.approx(np.log(2)) and diversity == pytest.approx(np.log(2))
+    assert entropies(jnp.ones((9, 6)), 2, 0.05)[1] == pytest.approx(0, abs=1e-6)  # one code for all
+
+
+# --- Images to tokens and back ---------------------------------------------------------------
+
+
+def test_shapes_and_types_of_both_ways(tokenizer):
+    ids = tokenizer.encode(noise(3))
+    assert ids.shape == (3, tokenizer.tokens) == (3, 16) and ids.dtype == np.int32
+    assert ids.min() >= 0 and ids.max() < tokenizer.vocab_size == 64
+    assert len(np.unique(ids)) > 10
+    frames = tokenizer.decode(ids)
+    assert frames.shape == (3, 16, 16, 3) and frames.dtype == np.uint8
+
+
+def test_tokens_do_not_depend_on_the_batch_they_came_in(tokenizer):
+    """Else a dataset tokenised on another day, or in other batches, would be another dataset."""
+    images = noise(2 * PIECE + 3)
+    ids = tokenizer.encode(images)
+    assert len(ids) == len(images)
+    assert np.array_equal(tokenizer.encode(images[::-1])[::-1], ids)
+    for i in (0, PIECE - 1, PIECE, len(images) - 1):  # the last of these stood in a padded piece
+        assert np.array_equal(tokenizer.encode(images[i : i + 1])[0], ids[i])
+    frames = tokenizer.decode(ids)
+    assert np.array_equal(tokenizer.decode(ids[-5:]), frames[-5:])
+
+
+def test_a_token_sees_its_own_patch_only(tokenizer):
+    """Row-major grid: a change inside patch (r, c) may change token 4 r + c and no other."""
+    before = noise(8)
+    ids = tokenizer.encode(before)
+    for token in range(16):
+        row, column = 4 * (token // 4), 4 * (token % 4)
+        after = before.copy()
+        after[:, row : row + 4, column : column + 4] ^= 255
+        changed = (tokenizer.encode(after) != ids).any(axis=0)
+        assert changed[token], "it does not even see its own patch"
+        assert changed.sum() == 1
+
+
+def test_decoding_inside_a_jit_gives_the_same_frames(tokenizer):
+    ids = tokenizer.encode(noise(PIECE))
+    frames = np.asarray(jax.jit(tokenizer.decode_fn)(tokenizer.params, ids))
+    assert frames.dtype == np.float32 and frames.min() >= 0 and frames.max() <= 255
+    np.testing.assert_allclose(frames, tokenizer.decode(ids), atol=0.51)
+
+
+def test_what_cannot_be_encoded_or_decoded_is_refused(tokenizer):
+    images, ids = noise(2), np.zeros((2, 16), np.int32)
+    for wrong in (images.astype(np.float32), images[0], images[:, :8], images[..., :1]):
+        with pytest.raises(ConfigError, match=r"encodes uint8 images \[B, 16, 16, 3\], got"):
+            tokenizer.encode(wrong)
+    with pytest.raises(ConfigError, match="empty batch"):
+        tokenizer.encode(images[:0])
+    with pytest.raises(ConfigError, match=r"decodes ids \[B, 16\], got \[2, 9\]"):
+        tokenizer.decode(ids[:, :9])
+    for wrong in (-1, 64):
+        with pytest.raises(ConfigError, match=r"must lie in \[0, 64\)"):
+            tokenizer.decode(ids + wrong)
+
+
+def test_code_usage_counts_codes_of_each_factor():
+    class Constant:
+        factors, factor_vocab = 2, 8
+
+        def encode(self, images):
+            return images
+
+    low_digit_only = np.arange(8, dtype=np.int32)[None]
+    assert code_usage(Constant(), low_digit_only) == pytest.approx((8.0, 1.0))
+
+
+# --- Training --------------------------------------------------------------------------------
+
+
+def test_regularisers_reach_loss_and_encoder():
+    config = replace(CONFIG, encoder_blocks=0, decoder_blocks=0)  # quick to compile
+    declared = declare_tokenizer(config)
+    params, images = declared.init(0), jnp.asarray(scenes(4))
+
+    weighted = [replace(config, **{name: 0.5}) for name in ("entropy_weight", "commitment_weight")]
+
+    @jax.jit
+    def evaluate(params):
+        def one(config):
+            loss = partial(tokenizer_loss, declared, images=images, config=config)
+            (total, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+            return total, metrics, gradient["encoder"]["head"]["kernel"]
+
+        return [one(c) for c in [config, *weighted]]
+
+    (plain, terms, at_rest), *others = evaluate(params)
+    expected = float(terms["uncertainty"] - terms["diversity"]), float(terms["commitment"])
+    for term, (total, _, moved) in zip(expected, others, strict=True):
+        assert term != 0 and float(total - plain) == pytest.approx(0.5 * term, abs=1e-6)
+        assert not np.allclose(moved, at_rest)
+
+
+def train(run_dir: Path, *, config=CONFIG, settings=TRAIN, last_step: int | None = None, **options):
+    """Trains on random scenes; the source breaks after `last_step` batches."""
+
+    def batches(start: int):
+        for step in itertools.count(start):
+            if last_step is not None and step >= last_step:
+                raise OSError("the disk went away")
+            yield scenes(settings.batch, seed=step)
+
+    return train_tokenizer(config, settings, batches, run_dir, **options)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("tokenizer")
+    metrics = []
+    tokenizer = train(
+        run_dir, provenance={"data": "a"}, progress=lambda step, steps, values: metrics.append(values)
+    )
+    return tokenizer, metrics, run_dir
+
+
+def test_training_raises_psnr_on_images_it_has_not_seen(trained):
+    tokenizer, metrics, _ = trained
+    assert len(metrics) == TRAIN.steps
+    assert np.mean([m["loss"] for m in metrics[-5:]]) < 0.5 * metrics[0]["loss"]
+    held_out = scenes(32, seed=10_000)
+    fresh = LfqTokenizer(CONFIG, declare_tokenizer(CONFIG).init(TRAIN.seed))
+    assert reconstruction_psnr(tokenizer, held_out).mean > reconstruction_psnr(fresh, held_out).mean + 4
+
+
+def test_same_seed_same_tokenizer_also_after_a_crash(trained, tmp_path):
+    with pytest.raises(OSError, match="the disk went away"):
+        train(tmp_path, last_step=25, options=LoopOptions(checkpoint_every=10))
+    resumed = train(tmp_path, options=LoopOptions(checkpoint_every=10))
+    assert resumed.identity == trained[0].identity
+
+
+def test_another_seed_is_another_tokenizer(trained, tmp_path):
+    other = train(tmp_path, settings=replace(TRAIN, seed=1))
+    assert other.identity != trained[0].identity
+
+
+def test_run_of_another_configuration_is_not_resumed(trained, tmp_path):
+    run_dir = shutil.copytree(trained[2], tmp_path / "run")
+    with pytest.raises(CheckpointError, match=r"train.learning_rate: 0.01 -> 0.1"):
+        train(run_dir, settings=replace(TRAIN, learning_rate=0.1), provenance={"data": "a"})
+    with pytest.raises(CheckpointError, match="provenance.data: 'a' -> 'b'"):
+        train(run_dir, provenance={"data": "b"})
+    assert train(run_dir, provenance={"data": "a"}).identity == trained[0].identity
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3])
+def test_runs_shorter_than_their_warm_up_learn(steps):
+    one_array = Declared(None, {"w": ParamSpec((3,), (None,), "hidden", True, normal(1.0))})
+    optimizer = make_optimizer(replace(TRAIN, steps=steps, warmup_steps=50), one_array)
+    params = {"w": jnp.ones(3)}
+    state, sizes = optimizer.init(params), []
+    for _ in range(steps):
+        updates, state = jax.jit(optimizer.update)(params, state, params)
+        sizes.append(float(jnp.abs(updates["w"]).max()))
+    assert np.isfinite(sizes).all() and max(sizes) == pytest.approx(TRAIN.learning_rate, rel=0.01)

@@ -1,0 +1,174 @@
+"""Tokenizers on disk: the same one comes back, or a message says why not. Never another one."""
+
+import json
+import os
+import shutil
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, TokenizerConfig
+from hma_jax.tokenizers.io import DESCRIPTION, WEIGHTS, load_tokenizer
+from hma_jax.tokenizers.lfq import LfqTokenizer, declare_tokenizer
+
+CONFIG = TokenizerConfig(
+    image_size=8, downsample=4, bits=4, factors=2, channels=4, encoder_blocks=1, decoder_blocks=1
+)
+
+
+def make(config: TokenizerConfig = CONFIG, seed: int = 0) -> LfqTokenizer:
+    return LfqTokenizer(config, declare_tokenizer(config).init(seed))
+
+
+@pytest.fixture(scope="module")
+def tokenizer():
+    return make()
+
+
+@pytest.fixture(scope="module")
+def saved(tokenizer, tmp_path_factory):
+    directory = tmp_path_factory.mktemp("saved")
+    tokenizer.save(directory)
+    return directory
+
+
+@pytest.fixture
+def copy(saved, tmp_path):
+    """A saved tokenizer to be spoilt."""
+    return shutil.copytree(saved, tmp_path / "tokenizer")
+
+
+def refusal(directory, **options) -> str:
+    with pytest.raises(ConfigError) as error:
+        load_tokenizer(directory, **options)
+    message = str(error.value)
+    assert str(directory) in message, "it does not say where"
+    return message
+
+
+def test_what_was_saved_comes_back(tokenizer, saved):
+    images = np.random.default_rng(0).integers(0, 256, (5, 8, 8, 3), np.uint8)
+    again = load_tokenizer(saved, expect=CONFIG)
+    ids = tokenizer.encode(images)
+    assert again.identity == tokenizer.identity
+    assert np.array_equal(again.encode(images), ids)
+    assert np.array_equal(again.decode(ids), tokenizer.decode(ids))
+
+
+def test_identity_is_of_every_weight_and_every_setting(tokenizer):
+    assert make().identity == tokenizer.identity
+    leaves, structure = jax.tree.flatten(tokenizer.params)
+    seen = {tokenizer.identity}
+    for i, leaf in enumerate(leaves):
+        flat = np.array(leaf).ravel()
+        flat[-1] = np.nextafter(flat[-1], np.float32(9))  # the last bit of one number
+        changed = [*leaves[:i], flat.reshape(leaf.shape), *leaves[i + 1 :]]
+        seen.add(LfqTokenizer(CONFIG, jax.tree.unflatten(structure, changed)).identity)
+    assert len(seen) == 1 + len(leaves)
+    assert make(replace(CONFIG, factors=1)).identity not in seen  # the same weights, other ids' meaning
+
+
+def test_saving_replaces_the_tokenizer_that_is_there(copy):
+    other = make(replace(CONFIG, channels=5), seed=3)
+    other.save(copy)
+    assert load_tokenizer(copy).identity == other.identity
+    assert {p.name for p in copy.iterdir()} == {DESCRIPTION, WEIGHTS}
+
+
+@pytest.mark.parametrize("replaced", [0, 1])
+def test_a_save_that_is_cut_short_leaves_no_tokenizer(copy, monkeypatch, replaced):
+    """Killed before or after the weights were put in place."""
+    calls = []
+
+    def die(source, target):
+        if len(calls) == replaced:
+            raise KeyboardInterrupt
+        calls.append(target)
+        os.rename(source, target)
+
+    monkeypatch.setattr("hma_jax.tokenizers.io.os.replace", die)
+    with pytest.raises(KeyboardInterrupt):
+        make(seed=1).save(copy)
+    assert "no tokenizer at" in refusal(copy)
+
+
+def test_nothing_there(tmp_path):
+    for place in (tmp_path, tmp_path / "none"):
+        assert "hma tokenizer train" in refusal(place)
+
+
+@pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
+def test_missing_file(copy, name):
+    (copy / name).unlink()
+    assert f"{name} is missing" in refusal(copy)
+
+
+@pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
+def test_truncated_file(copy, name):
+    whole = (copy / name).read_bytes()
+    for size in {0, 1, len(whole) // 2, len(whole) - 40}:
+        (copy / name).write_bytes(whole[:size])
+        message = refusal(copy)
+        assert name in message and "again" in message
+
+
+@pytest.mark.parametrize("name", [DESCRIPTION, WEIGHTS])
+def test_flipped_bit_is_refused_or_harmless(copy, tokenizer, name):
+    """Harmless: a date or a permission in the archive. What is loaded is what was saved."""
+    whole = (copy / name).read_bytes()
+    places = range(0, len(whole), 3 if name == DESCRIPTION else 37)
+    refused = 0
+    for place in places:
+        spoilt = bytearray(whole)
+        spoilt[place] ^= 1 << place % 8
+        (copy / name).write_bytes(spoilt)
+        try:
+            assert load_tokenizer(copy).identity == tokenizer.identity
+        except ConfigError:
+            refused += 1
+    assert refused > 0.5 * len(places)
+
+
+@pytest.mark.parametrize("text", ["null", "3", "[]", "{}", '{"kind": "lfq", "config": 3, "identity": "x"}'])
+def test_json_that_describes_no_tokenizer(copy, text):
+    (copy / DESCRIPTION).write_text(text)
+    assert DESCRIPTION in refusal(copy)
+
+
+def test_unknown_kind(copy):
+    text = (copy / DESCRIPTION).read_text()
+    (copy / DESCRIPTION).write_text(text.replace('"lfq"', '"magvit"'))
+    assert "unknown tokenizer kind 'magvit'; known: lfq" in refusal(copy)
+
+
+def test_weights_of_another_training(copy, tmp_path):
+    make(seed=1).save(tmp_path / "other")
+    shutil.copy(tmp_path / "other" / WEIGHTS, copy / WEIGHTS)
+    assert f"{WEIGHTS} is not the file {DESCRIPTION} describes" in refusal(copy)
+
+
+def test_weights_of_another_configuration(copy, tmp_path):
+    make(replace(CONFIG, channels=5)).save(tmp_path / "other")
+    shutil.copy(tmp_path / "other" / WEIGHTS, copy / WEIGHTS)
+    message = refusal(copy)
+    assert str(copy / WEIGHTS) in message and "should be (4,) but is (5,)" in message
+
+
+def test_edited_configuration(copy):
+    values = json.loads((copy / DESCRIPTION).read_text())
+    values["config"]["factors"] = 1
+    (copy / DESCRIPTION).write_text(json.dumps(values))
+    assert "identity" in refusal(copy)
+
+
+def test_another_configuration_than_expected_names_the_fields(saved):
+    message = refusal(saved, expect=replace(CONFIG, bits=6, channels=8))
+    assert "bits: 4 -> 6" in message and "channels: 4 -> 8" in message and "factors" not in message
+
+
+def test_directory_that_cannot_be_written(tokenizer, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot write the tokenizer to .*file/tokenizer"):
+        tokenizer.save(tmp_path / "file" / "tokenizer")
