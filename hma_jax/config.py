@@ -40,10 +40,15 @@ def to_dict(config: Any) -> Any:
 
 
 def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
-    """A `cls` from `to_dict`'s output. Unknown and missing keys raise ConfigError by name."""
+    """A `cls` from `to_dict`'s output.
+
+    Unknown and missing keys, values of the wrong kind and choices that are not on offer raise
+    ConfigError naming the field.
+    """
     hints = typing.get_type_hints(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}
     where = where or cls.__name__
+    require(isinstance(values, dict), f"{where}: expected named fields ({', '.join(known)}), got {values!r}")
     unknown = sorted(set(values) - set(known))
     require(not unknown, f"{where}: unknown field(s) {', '.join(unknown)}; known: {', '.join(known)}")
     missing = [
@@ -66,13 +71,23 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         return _decode(options[0], value, where)
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)
+    if origin is Literal:
+        choices = typing.get_args(hint)
+        known = ", ".join(map(str, choices))
+        require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
+        return value
     if origin is tuple:
+        require(isinstance(value, (list, tuple)), f"{where}: expected a list, got {value!r}")
         args = typing.get_args(hint)
         if len(args) == 2 and args[1] is Ellipsis:
             args = (args[0],) * len(value)
+        require(len(value) == len(args), f"{where}: expected {len(args)} values, got {value!r}")
         return tuple(_decode(a, v, where) for a, v in zip(args, value, strict=True))
-    if hint is float and isinstance(value, int):
-        return float(value)
+    if hint in (bool, int, float, str):
+        kinds = (int, float) if hint is float else hint
+        fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
+        require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
+        return hint(value)
     return value
 
 

@@ -11,7 +11,7 @@ from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.study import on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
 from experiments.trial import Provenance, trial_id
-from hma_jax.config import ConfigError, from_dict, to_dict
+from hma_jax.config import ConfigError, MeshConfig, from_dict, to_dict
 
 PLANS = (scale_datasets.plan, scale_trajectories.plan, scale_width.plan)
 PROVENANCE = Provenance("store", "manifest", "tokenizer", "code")
@@ -92,11 +92,34 @@ def test_override_sets_nested_fields_and_lists():
         ("model.tokens=9", "the tokenizer makes 16"),
         ("widths=4,8", "must contain model.width"),
         ("trajectory_counts=8,4", "must increase"),
+        ("train.optimizer.schedule=linear", "train.optimizer.schedule: 'linear'.*constant, cosine, wsd"),
+        ("store.corrupt=ignore", "store.corrupt: 'ignore'.*raise, skip"),
+        ("model.frames=null", "model.frames: expected int, got None"),
+        ("widths=4,8.5", "widths: expected int, got 8.5"),
     ],
 )
 def test_wrong_override_names_the_field(setting, message):
     with pytest.raises(ConfigError, match=message):
         override(SMOKE, [setting])
+
+
+def test_every_choice_on_offer_is_accepted():
+    for schedule in ("constant", "cosine", "wsd"):
+        assert override(SMOKE, [f"train.optimizer.schedule={schedule}"]).train.optimizer.schedule == schedule
+    assert from_dict(type(SMOKE), to_dict(SMOKE)) == SMOKE
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([], "MeshConfig: expected named fields"),
+        ({"data": "all"}, "MeshConfig.data: expected int, got 'all'"),
+        ({"data": True}, "MeshConfig.data: expected int, got True"),
+    ],
+)
+def test_json_of_the_wrong_kind_names_the_field(values, message):
+    with pytest.raises(ConfigError, match=message):
+        from_dict(MeshConfig, values)
 
 
 def test_unknown_preset_lists_the_known():
