@@ -213,7 +213,7 @@ class RldsDataset:
         if lost > self.max_skipped:
             raise DataError(
                 f"{self.name}: {lost} episodes are unusable, more than max_skipped={self.max_skipped}. "
-                f"The last: {reason}"
+                f"The last: {reason} Raise max_skipped if the rest is worth it."
             )
 
     def _place(self, i: int) -> tuple[Path, int, int]:

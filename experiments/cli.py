@@ -7,9 +7,12 @@ Imports no JAX, so that --help is instant.
 
 from __future__ import annotations
 
+import gc
+import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -164,6 +167,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "--debug" in arguments:
         arguments.remove("--debug")
         debug = True
+    if debug:
+        return _run_command(arguments, debug)
+    with _background_silenced():
+        code = _run_command(arguments, debug)
+        if code:
+            gc.collect()  # the tasks that an error left behind complain now, not at exit
+    return code
+
+
+def _run_command(arguments: Sequence[str], debug: bool) -> int:
     try:
         app.cli(
             prog=PROGRAM,
@@ -178,8 +191,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _exit_code(error)
         if debug or code is None:
             raise
-        _say(f"error: {error}")
+        _say(f"error: {_words(error)}")
         return code
+
+
+@contextmanager
+def _background_silenced() -> Iterator[None]:
+    """Reader tasks of a checkpoint that turns out damaged report it in pages of their own, from
+    threads and destructors where nothing can catch it. The error message says it once.
+    """
+    hook, logger = sys.unraisablehook, logging.getLogger("asyncio")
+    level = logger.level
+    sys.unraisablehook = lambda _: None
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        logger.setLevel(level)
 
 
 def _exit_code(error: Exception) -> int | None:
@@ -196,6 +225,18 @@ def _exit_code(error: Exception) -> int | None:
         if isinstance(error, (DivergedError, Interrupted)):
             return 130 if isinstance(error, Interrupted) else 1
     return None
+
+
+def _words(error: Exception) -> str:
+    """The message of an error, and what it cannot know: how its advice is followed from here."""
+    from data_pipelines.errors import EpisodeError
+
+    if isinstance(error, EpisodeError):
+        return f"{error} (Here: --set store.corrupt=skip.)"
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
+    return str(error)
 
 
 def _say(message: str) -> None:

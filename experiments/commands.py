@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
@@ -28,6 +28,7 @@ from hma_jax.config import ConfigError, MeshConfig, to_dict
 
 if TYPE_CHECKING:
     from experiments.trial import Materials
+    from hma_jax.training.train import Run
 
 AXES = {
     "datasets": scale_datasets.plan,
@@ -233,7 +234,7 @@ def evaluate(setting: Setting, run: Path) -> None:
 
     trained = load_run(run)
     materials = open_materials(setting.workspace)
-    check_same_tokens(trained.provenance, materials)
+    check_fits(trained, materials)
     with step(f"evaluate {_short(run)}") as update:
         evaluation = evaluate_on(
             trained.table.names,
@@ -254,13 +255,25 @@ def evaluate(setting: Setting, run: Path) -> None:
     wrote(run / "evaluation.json", run / "samples.npz")
 
 
-def check_same_tokens(provenance: dict[str, Any], materials: Materials) -> None:
-    """Raises ConfigError when a model was trained on another tokenizer's tokens."""
-    trained, here = provenance.get("tokenizer"), materials.tokenizer.identity
-    if trained != here:
+def check_fits(trained: Run, materials: Materials) -> None:
+    """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
+    advice = "; evaluate it with the --out it was trained in"
+    tokenizer, here = trained.provenance.get("tokenizer"), materials.tokenizer.identity
+    if tokenizer != here:
         raise ConfigError(
-            f"the model was trained on tokens of tokenizer {trained}, the study here uses {here}; evaluate it "
-            "with the --out it was trained in"
+            f"the model was trained on tokens of tokenizer {tokenizer}, the study here uses {here}{advice}"
+        )
+    frames, manifest = trained.model.frames, materials.manifest
+    if frames != manifest.frames:
+        raise ConfigError(
+            f"the model sees windows of {frames} frames, those frozen for evaluation here have "
+            f"{manifest.frames}{advice}"
+        )
+    missing = set(trained.table.names) - {d.dataset for d in manifest.datasets}
+    if missing:
+        raise ConfigError(
+            f"the model was trained on {', '.join(sorted(missing))}, of which the study here has no "
+            f"windows{advice}"
         )
 
 

@@ -18,13 +18,14 @@ import numpy as np
 from rich.markup import escape
 
 from experiments.progress import console, step
-from experiments.study import Study
+from experiments.study import StoreConfig, Study
 from experiments.trial import CHECKPOINTS, Provenance, source_hash, write_atomically
 from experiments.workspace import Workspace
 from hma_jax.config import require, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
+    from data_pipelines.rlds import RldsDataset
     from data_pipelines.store import TokenStore
     from hma_jax.tokenizers.base import Tokenizer
 
@@ -74,6 +75,7 @@ def make_suite(study: Study, workspace: Workspace) -> list[Source]:
     from data_pipelines.suite import generate_suite
 
     names = study.dataset_names()
+    specs = [get_spec(name) for name in names]  # a mistyped name is refused before any work
     with step(f"simulate {len(names)} datasets") as update:
         paths = generate_suite(
             workspace.suite,
@@ -83,7 +85,15 @@ def make_suite(study: Study, workspace: Workspace) -> list[Source]:
             workers=_cores(),
             progress=lambda name, done, total: update(done, total, name),
         )
-    return [(get_spec(name), path) for name, path in zip(names, paths, strict=True)]
+    return list(zip(specs, paths, strict=True))
+
+
+def open_source(source: Source, settings: StoreConfig) -> RldsDataset:
+    """Indexes a dataset's shards. Raises DataError for damage that `settings` do not allow."""
+    from data_pipelines.rlds import RldsDataset
+
+    spec, path = source
+    return RldsDataset(path, spec.split, corrupt=settings.corrupt, max_skipped=settings.max_skipped)
 
 
 def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
@@ -92,7 +102,6 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
     Beside it lies quality.json: its reconstruction PSNR on held-out frames.
     """
     from data_pipelines.frames import make_frame_loader
-    from data_pipelines.rlds import RldsDataset
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
@@ -101,7 +110,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
         "config": to_dict(config),
         "train": to_dict(train),
         "held_out": [settings.val_fraction, settings.min_val, settings.max_val],
-        "data": [RldsDataset(p, spec.split, corrupt=settings.corrupt).fingerprint() for spec, p in sources],
+        "data": [open_source(source, settings).fingerprint() for source in sources],
         "code": source_hash(("hma_jax/tokenizers",)),
     }
     made_from = stable_hash(inputs)
@@ -114,7 +123,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
             val_fraction=settings.val_fraction, min_val=settings.min_val, max_val=settings.max_val,
-            corrupt=settings.corrupt,
+            corrupt=settings.corrupt, max_skipped=settings.max_skipped,
         )  # fmt: skip
 
     aside = workspace.root / f"tokenizer.{made_from}"  # never resumed with other inputs
@@ -145,7 +154,6 @@ def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> 
 
 def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
     """Tokens of every source. Those made in the same way from the same shards are kept."""
-    from data_pipelines.rlds import RldsDataset
     from data_pipelines.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
@@ -154,7 +162,7 @@ def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) ->
     with step(f"tokenise {len(sources)} dataset(s)") as update:
         for i, (spec, path) in enumerate(sources):
             note = f"{spec.name} ({i + 1} of {len(sources)})"
-            shards = RldsDataset(path, spec.split, corrupt=study.store.corrupt).fingerprint()
+            shards = open_source((spec, path), study.store).fingerprint()
             made_from = stable_hash([tokenizer.identity, settings, to_dict(spec), shards])
             stamp = workspace.store / f"{spec.name}.{STAMP}"
             if not _reads(stamp, made_from):  # tokens of other data or another tokenizer are of no use

@@ -44,6 +44,7 @@ class StoreConfig:
     max_val: int = 200  # and at most
     frame_step: int | None = None  # None: only the 2 Hz frames
     corrupt: Literal["raise", "skip"] = "raise"  # damaged records: stop, or leave out and count
+    max_skipped: int = 16  # damaged episodes per dataset that may be left out
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,9 @@ table, data provenance); restoring under another description is refused by name.
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,12 +37,13 @@ class Checkpoints:
                 f"cannot create the checkpoint directory {self.directory}: {error.strerror}; "
                 "choose another output directory"
             ) from error
-        self._orbax = ocp.training.Checkpointer(
-            self.directory,
-            preservation_policy=ocp.training.preservation_policies.LatestN(keep),
-            # A save cut short by a kill leaves a temporary directory; drop it.
-            cleanup_tmp_directories=True,
-        )
+        with _log_silenced():
+            self._orbax = ocp.training.Checkpointer(
+                self.directory,
+                preservation_policy=ocp.training.preservation_policies.LatestN(keep),
+                # A save cut short by a kill leaves a temporary directory; drop it.
+                cleanup_tmp_directories=True,
+            )
 
     def __enter__(self) -> Checkpoints:
         return self
@@ -64,12 +68,19 @@ class Checkpoints:
         """The latest state, laid out as the arrays of `like` are.
 
         `ignore` lists fields of `meta` ('train.steps') that may differ. Raises CheckpointError
-        naming every other difference.
+        naming every other difference, or if the files are damaged.
         """
         step = self.latest_step
         if step is None:
             raise CheckpointError(f"no checkpoint under {self.directory}")
-        saved = self._orbax.metadata(step).custom_metadata or {}
+        with _reading(self.directory / str(step)):
+            saved = self._orbax.metadata(step).custom_metadata or {}
+        if saved.keys() != self.meta.keys():
+            raise CheckpointError(
+                f"the checkpoint at {self.directory} (step {step}) is of another kind of run: it describes "
+                f"{', '.join(sorted(saved)) or 'nothing'}, not {', '.join(sorted(self.meta))}; use a new "
+                "output directory"
+            )
         changes = [line for line in diff(saved, self.meta) if line.split(":")[0] not in ignore]
         if changes:
             raise CheckpointError(
@@ -80,25 +91,57 @@ class Checkpoints:
         abstract = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like
         )
-        return self._orbax.load(step, abstract)
+        with _reading(self.directory / str(step)):
+            return self._orbax.load(step, abstract)
+
+
+@contextmanager
+def _reading(checkpoint: Path) -> Iterator[None]:
+    """Whatever Orbax raises for a damaged file (types of four libraries) becomes a CheckpointError."""
+    try:
+        with _log_silenced():
+            yield
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CheckpointError(
+            f"the checkpoint {checkpoint} cannot be read ({reason[:160]}); if its files are damaged, remove "
+            "this directory to go on from an earlier checkpoint"
+        ) from error
+
+
+@contextmanager
+def _log_silenced() -> Iterator[None]:
+    """Orbax quotes damaged files in its log, whole."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def read_checkpoint(directory: Path) -> tuple[int, Any, dict[str, Any]]:
     """(step, state as nested dicts of arrays on the default device, meta) of the latest one.
 
-    Raises CheckpointError if there is none.
+    Raises CheckpointError if there is none or it is damaged.
     """
     directory = Path(directory).absolute()
     if not directory.is_dir():
         raise CheckpointError(f"no checkpoints at {directory}; give the directory of a training run")
-    with ocp.training.Checkpointer(directory) as orbax:
+    with _log_silenced():
+        opened = ocp.training.Checkpointer(directory)
+    with opened as orbax:
         if orbax.latest is None:
             raise CheckpointError(f"no finished checkpoint under {directory}; resume its training first")
         step = orbax.latest.step
-        metadata = orbax.metadata(step)
-        # Saved on one mesh, read on whatever this process has: put everything on one device.
-        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        abstract = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), metadata.metadata
-        )
-        return step, orbax.load(step, abstract), metadata.custom_metadata or {}
+        with _reading(directory / str(step)):
+            metadata = orbax.metadata(step)
+            if metadata.metadata is None:
+                raise ValueError("the description of its arrays is damaged")
+            # Saved on one mesh, read on whatever this process has: put everything on one device.
+            device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+            abstract = jax.tree.map(
+                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), metadata.metadata
+            )
+            return step, orbax.load(step, abstract), metadata.custom_metadata or {}

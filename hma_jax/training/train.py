@@ -109,11 +109,14 @@ def load_run(run_dir: Path) -> Run:
     step, state, meta = read_checkpoint(Path(run_dir) / "checkpoints")
     missing = {"model", "train", "table", "provenance"} - set(meta)
     if missing:
-        raise CheckpointError(f"{run_dir}: not a run of this project (no {', '.join(sorted(missing))})")
+        raise CheckpointError(
+            f"{run_dir}: not a run of this project (no {', '.join(sorted(missing))}); give the directory "
+            "of a training run"
+        )
     return Run(
-        from_dict(ModelConfig, meta["model"]),
-        from_dict(TrainConfig, meta["train"]),
-        from_dict(EmbodimentTable, meta["table"]),
+        from_dict(ModelConfig, meta["model"], f"{run_dir}: model"),
+        from_dict(TrainConfig, meta["train"], f"{run_dir}: train"),
+        from_dict(EmbodimentTable, meta["table"], f"{run_dir}: table"),
         state["params"] if isinstance(state, dict) else state.params,
         step,
         meta["provenance"],

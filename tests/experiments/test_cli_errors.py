@@ -1,0 +1,417 @@
+"""What a user meets when data, directories or checkpoints are wrong: one message that says what,
+where and what to do, an exit code, and no traceback.
+
+All of it goes through `main`, on tiny RLDS datasets under registered names. No step here
+learns anything: what a step computes is tested elsewhere.
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipelines.registry import get_spec
+from experiments import commands, pipeline
+from experiments.cli import main
+from hma_jax.tokenizers import train as tokenizer_training
+from hma_jax.training import train as model_training
+from tests.data_pipelines.fakes import make_spec, write_rlds
+
+ARM, BASE, PUSHER = map(
+    get_spec, ("two_link_arm_joint_targets", "omni_base_world_velocity", "disc_pusher_delta_pixels")
+)
+LENGTHS = [10, 11, 12, 13, 14, 15]  # a window of the smoke study takes 8 native frames
+SMOKE = ("--preset", "smoke")
+
+
+def idle_step(*_):
+    """A training step that counts."""
+
+    def step(state, batch):
+        return state._replace(step=state.step + 1), {"loss": jnp.float32(5), "psnr": jnp.float32(5)}
+
+    return step
+
+
+@pytest.fixture(scope="module", autouse=True)
+def idle_training():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tokenizer_training, "make_train_step", idle_step)
+        patch.setattr(model_training, "make_train_step", idle_step)
+        patch.setattr(pipeline, "QUALITY_FRAMES", 8)
+        yield
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    return write_rlds(tmp_path_factory.mktemp("rlds"), ARM, LENGTHS, shards=2)
+
+
+@pytest.fixture(scope="module")
+def study(arm, tmp_path_factory):
+    """A prepared study with a trained model; its second dataset is too short for any window."""
+    root = tmp_path_factory.mktemp("study")
+    short = write_rlds(root / "rlds", BASE, [5, 6, 7, 5])
+    data = ("--data", str(arm), str(short))
+    assert main(["train", *SMOKE, "--out", str(root / "out"), *data]) == 0
+    return root / "out", data
+
+
+@pytest.fixture
+def refused(capsys):
+    """Runs a command that must fail; returns its message."""
+
+    def run(code: int, *arguments: object) -> str:
+        capsys.readouterr()
+        assert main([str(a) for a in arguments]) == code
+        said = capsys.readouterr().err
+        assert said.startswith("error: ") and said.count("error: ") == 1, said
+        assert "Traceback" not in said and len(said) < 1500, said
+        return said
+
+    return run
+
+
+# --- Data ------------------------------------------------------------------------------------
+
+
+def shard(directory: Path, number: int = 0) -> Path:
+    return sorted(directory.glob("*.tfrecord-*"))[number]
+
+
+def truncate(directory: Path) -> None:
+    whole = shard(directory).read_bytes()
+    shard(directory).write_bytes(whole[:-9])
+
+
+def flip(at: int) -> Callable[[Path], None]:
+    def spoil(directory: Path) -> None:
+        content = bytearray(shard(directory).read_bytes())
+        content[at] ^= 4
+        shard(directory).write_bytes(content)
+
+    return spoil
+
+
+def lose_shard(directory: Path) -> None:
+    shard(directory, 1).unlink()
+
+
+def empty_shard(directory: Path) -> None:
+    shard(directory).write_bytes(b"")
+
+
+def lose_schema(directory: Path) -> None:
+    (directory / "features.json").unlink()
+
+
+def garble_info(directory: Path) -> None:
+    (directory / "dataset_info.json").write_text("{")
+
+
+def empty(directory: Path) -> None:
+    shutil.rmtree(directory)
+    directory.mkdir()
+
+
+DAMAGE = {
+    "truncated shard": (truncate, ["{shard}", "corrupt record at byte", "truncated", "Fetch the file again"]),
+    "bit of a length": (flip(3), ["{shard}", "byte 0", "checksum", "corrupt='skip'"]),
+    "bit of a record": (flip(300), ["{shard}", "byte 0", "checksum of the record's data", "corrupt='skip'"]),
+    "missing shard": (lose_shard, ["00001-of-00002", "the shard is missing", "Fetch it again"]),
+    "empty shard": (empty_shard, ["{shard}", "0 records", "says 3", "Fetch the shard again"]),
+    "missing schema": (lose_schema, ["{dir}", "features.json", "Restore"]),
+    "damaged metadata": (garble_info, ["{dir}", "dataset_info.json", "Restore"]),
+    "empty directory": (empty, ["{dir}", "it holds nothing", "Give the directory that tfds wrote"]),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_dataset(name, arm, tmp_path, refused):
+    spoil, parts = DAMAGE[name]
+    directory = shutil.copytree(arm, tmp_path / ARM.name / "1.0.0")
+    path = shard(directory)
+    spoil(directory)
+    message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", directory)
+    for part in parts:
+        assert part.format(shard=path, dir=directory) in message
+    assert not list((tmp_path / "out").glob("tokens/*/manifest.json")), "half a dataset was kept"
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_actions_that_are_not_finite(value, tmp_path, refused):
+    def spoil(episode, features):
+        if episode == 3:
+            features["steps/action"][7] = value
+
+    rlds = write_rlds(tmp_path, ARM, LENGTHS, change=spoil)
+    message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
+    for part in (ARM.name, "episode 3", "'steps/action'", "not finite at step 7", "--set store.corrupt=skip"):
+        assert part in message
+
+
+def test_damage_can_be_left_out_and_is_counted(arm, tmp_path, capsys):
+    directory = shutil.copytree(arm, tmp_path / ARM.name / "1.0.0")
+    flip(300)(directory)
+    arguments = ("--out", str(tmp_path / "out"), "--data", str(directory), "--set", "store.corrupt=skip")
+    assert main(["tokenize", *SMOKE, *arguments]) == 0
+    assert f"{ARM.name}: 1 damaged episodes are left out" in capsys.readouterr().out
+    (facts,) = json.loads((tmp_path / "out" / "data.json").read_text()).values()
+    assert facts["skipped"] == 1
+
+
+def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
+    def spoil(episode, features):
+        if episode >= 2:
+            features["steps/action"][0] = np.nan
+
+    rlds = write_rlds(tmp_path, ARM, [8] * 24, change=spoil)
+    skip = ("--set", "store.corrupt=skip")
+    message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
+    assert "17 episodes are unusable, more than max_skipped=16" in message and "episode 18" in message
+    allowed = ("--set", "store.max_skipped=22")
+    arguments = map(str, ("tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip, *allowed))
+    assert main(list(arguments)) == 0
+
+
+def test_unknown_dataset_name(tmp_path, refused):
+    rlds = write_rlds(tmp_path, make_spec("two_link_arm_joint_target", (2,)), LENGTHS)
+    message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
+    assert "unknown dataset 'two_link_arm_joint_target'; did you mean two_link_arm_joint_targets" in message
+    assert "data_pipelines/registry.py" in message
+
+
+def test_unknown_dataset_of_the_suite(tmp_path, refused):
+    names = "datasets=two_link_arm_joint_targets,omni_bass_world_velocity,disc_pusher_delta_pixels"
+    message = refused(2, "data", "suite", *SMOKE, "--out", tmp_path / "out", "--set", names)
+    assert "unknown dataset 'omni_bass_world_velocity'; did you mean omni_base_world_velocity" in message
+
+
+def test_wrong_image_key(tmp_path, refused):
+    """The registry says image_0 of this dataset, its schema says image."""
+    rlds = write_rlds(tmp_path, get_spec("bridge_dataset"), LENGTHS)
+    message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
+    for part in ("bridge_dataset", "no image 'observation/image_0'", "features.json", "Correct image_key"):
+        assert part in message
+    assert "images there: observation/image" in message
+
+
+def test_wrong_number_of_action_values(tmp_path, refused):
+    rlds = write_rlds(tmp_path, replace(ARM, action_dims=(5,)), LENGTHS)
+    message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
+    assert ARM.name in message and "has 5 values" in message and "2 were expected" in message
+
+
+def test_one_dataset_given_twice(arm, tmp_path, refused):
+    message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, arm)
+    assert "datasets repeat" in message and ARM.name in message
+
+
+# --- Windows ---------------------------------------------------------------------------------
+
+
+def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
+    """Its windows are counted; the study goes on without it, through training and evaluation."""
+    out, data = study
+    assert main(["tokenize", *SMOKE, "--out", str(out), *data]) == 0
+    said = capsys.readouterr().out
+    assert f"{BASE.name}: 2 of 2 training episodes are too short for 4 frames" in said
+    assert "it is not evaluated: 4 frames need 8 native frames" in said
+    facts = json.loads((out / "data.json").read_text())
+    assert facts[BASE.name] == {"episodes": 2, "too_short": 2, "windows": 0, "skipped": 0}
+    assert facts[ARM.name]["too_short"] == 0 and facts[ARM.name]["windows"] > 0
+
+
+def test_no_window_at_all(arm, tmp_path, refused):
+    long = ("--set", "model.frames=8", "--set", "eval.prompt_frames=7")
+    message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, *long)
+    assert "no val episode is long enough for a window" in message and ARM.name in message
+    assert "8 frames need 16 native frames" in message and "use at most" in message
+
+
+# --- Directories -----------------------------------------------------------------------------
+
+
+WRITERS = ("study", "sweep width", "data suite", "tokenizer train", "tokenize", "train")
+
+
+@pytest.mark.parametrize("command", WRITERS)
+def test_output_directory_that_cannot_be_made(command, tmp_path, refused):
+    (tmp_path / "file").write_text("")
+    out = tmp_path / "file" / "out"
+    message = refused(2, *command.split(), *SMOKE, "--out", out)
+    assert f"cannot write to {out}" in message and "choose another --out" in message
+
+
+def test_run_directory_that_cannot_be_made(study, tmp_path, refused):
+    out, data = study
+    (tmp_path / "file").write_text("")
+    message = refused(2, "train", *SMOKE, "--out", out, *data, "--run", tmp_path / "file" / "run")
+    assert str(tmp_path / "file" / "run") in message and "choose another output directory" in message
+
+
+def test_disk_that_fills_up_later(study, tmp_path, refused, monkeypatch):
+    def full(path, text):
+        raise OSError(28, "No space left on device", str(path))
+
+    out, data = study
+    monkeypatch.setattr(pipeline, "write_atomically", full)
+    message = refused(1, "tokenize", *SMOKE, "--out", out, *data)
+    assert f"{out / 'data.json'}: No space left on device" in message and "the space on its disk" in message
+
+
+@pytest.mark.parametrize("name", ["tokens", "tokenizer", "eval_manifest.json"])
+def test_evaluation_without_what_was_prepared(name, study, tmp_path, refused):
+    out, data = study
+    other = tmp_path / "out"
+    shutil.copytree(out, other)
+    shutil.rmtree(other / name) if (other / name).is_dir() else (other / name).unlink()
+    code = 2 if name == "tokenizer" else 1
+    message = refused(code, "evaluate", out / "model", *SMOKE, "--out", other, *data)
+    assert str(other / name) in message
+
+
+def test_report_of_an_empty_directory(tmp_path, refused):
+    message = refused(2, "report", "--out", tmp_path)
+    assert f"no study in {tmp_path}" in message and "hma study" in message
+
+
+# --- Checkpoints -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("setting", "difference"),
+    [
+        ("model.mlp_ratio=2", "model.mlp_ratio: 4.0 -> 2.0"),
+        ("train.batch=2", "train.batch: 4 -> 2"),
+        ("train.optimizer.learning_rate=0.1", "train.optimizer.learning_rate: 0.001 -> 0.1"),
+        ("tau=2", "provenance.loader.tau: 3.0 -> 2.0"),
+    ],
+)
+def test_training_is_not_resumed_under_another_configuration(setting, difference, study, refused):
+    out, data = study
+    before = (out / "model" / "metrics.jsonl").read_bytes()
+    message = refused(2, "train", *SMOKE, "--out", out, *data, "--set", setting)
+    assert str(out / "model") in message and "use a new output directory" in message
+    assert message.rstrip().endswith("\n  " + difference)  # and nothing else differs
+    assert (out / "model" / "metrics.jsonl").read_bytes() == before
+
+
+def test_training_is_not_resumed_on_other_data(study, tmp_path, refused):
+    out, data = study
+    other = shutil.copytree(out, tmp_path / "out")
+    longer = write_rlds(tmp_path, ARM, [20] * 6)
+    message = refused(2, "train", *SMOKE, "--out", other, "--data", longer, data[-1])
+    assert "provenance.store: " in message and str(other / "model") in message
+
+
+def test_run_of_another_kind(study, refused):
+    out, data = study
+    message = refused(2, "train", *SMOKE, "--out", out, *data, "--run", out / "tokenizer")
+    assert "another kind of run" in message and "use a new output directory" in message
+    message = refused(2, "evaluate", out / "tokenizer", *SMOKE, "--out", out, *data)
+    assert f"{out / 'tokenizer'}: not a run of this project (no model, table)" in message
+
+
+def nothing(path: Path) -> None:
+    pass
+
+
+@pytest.mark.parametrize("make", [nothing, Path.mkdir, Path.touch])
+def test_evaluation_of_what_is_no_run(make, study, tmp_path, refused):
+    out, data = study
+    make(tmp_path / "run")
+    message = refused(2, "evaluate", tmp_path / "run", *SMOKE, "--out", out, *data)
+    assert f"no checkpoints at {tmp_path / 'run'}" in message and "the directory of a training run" in message
+
+
+def prepared_otherwise(study, root: Path, *settings: str, data: tuple[str, ...] | None = None) -> Path:
+    """A study that was prepared in another way."""
+    other = shutil.copytree(study[0], root / "out")
+    changes = [word for setting in settings for word in ("--set", setting)]
+    assert main(["tokenize", *SMOKE, "--out", str(other), *(data or study[1]), *changes]) == 0
+    return other
+
+
+def test_evaluation_on_tokens_of_another_tokenizer(study, tmp_path, refused):
+    other = prepared_otherwise(study, tmp_path, "tokenizer.channels=8")
+    message = refused(2, "evaluate", study[0] / "model", *SMOKE, "--out", other, *study[1])
+    assert "trained on tokens of tokenizer" in message and "the --out it was trained in" in message
+
+
+def test_evaluation_on_windows_of_another_length(study, tmp_path, refused):
+    other = prepared_otherwise(study, tmp_path, "model.frames=3")
+    message = refused(2, "evaluate", study[0] / "model", *SMOKE, "--out", other, *study[1])
+    assert "windows of 4 frames" in message and "have 3" in message and "the --out it was" in message
+
+
+def test_evaluation_in_a_study_without_its_datasets(study, tmp_path, refused):
+    other = prepared_otherwise(study, tmp_path, data=study[1][:2])
+    message = refused(2, "evaluate", study[0] / "model", *SMOKE, "--out", other, *study[1][:2])
+    assert f"trained on {BASE.name}, of which the study here has no windows" in message
+
+
+def test_evaluation_with_a_prompt_that_fills_the_window(study, refused):
+    out, data = study
+    settings = ("--set", "model.frames=5", "--set", "eval.prompt_frames=4")
+    message = refused(2, "evaluate", out / "model", *SMOKE, "--out", out, *data, *settings)
+    assert "eval.prompt_frames 4 leaves nothing to predict in a window of 4 frames" in message
+
+
+CHECKPOINT_FILES = ("_CHECKPOINT_METADATA", "_METADATA", "manifest.ocdbt", "array_metadatas/process_0")
+
+
+@pytest.mark.parametrize("name", CHECKPOINT_FILES)
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_damaged_checkpoint(command, name, study, tmp_path, refused):
+    out, data = study
+    run = shutil.copytree(out / "model", tmp_path / "run")
+    for file in (run / "checkpoints" / "3").rglob(name):
+        file.write_bytes(file.read_bytes()[:-30])
+    run_argument = (run,) if command == "evaluate" else ("--run", run)
+    message = refused(2, command, *run_argument, *SMOKE, "--out", out, *data)
+    assert str(run) in message
+    if name != "_CHECKPOINT_METADATA":
+        assert str(run / "checkpoints" / "3") in message and "remove this directory" in message
+
+
+# --- The program -----------------------------------------------------------------------------
+
+
+def hma(*arguments: object) -> tuple[int, str]:
+    """Exit code and standard error of a real process."""
+    command = [sys.executable, "-m", "experiments.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return done.returncode, done.stderr
+
+
+def test_the_process_says_the_same(tmp_path):
+    code, said = hma("tokenize", *SMOKE, "--out", tmp_path / "out", "--data", tmp_path / "none")
+    assert code == 1
+    assert said == f"error: {tmp_path / 'none'}: no such directory. Give the path of an RLDS dataset.\n"
+
+
+def test_background_readers_of_a_damaged_checkpoint_stay_silent(study, tmp_path):
+    """They complain from threads and destructors, in pages, also when the process ends."""
+    out, data = study
+    run = shutil.copytree(out / "model", tmp_path / "run")
+    for file in (run / "checkpoints" / "3").rglob("array_metadatas/process_0"):
+        file.write_bytes(file.read_bytes()[:-30])
+    code, said = hma("evaluate", run, *SMOKE, "--out", out, *data)
+    assert code == 2 and said.startswith("error: the checkpoint") and len(said.splitlines()) == 1
+
+
+def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch):
+    def broken():
+        raise KeyError("oops")
+
+    monkeypatch.setattr(commands, "list_datasets", broken)
+    with pytest.raises(KeyError, match="oops"):
+        main(["data", "list"])
