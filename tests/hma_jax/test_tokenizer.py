@@ -15,7 +15,7 @@ from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.model.hma import compose, factorise
 from hma_jax.params import Declared, ParamSpec, normal
 from hma_jax.tokenizers import quantizer
-from hma_jax.tokenizers.base import PIECE
+from hma_jax.tokenizers.base import PIECE, in_pieces
 from hma_jax.tokenizers.lfq import LfqTokenizer, code_usage, declare_tokenizer, reconstruction_psnr
 from hma_jax.tokenizers.quantizer import (
     commitment,
@@ -153,6 +153,20 @@ def test_tokens_do_not_depend_on_the_batch_they_came_in(tokenizer):
         assert np.array_equal(tokenizer.encode(images[i : i + 1])[0], ids[i])
     frames = tokenizer.decode(ids)
     assert np.array_equal(tokenizer.decode(ids[-5:]), frames[-5:])
+
+
+@pytest.mark.parametrize("rows", [1, 4, 5, 8])
+def test_networks_only_see_whole_pieces(rows):
+    """One shape: one compilation, and rounding that cannot depend on the size of a batch."""
+    sizes = []
+
+    def double(piece):
+        sizes.append(len(piece))
+        return 2 * piece
+
+    numbers = np.arange(rows * 3).reshape(rows, 3)
+    assert np.array_equal(in_pieces(double, numbers, size=4), 2 * numbers)
+    assert set(sizes) == {4} and len(sizes) == -(-rows // 4)
 
 
 def test_a_token_sees_its_own_patch_only(tokenizer):

@@ -131,6 +131,15 @@ def test_flipped_bit_is_refused_or_harmless(copy, tokenizer, name):
     assert refused > 0.5 * len(places)
 
 
+@pytest.mark.parametrize(("field", "value"), [(8, 1), (10, 99)], ids=["encrypted", "unknown compression"])
+def test_archive_that_claims_what_numpy_never_writes(copy, field, value):
+    content = bytearray((copy / WEIGHTS).read_bytes())
+    for header in (b"PK\x01\x02", b"PK\x03\x04"):  # of the directory and of the entry itself
+        content[content.index(header) + field - 2 * (header == b"PK\x03\x04")] = value
+    (copy / WEIGHTS).write_bytes(content)
+    assert f"{WEIGHTS} is damaged" in refusal(copy)
+
+
 @pytest.mark.parametrize("text", ["null", "3", "[]", "{}", '{"kind": "lfq", "config": 3, "identity": "x"}'])
 def test_json_that_describes_no_tokenizer(copy, text):
     (copy / DESCRIPTION).write_text(text)
