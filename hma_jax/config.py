@@ -238,6 +238,11 @@ class ModelConfig:
     proj_bias: bool = True
     mlp_bias: bool = True
     qk_norm: bool = False
+    # Which chunk conditions frame t: the one executed after it (`released`; the chunk that led
+    # to it then arrives through temporal attention) or the one that led to it (`causal`).
+    action_alignment: Literal["released", "causal"] = "released"
+    trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
+    stem_gain: float = 0.01  # Xavier gain of the action stems
     mup: MupConfig = field(default_factory=MupConfig)
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
     remat: bool = True

@@ -116,13 +116,14 @@ def rollout(
         f"a rollout of {frames} frames from a prompt of {prompt} does not fit a window of {config.frames}",
     )
     flat = lambda x: jnp.repeat(x, repeats, axis=0)  # noqa: E731  [B, ...] -> [B * R, ...]
-    actions = actions_BRTU.reshape(batch * repeats, frames, -1)
+    aligned_BRTU = model.align(actions_BRTU)
+    actions = aligned_BRTU.reshape(batch * repeats, frames, -1)
     embodiment, keys = flat(embodiment_B), flat(key_B)
 
     # Keys and values of all prompt frames but the last, with room for the rest.
     past = None
     if prompt > 1:
-        _, past = model(prompt_BTS[:, :-1], actions_BRTU[:, 0, : prompt - 1], embodiment_B, keep=True)
+        _, past = model(prompt_BTS[:, :-1], aligned_BRTU[:, 0, : prompt - 1], embodiment_B, keep=True)
     room = frames - 1
     cache = _make_room(model, past, batch, room)
     cache = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=1), cache)
@@ -173,17 +174,20 @@ def rollout_naive(
 ) -> jax.Array:
     """What `rollout` must equal: the whole window again for every look at a frame."""
     mask_id, frames = model.config.mask_id, actions_BTU.shape[1]
+    actions = model.align(actions_BTU)
     batch, prompt, tokens = prompt_BTS.shape
     future = jnp.full((batch, frames - prompt, tokens), mask_id, jnp.int32)
     window = jnp.concatenate([prompt_BTS, future], axis=1)
-    for t in range(prompt, frames):
 
-        def look(frame_BS: jax.Array, t: int = t, window: jax.Array = window) -> jax.Array:
-            return model(window.at[:, t].set(frame_BS), actions_BTU, embodiment_B)[0][:, t]
+    def next_frame(window_BTS: jax.Array, t: jax.Array):
+        def look(frame_BS: jax.Array) -> jax.Array:
+            return model(window_BTS.at[:, t].set(frame_BS), actions, embodiment_B)[0][:, t]
 
-        frame_keys = jax.vmap(lambda k, t=t: jax.random.fold_in(k, t))(key_B)
-        frame = _decode_frame(look(window[:, t]), look, frame_keys, mask_id, decode)
-        window = window.at[:, t].set(frame)
+        frame_keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)
+        frame = _decode_frame(look(window_BTS[:, t]), look, frame_keys, mask_id, decode)
+        return window_BTS.at[:, t].set(frame), None
+
+    window, _ = jax.lax.scan(next_frame, window, jnp.arange(prompt, frames))
     return window[:, prompt:]
 
 
@@ -198,7 +202,8 @@ def next_frame_logits(
     frames = tokens_BTS.shape[1]
     true = tokens_BTS[:, :-1]
     both = jnp.concatenate([true, jnp.full_like(true, model.config.mask_id)], axis=1)
-    actions = jnp.concatenate([actions_BTU[:, :-1], actions_BTU[:, 1:]], axis=1)
+    aligned = model.align(actions_BTU)
+    actions = jnp.concatenate([aligned[:, :-1], aligned[:, 1:]], axis=1)
     positions = jnp.concatenate([jnp.arange(frames - 1), jnp.arange(1, frames)])
     past, itself = causal(frames - 1), jnp.eye(frames - 1, dtype=bool)
     # A masked frame t sees the true frames before it and itself; nobody sees a masked frame.

@@ -121,7 +121,8 @@ def masked_loss(
     smoothing: float,
 ) -> LossSums:
     """Forward dynamics: predict masked tokens given the rest and the actions (reference 1.8)."""
-    logits, _ = model(masked.inputs_TS, actions_BTU, embodiment_B)
+    actions = None if actions_BTU is None else model.align(actions_BTU)
+    logits, _ = model(masked.inputs_TS, actions, embodiment_B)
     labels = factorise(tokens_BTS, model.config.factors, model.config.factor_vocab)
     loss = smoothed_cross_entropy(logits, labels, smoothing)
     correct = jnp.all(jnp.argmax(logits, axis=-1) == labels, axis=-1)

@@ -2,7 +2,8 @@
 
 `concat+modulate` of the release (reference sections 1.3 and 1.6): the stem's feature is
 appended to each frame as K identical tokens, and it also shifts and scales every token
-between spatial and temporal attention.
+between spatial and temporal attention. The paper's text gives one Xavier gain, 0.1, for "action
+projectors"; the release has it for the modulation and 0.01 for the stems (section 1.10).
 """
 
 from __future__ import annotations
@@ -14,13 +15,8 @@ from flax import nnx
 
 from hma_jax.config import ModelConfig
 from hma_jax.embodiments import EmbodimentTable
-from hma_jax.model.attention import TRUNK_GAIN
 from hma_jax.model.layers import BLOCK_EPS, MODULATION_EPS, EmbodimentLinear, normalise
 from hma_jax.params import bias, ones, param, uniform, xavier_uniform
-
-STEM_GAIN = 0.01
-"""Xavier gain of the stems as trained by the release; the paper's text says 0.1 for "action
-projectors", which matches the modulation (reference section 1.10)."""
 
 
 class Stem(nnx.Module):
@@ -35,14 +31,14 @@ class Stem(nnx.Module):
             # stay so, because padded inputs are zero.
             chunk_E = np.array([entry.chunk for entry in table.entries])[:, None, None]
             own = np.arange(shape[1])[:, None] < chunk_E
-            return uniform(rng, shape, np.where(own, STEM_GAIN * np.sqrt(6 / (chunk_E + width)), 0.0))
+            return uniform(rng, shape, np.where(own, config.stem_gain * np.sqrt(6 / (chunk_E + width)), 0.0))
 
         self.into = EmbodimentLinear(
             size, (table.action_width, width), ("U", "D"), init=first_layer, role="input"
         )
         self.gain = param((size, width), ("E", "D"), ones, role="vector")
         self.bias = bias((size, width), ("E", "D"))
-        init = xavier_uniform(width, width, STEM_GAIN)
+        init = xavier_uniform(width, width, config.stem_gain)
         self.out = EmbodimentLinear(size, (width, width), ("D", "D_out"), init=init, role="hidden")
 
     def __call__(self, actions_BTU: jax.Array, embodiment_B: jax.Array, dtype: jnp.dtype) -> jax.Array:
@@ -61,8 +57,8 @@ class Modulation(nnx.Module):
 
     def __init__(self, config: ModelConfig, embodiments: int):
         width = config.width
-        init = xavier_uniform(width, width, TRUNK_GAIN)
-        wide = xavier_uniform(width, 2 * width, TRUNK_GAIN)
+        init = xavier_uniform(width, width, config.trunk_gain)
+        wide = xavier_uniform(width, 2 * width, config.trunk_gain)
         square, double = (width, width), (width, 2 * width)
         axes = ("D", "D_out")
         self.hidden = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")

@@ -10,9 +10,6 @@ from hma_jax.config import ModelConfig
 from hma_jax.model.layers import LayerNorm
 from hma_jax.params import bias, param, xavier_uniform
 
-TRUNK_GAIN = 0.1
-"""Xavier gain of every matrix of the trunk and of the modulation (reference section 1.10)."""
-
 
 def attention_scale(config: ModelConfig) -> float:
     """What multiplies q.k.
@@ -31,11 +28,11 @@ class Attention(nnx.Module):
     def __init__(self, config: ModelConfig):
         width, heads, head = config.width, config.heads, config.head_width
         # The fans are those of the fused (3D, D) matrix of the release.
-        init = xavier_uniform(width, 3 * width, TRUNK_GAIN)
+        init = xavier_uniform(width, 3 * width, config.trunk_gain)
         self.qkv = param((width, 3, heads, head), ("D", None, "H", None), init, role="hidden")
         shape, axes = (3, heads, head), (None, "H", None)
         self.qkv_bias = bias(shape, axes) if config.qkv_bias else None
-        init = xavier_uniform(width, width, TRUNK_GAIN)
+        init = xavier_uniform(width, width, config.trunk_gain)
         self.out = param((heads, head, width), ("H", None, "D"), init, role="hidden")
         self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
         self.norm = LayerNorm(head, axis=None) if config.qk_norm else None

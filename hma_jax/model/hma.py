@@ -86,10 +86,10 @@ class HMA(nnx.Module):
     ) -> tuple[jax.Array, TemporalCache | None]:
         """Logits [B, T, S, Q, V] (float32) of every frame given, and their cache if `keep`.
 
-        `actions_BTU` are raw; frame t carries the chunk executed after it was seen (reference
-        section 1.3). None runs without any conditioning. The frames stand at window positions
-        `positions` (int [T], default `first` onwards); `visible` [T, T_past + T] defaults to
-        causal.
+        `actions_BTU` are raw chunks as `align` arranges them: as released, frame t carries the
+        chunk executed after it was seen (reference section 1.3). None runs without any
+        conditioning. The frames stand at window positions `positions` (int [T], default `first`
+        onwards); `visible` [T, T_past + T] defaults to causal.
         """
         config = self.config
         frames = tokens_BTS.shape[1]
@@ -108,6 +108,16 @@ class HMA(nnx.Module):
         x = constrain(x, ("B", None, None, "D_act"))
         x, cache = self.trunk(x, action, embodiment_B, visible, past, keep)
         return self.logits(x[:, :, : config.tokens]), cache
+
+    def align(self, actions: jax.Array) -> jax.Array:
+        """Recorded chunks [..., T, U] -> the chunk that conditions each frame.
+
+        With `causal` alignment every frame takes the chunk that led to it; nothing led to the
+        first one, which keeps its own.
+        """
+        if self.config.action_alignment == "released":
+            return actions
+        return jnp.concatenate([actions[..., :1, :], actions[..., :-1, :]], axis=-2)
 
     def logits(self, x: jax.Array) -> jax.Array:
         """Trunk outputs [..., D] -> float32 logits [..., Q, V]."""

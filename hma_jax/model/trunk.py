@@ -9,7 +9,7 @@ from flax import nnx
 
 from hma_jax.config import ModelConfig
 from hma_jax.model.actions import Modulation
-from hma_jax.model.attention import TRUNK_GAIN, Attention
+from hma_jax.model.attention import Attention
 from hma_jax.model.layers import LayerNorm, Linear
 from hma_jax.params import stack
 from hma_jax.sharding import constrain
@@ -37,7 +37,7 @@ class Block(nnx.Module):
         self.time = Attention(config)
         self.norm_mlp = None if config.qk_norm else LayerNorm(config.width)
         sizes = (config.width, config.mlp_width)
-        options = {"gain": TRUNK_GAIN, "role": "hidden", "with_bias": config.mlp_bias}
+        options = {"gain": config.trunk_gain, "role": "hidden", "with_bias": config.mlp_bias}
         self.mlp_in = Linear(sizes, ("D", "F"), **options)
         self.mlp_out = Linear(sizes[::-1], ("F", "D"), **options)
 

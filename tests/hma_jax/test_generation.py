@@ -27,9 +27,11 @@ def test_masked_counts_are_the_cosine_schedule_of_the_release():
     [DecodeConfig(1), DecodeConfig(2), DecodeConfig(3, 1.0), DecodeConfig(4, order="confidence")],
     ids=str,
 )
-@pytest.mark.parametrize("prompt", [1, 3])
-def test_the_cached_rollout_equals_recomputing_the_window(decode: DecodeConfig, prompt: int):
-    config = model_config()
+@pytest.mark.parametrize("prompt, alignment", [(1, "released"), (3, "released"), (3, "causal")])
+def test_the_cached_rollout_equals_recomputing_the_window(
+    decode: DecodeConfig, prompt: int, alignment: str
+):
+    config = model_config(action_alignment=alignment)
     declared, params = lively_params(config)
     batch = random_batch(0, config, 4)
     other = batch["actions"].copy()
@@ -61,13 +63,30 @@ def test_equal_actions_give_equal_rollouts_even_when_sampled():
     np.testing.assert_array_equal(got[:, 0], got[:, 1])
 
 
-def test_next_frame_logits_equal_one_masked_window_per_frame():
-    config = model_config()
+def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
+    def first_frame_to_change(alignment: str, chunk: int) -> int:
+        config = model_config(action_alignment=alignment)
+        declared, params = lively_params(config)
+        hma = declared.merge(params)
+        batch = random_batch(0, config, 2)
+        actions = batch["actions"].copy()
+        actions[:, chunk, :2] += 3.0
+        logits = [hma(batch["tokens"], hma.align(a), batch["embodiment"])[0] for a in (batch["actions"], actions)]
+        changed = np.abs(logits[0] - logits[1]).max((0, 2, 3, 4)) > 1e-3
+        return int(np.argmax(changed))
+
+    assert [first_frame_to_change("released", c) for c in (0, 2)] == [0, 2]
+    assert [first_frame_to_change("causal", c) for c in (0, 2)] == [0, 3]
+
+
+@pytest.mark.parametrize("alignment", ["released", "causal"])
+def test_next_frame_logits_equal_one_masked_window_per_frame(alignment: str):
+    config = model_config(action_alignment=alignment)
     declared, params = lively_params(config, scale=0.1)
     batch = random_batch(0, config, 3)
     hma = declared.merge(params)
-    args = (batch["actions"], batch["embodiment"])
-    fast = np.asarray(next_frame_logits(hma, batch["tokens"], *args))
+    args = (hma.align(batch["actions"]), batch["embodiment"])
+    fast = np.asarray(next_frame_logits(hma, batch["tokens"], batch["actions"], batch["embodiment"]))
     for t in range(1, config.frames):
         window = jnp.asarray(batch["tokens"]).at[:, t:].set(config.mask_id)
         slow = np.asarray(hma(window, *args)[0][:, t])
