@@ -130,13 +130,17 @@ def stratified(stats: Iterable[Stat]) -> Stat:
     """Mean over datasets, every dataset counting equally: sem = sqrt(sum sem^2) / D.
 
     The datasets are fixed, not a sample of possible datasets: only the windows drawn within
-    each contribute error. `n` is the number of windows over all of them.
+    each contribute error. A dataset of one window cannot know its own error; it is taken to
+    scatter as the windows of the others do on average. `n` counts the windows of all.
     """
     stats = list(stats)
     require(len(stats) > 0, "no datasets to average over")
+    known = [s.sem**2 * s.n for s in stats if not math.isnan(s.sem)]  # variance of one window
+    typical = sum(known) / len(known) if known else math.nan
+    squares = [typical / s.n if math.isnan(s.sem) else s.sem**2 for s in stats]
     return Stat(
         mean=sum(s.mean for s in stats) / len(stats),
-        sem=math.sqrt(sum(s.sem**2 for s in stats)) / len(stats),
+        sem=math.sqrt(sum(squares)) / len(stats),
         n=sum(s.n for s in stats),
     )
 
@@ -149,14 +153,23 @@ def group_means(values: Any, group: int) -> tuple[np.ndarray, np.ndarray]:
     return np.add.reduceat(x, starts) / sizes, sizes
 
 
-def perplexity(batch_losses: Sequence[float] | np.ndarray, batch_sizes: Any) -> Stat:
-    """The official perplexity: size-weighted mean over batches of exp(mean loss of the batch).
+def official_perplexity(batch_losses: Sequence[float] | np.ndarray, batch_sizes: Any) -> float:
+    """Size-weighted mean over batches of exp(mean loss of the batch), as the release reports it.
 
     A mean of exponentials, so by Jensen it lies above `corpus_perplexity` and grows as batches
-    shrink: comparable only at one batch size (`EvalConfig.perplexity_group`, made with
-    `group_means`) and one tokenizer.
+    shrink: comparable only at one batch size and one tokenizer.
     """
-    return mean_and_sem(np.exp(np.asarray(batch_losses, np.float64)), batch_sizes)
+    return float(np.average(np.exp(np.asarray(batch_losses, np.float64)), weights=batch_sizes))
+
+
+def perplexity(losses: Any, group: int) -> Stat:
+    """`official_perplexity` of windows in batches of `group`; standard error over windows.
+
+    The error is the delta method's, value times that of the mean loss: a dataset may hold too
+    few batches to estimate one from their scatter.
+    """
+    value, stat = official_perplexity(*group_means(losses, group)), mean_and_sem(losses)
+    return Stat(value, value * stat.sem, stat.n)
 
 
 def corpus_perplexity(losses: Any) -> Stat:

@@ -15,6 +15,7 @@ random actions also overwrite the prompt's and use other random numbers (section
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -29,7 +30,6 @@ from hma_jax.evaluation.metrics import (
     Stat,
     corpus_perplexity,
     factored_cross_entropy,
-    group_means,
     mean_and_sem,
     perplexity,
     psnr,
@@ -92,6 +92,7 @@ def random_actions(
     return mean_EU[embodiment_B][:, None, None] + std_EU[embodiment_B][:, None, None] * noise
 
 
+@functools.lru_cache(maxsize=4)  # a second evaluation of the same shapes compiles nothing
 def make_evaluator(model: ModelConfig, table: EmbodimentTable, config: EvalConfig) -> Callable:
     """A jitted f(params, batch) -> (loss [B], correct [B], tokens [B, 1 + draws, T - prompt, S])."""
     require(
@@ -165,8 +166,7 @@ def evaluate(
     for name, metrics in columns.items():
         joined = {metric: np.concatenate(parts) for metric, parts in metrics.items()}
         stats = {metric: mean_and_sem(values) for metric, values in joined.items()}
-        groups = group_means(joined["cross_entropy"], config.perplexity_group)
-        stats["perplexity"] = perplexity(*groups)
+        stats["perplexity"] = perplexity(joined["cross_entropy"], config.perplexity_group)
         stats["perplexity_corpus"] = corpus_perplexity(joined["cross_entropy"])
         result.datasets[name] = stats
     return result

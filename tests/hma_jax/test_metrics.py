@@ -60,7 +60,7 @@ def test_cross_entropy_perplexity_and_accuracy_equal_golden(golden):
 
 def test_perplexity_is_the_size_weighted_mean_of_exponentials(golden):
     x, expected = golden
-    value = metrics.perplexity(x["batch_losses"], x["batch_sizes"]).mean
+    value = metrics.official_perplexity(x["batch_losses"], x["batch_sizes"])
     assert value == pytest.approx(expected["mean_perplexity_over_batches"], abs=1e-6)
     pooled = np.average(x["batch_losses"], weights=x["batch_sizes"])
     assert value > math.exp(pooled)  # a mean of exponentials lies above exp of the mean
@@ -109,10 +109,24 @@ def test_stratified_mean_weighs_datasets_equally_and_combines_errors():
     assert metrics.stratified(stats) == metrics.Stat(2.0, pytest.approx(0.25), 1010)
 
 
+def test_a_dataset_of_one_window_takes_the_scatter_of_the_others():
+    stats = [metrics.Stat(1.0, 0.5, 4), metrics.Stat(3.0, math.nan, 1)]
+    assert metrics.stratified(stats).sem == pytest.approx(math.sqrt(0.5**2 + 1.0**2) / 2)
+    assert math.isnan(metrics.stratified(stats[1:]).sem)
+
+
 def test_grouping_keeps_a_smaller_last_group():
     means, sizes = metrics.group_means([1.0, 3.0, 5.0, 7.0, 9.0], 2)
     np.testing.assert_array_equal(means, [2.0, 6.0, 9.0])
     np.testing.assert_array_equal(sizes, [2, 2, 1])
+
+
+def test_perplexity_has_an_error_even_when_all_windows_form_one_group():
+    losses = [1.0, 1.2, 0.8]
+    one, many = metrics.perplexity(losses, 4), metrics.perplexity(losses, 1)
+    assert one.mean == pytest.approx(math.e) and one.n == 3
+    assert one.sem == pytest.approx(metrics.corpus_perplexity(losses).sem)
+    assert many.mean > one.mean
 
 
 def test_corpus_perplexity_error_is_the_delta_method():
