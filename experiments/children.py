@@ -14,13 +14,15 @@ import threading
 import time
 from pathlib import Path
 
+from hma_jax.host_memory import HUGE_PAGES, keep_freed_memory
+
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
 _PR_SET_PDEATHSIG = 1
 
 
 def child_environment(slot: int, workers: int, compile_cache: Path | None = None) -> dict[str, str]:
     """The environment of the child in `slot` of `workers`: 1/workers of cores and accelerator."""
-    environment = dict(os.environ)
+    environment = {**HUGE_PAGES, **os.environ}
     environment[_PARENT] = str(os.getpid())
     if workers > 1 and hasattr(os, "sched_getaffinity"):
         cores = sorted(os.sched_getaffinity(0))
@@ -36,6 +38,7 @@ def child_environment(slot: int, workers: int, compile_cache: Path | None = None
 
 def settle() -> None:
     """Called first in a child: takes its cores and arranges to die with its parent."""
+    keep_freed_memory()
     cores = os.environ.get(_CORES)
     if cores:
         os.sched_setaffinity(0, {int(c) for c in cores.split(",")})

@@ -24,6 +24,7 @@ from tyro.extras import SubcommandApp
 from experiments import commands
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.host_memory import keep_freed_memory
 
 PROGRAM = "hma"
 Preset = Literal["smoke", "cpu", "accelerator", "paper"]
@@ -163,6 +164,7 @@ app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns the exit code; errors become one message on stderr."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    keep_freed_memory()
     debug = os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if "--debug" in arguments:
         arguments.remove("--debug")

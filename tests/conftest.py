@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from hma_jax.host_memory import keep_freed_memory
+
 CACHE = Path(__file__).parent.parent / ".jax_cache"
 # Environment, not jax.config: child processes of the tests must find it too.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+keep_freed_memory()
