@@ -37,17 +37,19 @@ SMOKE = Study(
 CPU = Study(
     name="cpu",  # the study of the README: two cores, minutes
     suite=SuiteConfig(scale=1.0),
-    tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=16),
-    tokenizer_train=TokenizerTrainConfig(steps=1600, batch=32),
+    store=StoreConfig(min_val=8),
+    tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=12),
+    tokenizer_train=TokenizerTrainConfig(steps=2000, batch=32),
     model=ModelConfig(
-        width=64, layers=3, heads=4, frames=12, tokens=16, action_tokens=1, factor_vocab=256,
-        mup=MupConfig(base_width=64), remat=False,
+        width=64, layers=2, heads=2, frames=12, tokens=16, action_tokens=1, factor_vocab=64,
+        mup=MupConfig(base_width=64), remat=False, trunk_gain=0.5, stem_gain=1.0,
     ),
     train=TrainConfig(
-        steps=300, batch=16,
+        steps=600, batch=16,
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
+        masking=MaskingConfig(max_corrupt_rate=0.0, non_mlm_ratio=0.0),
     ),
-    eval=EvalConfig(windows_per_dataset=8, batch=8),
+    eval=EvalConfig(windows_per_dataset=12, batch=12),
     dataset_counts=(5, 10, 20, 40),
     trajectory_counts=(2, 8, 32, 320),
     widths=(16, 32, 64, 96),

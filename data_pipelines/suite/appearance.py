@@ -34,7 +34,7 @@ def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
     """The looks of n episodes: pure in (spec, n, seed)."""
     rng = np.random.default_rng([seed, 4])
     look = spec.look
-    light = rng.uniform(0.86, 1.1, (n, 1, 1)) * (1 + 0.025 * rng.standard_normal((n, 1, 3)))
+    light = rng.uniform(0.95, 1.05, (n, 1, 1)) * (1 + 0.008 * rng.standard_normal((n, 1, 3)))
 
     def colours(base: np.ndarray, spread: float) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
@@ -49,17 +49,17 @@ def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
     else:
         goal = 0.4 * np.array(look.robot[:1]) + 0.6 * floor
     return Appearance(
-        floor=colours(floor, 5.0),
-        outside=colours(np.array([look.outside]), 8.0),
-        robot=colours(np.array(look.robot), 7.0),
-        objects=colours(things[0], 4.0),
-        goal=colours(goal, 2.0),
-        distractors=colours(things[1] * 0.75 + 40, 4.0),
-        slope=rng.uniform(-10, 10, (n, 2)).astype(np.float32),
+        floor=colours(floor, 2.0),
+        outside=colours(np.array([look.outside]), 2.5),
+        robot=colours(np.array(look.robot), 2.5),
+        objects=colours(things[0], 2.0),
+        goal=colours(goal, 1.0),
+        distractors=colours(things[1] * 0.75 + 40, 2.0),
+        slope=rng.uniform(-3, 3, (n, 2)).astype(np.float32),
     )
 
 
 def _hues(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Random strong colours [*shape, 3], all of similar brightness."""
-    phase = rng.uniform(0, 2 * np.pi, (*shape, 1)) + np.array([0.0, 2.1, 4.2])
+    """Strong colours [*shape, 3] from a wheel of six, all of similar brightness."""
+    phase = rng.integers(6, size=(*shape, 1)) * (np.pi / 3) + np.array([0.0, 2.1, 4.2])
     return 130 + 95 * np.cos(phase)

@@ -20,7 +20,7 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import VERSION, write_dataset
 from hma_jax.config import ConfigError, require
 
-GENERATOR = 6
+GENERATOR = 7
 """Raise it when simulation, rendering or encoding change: older datasets are then remade."""
 
 MIN_EPISODES = 8

@@ -42,7 +42,7 @@ class Look:
     outside: RGB = (120, 116, 112)
     robot: tuple[RGB, RGB, RGB] = ((70, 90, 160), (215, 120, 60), (60, 60, 70))
     pattern: Literal["plain", "slope", "stripe", "table"] = "plain"
-    shade: float = 14.0  # standard deviation of the floor's colour between episodes
+    shade: float = 4.0  # standard deviation of the floor's colour between episodes
     distractors: int = 0
     distractor_speed: float = 0.35  # world units per second
     distractor_size: float = 0.13
