@@ -7,12 +7,10 @@ Imports no JAX, so that --help is instant.
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -162,23 +160,18 @@ app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command and returns the exit code; errors become one message on stderr."""
+    """Runs a command and returns the exit code; errors become one message on stderr.
+
+    Without `arguments`, those of the process, which is then taken to be this program's own.
+    """
+    own_process = arguments is None
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    keep_freed_memory()
     debug = os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if "--debug" in arguments:
         arguments.remove("--debug")
         debug = True
-    if debug:
-        return _run_command(arguments, debug)
-    with _background_silenced():
-        code = _run_command(arguments, debug)
-        if code:
-            gc.collect()  # the tasks that an error left behind complain now, not at exit
-    return code
-
-
-def _run_command(arguments: Sequence[str], debug: bool) -> int:
+    if own_process and not debug:
+        _silence_background()
     try:
         app.cli(
             prog=PROGRAM,
@@ -197,20 +190,13 @@ def _run_command(arguments: Sequence[str], debug: bool) -> int:
         return code
 
 
-@contextmanager
-def _background_silenced() -> Iterator[None]:
-    """Reader tasks of a checkpoint that turns out damaged report it in pages of their own, from
-    threads and destructors where nothing can catch it. The error message says it once.
+def _silence_background() -> None:
+    """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
+    pages of their own, from threads and destructors where nothing can catch it, until the very
+    end. The error message says it once.
     """
-    hook, logger = sys.unraisablehook, logging.getLogger("asyncio")
-    level = logger.level
     sys.unraisablehook = lambda _: None
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        logger.setLevel(level)
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
 
 
 def _exit_code(error: Exception) -> int | None:
