@@ -6,7 +6,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs/study
 PRESET ?= cpu
-WORKERS ?= 1
+WORKERS ?= 2
 
 .PHONY: help study test test-slow clean
 

@@ -31,7 +31,7 @@ class LoaderConfig:
     seed: int = 0  # of the order and of the subset of trajectories
     max_trajectories: int | None = None  # per dataset
     datasets: tuple[str, ...] = ()  # empty: all of the store
-    shuffle_actions: bool = False  # control: actions of another window
+    shuffle_actions: bool = False  # control: actions of another episode
 
     def __post_init__(self):
         require(self.frames >= 1, f"loader.frames must be at least 1, got {self.frames}")
@@ -134,6 +134,13 @@ class _Stream:
         return {"tokens": tokens, "actions": actions, "embodiment": self.embodiment}
 
     def _other(self, at: int, i: int) -> int:
-        """Another window than `at`, drawn anew on every visit so that no pair can be learnt."""
+        """A window of another episode, drawn anew on every visit so that no pair can be learnt.
+
+        Windows of one episode overlap: their actions would still tell of this one's.
+        """
+        first, end = self.windows.siblings(at)
         n = len(self.windows)
-        return at if n == 1 else (at + 1 + random_below(n - 1, i, self.action_seed)) % n
+        others = n - (end - first)
+        if others == 0:  # a single episode: at least not the same window
+            return at if n == 1 else (at + 1 + random_below(n - 1, i, self.action_seed)) % n
+        return (end + random_below(others, i, self.action_seed)) % n

@@ -50,6 +50,11 @@ class WindowSet:
         at = int(np.searchsorted(self.ends, i, side="right"))
         return int(self.episodes[at]), int(i - (self.ends[at - 1] if at else 0))
 
+    def siblings(self, i: int) -> tuple[int, int]:
+        """The range [first, end) of all windows of window `i`'s episode."""
+        at = int(np.searchsorted(self.ends, i, side="right"))
+        return int(self.ends[at - 1]) if at else 0, int(self.ends[at])
+
     @property
     def counts(self) -> np.ndarray:
         """int64: windows of each episode."""

@@ -47,7 +47,7 @@ class Trial:
     train: TrainConfig
     eval: EvalConfig
     tau: float = 3.0
-    shuffle_actions: bool = False  # the control: actions from another window
+    shuffle_actions: bool = False  # the control: actions from another episode
     measure_untrained: bool = False  # also evaluate the model before its first step
 
     @property

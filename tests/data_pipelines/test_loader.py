@@ -169,7 +169,7 @@ def test_shuffled_actions_change_the_actions_and_nothing_else(store, table):
     other, rows = 0, 0
     for a, b in zip(true, shuffled, strict=True):
         assert np.array_equal(a["tokens"], b["tokens"]) and np.array_equal(a["embodiment"], b["embodiment"])
-        changed = (a["actions"] != b["actions"]).any(axis=(1, 2))
+        changed = a["actions"][:, 0, 0] != b["actions"][:, 0, 0]  # value 0 is the episode's number
         other, rows = other + changed.sum(), rows + len(changed)
         for row, embodiment in zip(b["actions"], b["embodiment"], strict=True):
             entry = table.entries[embodiment]  # a whole window of the same dataset's train split
