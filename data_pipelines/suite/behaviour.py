@@ -6,12 +6,9 @@ values. It sees the whole state; the physics sees only its actions.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from data_pipelines.suite.world import World
+from data_pipelines.suite.world import World
 
 
 class Behaviour:

@@ -13,8 +13,8 @@ import numpy as np
 
 from data_pipelines.suite.appearance import Appearance
 from data_pipelines.suite.bodies import Pose
+from data_pipelines.suite.rollout import Rollout
 from data_pipelines.suite.spec import Camera, EmbodimentSpec
-from data_pipelines.suite.world import Rollout
 
 CHUNK = 48
 """Frames drawn together: about what keeps canvas and windows in the cache."""

@@ -7,12 +7,25 @@ imprecise control and exploration make failures as real as successes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from data_pipelines.suite.world import World
+
+class Scene(Protocol):
+    """What a task sees of n episodes."""
+
+    goals: np.ndarray  # [n, M, 2], one for each tool
+    objects: np.ndarray  # [n, K, 2]
+    held: np.ndarray  # [n, M]: the object in each tool's grip, or -1
+    hand: np.ndarray  # [n]: the tool that does the task
+    tool_radius: float
+    grasp: float  # how near a gripper must be to an object to hold it
+
+    @property
+    def tools(self) -> np.ndarray:
+        """[n, M, 2]"""
+        ...
 
 
 @dataclass(frozen=True)
@@ -25,13 +38,13 @@ class Reach:
     carries: bool = False
     pushes: bool = True
 
-    def plan(self, world: World) -> tuple[np.ndarray, np.ndarray]:
+    def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         """Where the tools should go [n, M, 2], and gripper openings [n, M] (nan: no opinion)."""
-        return world.goals, np.full(world.goals.shape[:2], np.nan)
+        return scene.goals, np.full(scene.goals.shape[:2], np.nan)
 
-    def done(self, world: World) -> np.ndarray:
+    def done(self, scene: Scene) -> np.ndarray:
         """bool [n]: the goal is reached now."""
-        return (np.linalg.norm(world.tools - world.goals, axis=-1) < self.radius).all(1)
+        return (np.linalg.norm(scene.tools - scene.goals, axis=-1) < self.radius).all(1)
 
 
 @dataclass(frozen=True)
@@ -44,14 +57,14 @@ class Push:
     carries: bool = False
     pushes: bool = True
 
-    def plan(self, world: World) -> tuple[np.ndarray, np.ndarray]:
-        target = world.tools.copy()
+    def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        target = scene.tools.copy()
         rows = np.arange(len(target))
-        tool, thing, goal = target[rows, world.hand], world.objects[:, 0], world.goals[:, 0]
+        tool, thing, goal = target[rows, scene.hand], scene.objects[:, 0], scene.goals[:, 0]
         way = goal - thing
         way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6)
         side = np.stack([-way[:, 1], way[:, 0]], 1)
-        gap = self.size + world.tool_radius
+        gap = self.size + scene.tool_radius
         offset = tool - thing
         along, across = (offset * way).sum(1), (offset * side).sum(1)
         ready = (along < -0.5 * gap) & (np.abs(across) < 0.7 * self.size)
@@ -60,11 +73,11 @@ class Push:
         behind = thing - way * (gap + 0.05)
         around = thing - way * 0.5 * gap + side * sign * (gap + 0.12)
         aim = np.where(beside[:, None], around, behind)
-        target[rows, world.hand] = np.where(ready[:, None], thing + way * 0.15 - side * across[:, None], aim)
+        target[rows, scene.hand] = np.where(ready[:, None], thing + way * 0.15 - side * across[:, None], aim)
         return target, np.full(target.shape[:2], np.nan)
 
-    def done(self, world: World) -> np.ndarray:
-        return np.linalg.norm(world.objects[:, 0] - world.goals[:, 0], axis=-1) < self.radius
+    def done(self, scene: Scene) -> np.ndarray:
+        return np.linalg.norm(scene.objects[:, 0] - scene.goals[:, 0], axis=-1) < self.radius
 
 
 @dataclass(frozen=True)
@@ -77,19 +90,19 @@ class Carry:
     carries: bool = True
     pushes: bool = False
 
-    def plan(self, world: World) -> tuple[np.ndarray, np.ndarray]:
-        target = world.tools.copy()
+    def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        target = scene.tools.copy()
         opening = np.full(target.shape[:2], np.nan)
         rows = np.arange(len(target))
-        tool, thing, goal = target[rows, world.hand], world.objects[:, 0], world.goals[:, 0]
-        held = world.held[rows, world.hand] == 0
-        near = np.linalg.norm(tool - thing, axis=1) < 0.6 * world.grasp
-        target[rows, world.hand] = np.where(held[:, None], goal, thing)
-        opening[rows, world.hand] = np.where(held | near, 0.0, 1.0)
+        tool, thing, goal = target[rows, scene.hand], scene.objects[:, 0], scene.goals[:, 0]
+        held = scene.held[rows, scene.hand] == 0
+        near = np.linalg.norm(tool - thing, axis=1) < 0.6 * scene.grasp
+        target[rows, scene.hand] = np.where(held[:, None], goal, thing)
+        opening[rows, scene.hand] = np.where(held | near, 0.0, 1.0)
         return target, opening
 
-    def done(self, world: World) -> np.ndarray:
-        return np.linalg.norm(world.objects[:, 0] - world.goals[:, 0], axis=-1) < self.radius
+    def done(self, scene: Scene) -> np.ndarray:
+        return np.linalg.norm(scene.objects[:, 0] - scene.goals[:, 0], axis=-1) < self.radius
 
 
 Task = Reach | Push | Carry

@@ -1,7 +1,7 @@
 """One dataset of the suite on disk, laid out as tensorflow_datasets writes RLDS.
 
 Owns features, records, shards and metadata of one dataset. What happens in an episode comes
-from `world`, its pictures from `render`.
+from `rollout`, its pictures from `render`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import simplejpeg
 from data_pipelines.example import encode_example
 from data_pipelines.suite.appearance import Appearance, draw_appearance
 from data_pipelines.suite.render import frame_index, render_frames
+from data_pipelines.suite.rollout import Rollout, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
-from data_pipelines.suite.world import Rollout, simulate
 from data_pipelines.tfrecord import write_shard
 
 VERSION = "1.0.0"

@@ -14,7 +14,7 @@ from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.controls import Drive, JointRate, JointTarget
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.render import frame_index, render_frames
-from data_pipelines.suite.world import simulate
+from data_pipelines.suite.rollout import simulate
 
 BY_NAME = {spec.name: spec for spec in EMBODIMENTS}
 every_embodiment = pytest.mark.parametrize("name", list(BY_NAME))

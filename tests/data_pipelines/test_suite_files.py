@@ -13,7 +13,7 @@ from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.generate import MIN_EPISODES, fingerprint, generate_suite
 from data_pipelines.suite.render import frame_index, render_frames
-from data_pipelines.suite.world import simulate
+from data_pipelines.suite.rollout import simulate
 from data_pipelines.tfrecord import index_shard, read_record
 from hma_jax.config import ConfigError
 
