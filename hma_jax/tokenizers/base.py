@@ -7,7 +7,6 @@ and back can stand behind it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 
 import jax
@@ -73,10 +72,6 @@ class Tokenizer(Protocol):
 
     def decode_fn(self, params: Params, ids: jax.Array) -> jax.Array:
         """Pure, for use inside a jit: ids [B, S] -> float32 [B, ...] in 0..255."""
-        ...
-
-    def save(self, directory: Path) -> None:
-        """Writes what `tokenizers.io.load_tokenizer` reads."""
         ...
 
 

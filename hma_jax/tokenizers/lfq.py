@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 from functools import cached_property
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -118,11 +117,6 @@ class LfqTokenizer:
             "is a mask id left, or were they made by another tokenizer?",
         )
         return in_pieces(lambda piece: self._decode(self.params, piece), ids.astype(np.int32))
-
-    def save(self, directory: Path) -> None:
-        from hma_jax.tokenizers.io import save_tokenizer  # io imports this module
-
-        save_tokenizer(self, directory)
 
 
 def reconstruction_psnr(tokenizer: Tokenizer, images: np.ndarray) -> Stat:

@@ -16,6 +16,7 @@ import optax
 
 from hma_jax.config import TokenizerConfig, TokenizerTrainConfig, to_dict
 from hma_jax.params import Declared, Params
+from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer, declare_tokenizer
 from hma_jax.tokenizers.network import normalise
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
@@ -54,7 +55,7 @@ def train_tokenizer(
         progress=progress,
     )
     tokenizer = LfqTokenizer(config, result.state.params)
-    tokenizer.save(run_dir)
+    save_tokenizer(tokenizer, run_dir)
     return tokenizer
 
 
