@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 
 from experiments import scale_datasets, scale_trajectories, scale_width
+from experiments.atomic import write_atomically
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
-from experiments.trial import write_atomically
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
 from hma_jax.config import ConfigError, MeshConfig, to_dict
 

@@ -13,9 +13,10 @@ from rich.table import Table
 
 from experiments.paper_mixture import PAPER_MIXTURE
 from experiments.progress import tidy_table
+from experiments.provenance import Provenance
 from experiments.study import Study
 from experiments.sweep import Sweep, reference_trial, unique_trials
-from experiments.trial import Provenance, Trial, trial_id
+from experiments.trial import Trial, trial_id
 from hma_jax.embodiments import Embodiment, EmbodimentTable
 
 UNKNOWN = Provenance("", "", "", "")

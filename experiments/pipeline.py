@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.markup import escape
 
+from experiments.atomic import write_atomically
 from experiments.progress import console, step
+from experiments.provenance import Provenance, source_hash
 from experiments.study import StoreConfig, Study
-from experiments.trial import CHECKPOINTS, Provenance, source_hash, write_atomically
+from experiments.trial import CHECKPOINTS
 from experiments.workspace import Workspace
 from hma_jax.config import require, stable_hash, to_dict
 

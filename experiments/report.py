@@ -19,11 +19,12 @@ import numpy as np
 from PIL import Image
 
 from experiments.ledger import FINISHED
+from experiments.provenance import Provenance
 from experiments.report_style import CSS
 from experiments.rows import OVERALL, CurvePoint, Row, curve, load_result
 from experiments.runner import State
 from experiments.sweep import Sweep, reference_trial, unique_trials
-from experiments.trial import Provenance, trial_id
+from experiments.trial import trial_id
 from experiments.workspace import Record, Workspace
 from hma_jax.config import to_json
 

@@ -18,9 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from experiments.ledger import FINISHED
+from experiments.provenance import Provenance
 from experiments.runner import State
 from experiments.sweep import Point, Sweep
-from experiments.trial import Provenance, trial_id
+from experiments.trial import trial_id
 from hma_jax.config import ConfigError
 
 OVERALL = "overall"

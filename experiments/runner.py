@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from experiments.atomic import write_atomically
 from experiments.children import child_environment
 from experiments.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, STARTED, Ledger
-from experiments.trial import write_atomically
 from experiments.trial_main import FAILURE, JOB, PROGRESS, RESULT, STOPPED
 
 GRACE_SECONDS = 60.0

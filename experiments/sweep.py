@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from experiments.provenance import Provenance
 from experiments.study import Study
-from experiments.trial import Provenance, Trial, trial_id
+from experiments.trial import Trial, trial_id
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,17 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from experiments.atomic import write_atomically
+from experiments.provenance import Provenance
+from experiments.workspace import Workspace
 from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, TrainConfig, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.evalset import EvalManifest
     from data_pipelines.store import TokenStore
-    from experiments.workspace import Workspace
     from hma_jax.embodiments import EmbodimentTable
     from hma_jax.evaluation.protocol import Evaluation
     from hma_jax.tokenizers.base import Tokenizer
@@ -61,32 +62,9 @@ class Trial:
         )
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """What a trial's numbers depend on besides its own fields."""
-
-    store: str  # hash of the token store
-    manifest: str  # hash of the evaluation manifest
-    tokenizer: str  # identity of the tokenizer
-    code: str  # hash of the sources
-
-
 def trial_id(trial: Trial, provenance: Provenance) -> str:
     """The name of a trial: equal exactly when everything that determines it is equal."""
     return stable_hash({"trial": to_dict(trial), "provenance": to_dict(provenance)})
-
-
-@cache
-def source_hash(packages: tuple[str, ...] = ("hma_jax", "data_pipelines")) -> str:
-    """Hash of the sources that a trial runs: `packages` and this file.
-
-    Plots, reports and the command line are left out: changing them re-runs nothing.
-    """
-    root = Path(__file__).resolve().parent.parent
-    files = [p for package in packages for p in sorted((root / package).rglob("*.py"))]
-    return stable_hash(
-        [[p.relative_to(root).as_posix(), p.read_text()] for p in [*files, Path(__file__).resolve()]]
-    )
 
 
 @dataclass(frozen=True)
@@ -255,14 +233,4 @@ def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:
     np.savez_compressed(
         aside, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
     )
-    os.replace(aside, path)
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """A reader sees the old text or the new one, also after a crash."""
-    aside = path.with_name(path.name + ".tmp")
-    with open(aside, "w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
     os.replace(aside, path)

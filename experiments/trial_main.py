@@ -24,9 +24,10 @@ def main(directory: Path) -> int:
     settle()  # before anything imports JAX
 
     from data_pipelines.errors import DataError
+    from experiments.atomic import write_atomically
     from experiments.ledger import DIVERGED, FAILED
+    from experiments.trial import Trial, run_trial
     from experiments.workspace import Workspace
-    from experiments.trial import Trial, run_trial, write_atomically
     from hma_jax.config import ConfigError, MeshConfig, from_dict
     from hma_jax.training.loop import DivergedError, Interrupted
 

@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from experiments.atomic import write_atomically
+from experiments.provenance import Provenance
 from experiments.study import Study
-from experiments.trial import Provenance, write_atomically
 from hma_jax.config import ConfigError, from_dict, to_dict
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from experiments.commands import AXES
 from experiments.ledger import Ledger
 from experiments.presets import SMOKE
+from experiments.provenance import Provenance
 from experiments.study import Study
 from experiments.sweep import unique_trials
-from experiments.trial import Provenance, Trial, write_samples
+from experiments.trial import Trial, write_samples
 from experiments.workspace import Record, Workspace
 
 PROVENANCE = Provenance(store="5708e", manifest="3a41f", tokenizer="70c3", code="c0de")

@@ -8,9 +8,10 @@ import pytest
 from experiments import scale_datasets, scale_trajectories, scale_width
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
+from experiments.provenance import Provenance
 from experiments.study import on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
-from experiments.trial import Provenance, trial_id
+from experiments.trial import trial_id
 from hma_jax.config import ConfigError, MeshConfig, from_dict, to_dict
 
 PLANS = (scale_datasets.plan, scale_trajectories.plan, scale_width.plan)

@@ -1,0 +1,34 @@
+"""What a trial's numbers depend on besides the trial itself: data, tokenizer and sources.
+
+The data's hashes come from `pipeline`, which prepares it; that of the sources is made here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from hma_jax.config import stable_hash
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """An identity for each of them; a trial with another one is another trial."""
+
+    store: str  # hash of the token store
+    manifest: str  # hash of the evaluation manifest
+    tokenizer: str  # identity of the tokenizer
+    code: str  # hash of the sources
+
+
+@cache
+def source_hash(packages: tuple[str, ...] = ("hma_jax", "data_pipelines")) -> str:
+    """Hash of the sources that a trial runs: `packages` and `trial`.
+
+    Plots, reports and the command line are left out: changing them re-runs nothing.
+    """
+    root = Path(__file__).resolve().parent.parent
+    files = [p for package in packages for p in sorted((root / package).rglob("*.py"))]
+    files.append(root / "experiments" / "trial.py")
+    return stable_hash([[p.relative_to(root).as_posix(), p.read_text()] for p in files])
