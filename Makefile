@@ -19,11 +19,14 @@ help:
 study: $(VENV)/installed
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
+# One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
+PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8
+
 test: $(VENV)/installed-test
-	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -m "not slow"
+	$(PYTEST) -m "not slow"
 
 test-slow: $(VENV)/installed-test
-	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q
+	$(PYTEST)
 
 # constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves.
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check \

@@ -43,19 +43,19 @@ CPU = Study(
     model=ModelConfig(
         width=64, layers=2, heads=2, frames=12, tokens=16, action_tokens=1, factor_vocab=64,
         mup=MupConfig(base_width=64), remat=False,
-        # Ten thousand windows must do where the release has millions: residual branches and
+        # Twelve thousand windows must do where the release has millions: residual branches and
         # stems that do not start near zero, and the chunk that leads to a frame given with it.
         trunk_gain=0.5, stem_gain=1.0, action_alignment="causal",
     ),
     train=TrainConfig(
-        steps=600, batch=16,
+        steps=1000, batch=12,
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
         masking=MaskingConfig(max_corrupt_rate=0.0, non_mlm_ratio=0.0),
     ),
     eval=EvalConfig(windows_per_dataset=12, batch=12),
     dataset_counts=(5, 10, 20, 40),
-    trajectory_counts=(2, 8, 32, 320),
-    widths=(8, 16, 32, 64),
+    trajectory_counts=(2, 5, 16, 480),
+    widths=(16, 24, 32, 64),
     flops_per_second=2.5e10,
 )
 

@@ -38,7 +38,7 @@ EMBODIMENTS: tuple[EmbodimentSpec, ...] = (
       body=arm((0.52, 0.42), radius=0.19, bend=150, swing=170),
       controls=(JointTarget("joints", _j(0, 2)),),
       task=Reach(radius=0.12), purpose=0.4, instruction="touch the mark"),
-    E("disc_pusher_delta_pixels", "pusher", hz=4, restless=1.2, episodes=320, look=SLATE,
+    E("disc_pusher_delta_pixels", "pusher", hz=4, restless=1.2, episodes=480, look=SLATE,
       body=gantry(size=0.28, speed=0.95),
       controls=(JointRate("xy", _j(0, 2), unit=PIXEL, convention="delta"),),
       task=Push(objects=2), instruction="push the disc onto the mark"),

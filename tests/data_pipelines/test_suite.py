@@ -35,7 +35,7 @@ def test_the_table_is_as_heterogeneous_as_promised():
     assert sum(len(s.cameras) > 1 for s in EMBODIMENTS) >= 6
     sizes = [s.episodes for s in EMBODIMENTS]
     assert max(sizes) >= 20 * min(sizes)
-    assert sum(s.episodes * s.hz * sum(s.seconds) / 2 for s in EMBODIMENTS) < 170_000
+    assert sum(s.episodes * s.hz * sum(s.seconds) / 2 for s in EMBODIMENTS) < 200_000
 
 
 @pytest.mark.parametrize("count", [5, 10, 20])
@@ -161,7 +161,7 @@ def test_the_jacobian_is_the_derivative_of_the_tool_points():
 def test_episodes_differ_in_looks_and_shapes_lie_where_the_camera_says():
     spec = BY_NAME["disc_pusher_delta_pixels"]
     looks = draw_appearance(spec, 20, seed=0)
-    assert looks.floor[:, 0].std(0)[:3].min() > 4
+    assert looks.floor[:, 0].std(0)[:3].min() > 1.5
     rollout = simulate(spec, 1, seed=0)
     episode, step = frame_index(rollout, [0])
     camera = replace(spec.cameras[0], zoom=1.0, flip=True)
