@@ -127,3 +127,9 @@ def test_workers_share_the_cores():
     if len(cores) > 1:
         assert not shares[0] & shares[1]
     assert "HMA_CORES" not in child_environment(0, 1)
+
+
+def test_a_child_uses_huge_pages_unless_the_user_said_otherwise(monkeypatch):
+    assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
+    monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.hugetlb=0")
+    assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=0"
