@@ -54,7 +54,7 @@ CPU = Study(
     ),
     eval=EvalConfig(windows_per_dataset=12, batch=12),
     dataset_counts=(5, 10, 20, 40),
-    trajectory_counts=(2, 5, 16, 480),
+    trajectory_counts=(4, 8, 16, 480),
     widths=(24, 32, 64, 96),
     flops_per_second=2.5e10,
 )
