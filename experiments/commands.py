@@ -88,7 +88,9 @@ def run_study(
         save_record(workspace, record)
         trials = unique_trials(sweeps, provenance)
         common = {"provenance": to_dict(provenance), "mesh": to_dict(mesh)}
-        jobs = [Job(id, trial.title, {"trial": to_dict(trial), **common}) for id, trial in trials.items()]
+        # The widest take longest: first, so that no worker is left with one at the end.
+        ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
+        jobs = [Job(id, trial.title, {"trial": to_dict(trial), **common}) for id, trial in ordered]
         states = run_jobs(jobs, workspace, workers, retry_failed)
         draw(workspace, record)
     complain(jobs, states)
