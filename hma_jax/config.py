@@ -213,17 +213,62 @@ class MupConfig:
 
     `base_width` is where the multipliers are 1. Learning rate and initial variance of hidden
     matrices scale with base_width / D, the read-out's input with base_width / D, attention
-    logits with `attention_scale` / head width.
+    logits with `attention_scale` / head width. `without` takes single ingredients away, to show
+    that each is needed.
     """
 
     enabled: bool = True
     base_width: int = 256
     attention_scale: float = 8.0
+    without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """Diffusion over continuous vectors conditioned on the trunk (reference sections 2.4 and 2.5).
+
+    `channels` and `patch` describe what is denoised for frames: a token is a patch of
+    `patch` x `patch` latent cells of `channels` values, flattened to C = patch^2 x channels.
+    """
+
+    channels: int = 4
+    patch: int = 2
+    width: int = 1024  # of the denoising network
+    depth: int = 4  # its residual blocks
+    steps: int = 1000  # of the noising process
+    clip: float = 10.0  # predicted clean values are kept in +-clip while sampling
+    repeats: int = 1  # noised copies of each token per training step
+
+    def __post_init__(self):
+        for name in ("channels", "patch", "width", "depth", "steps", "repeats"):
+            value = getattr(self, name)
+            require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")
+        require(self.clip > 0, f"diffusion.clip must be positive, got {self.clip}")
+
+    @property
+    def cells(self) -> int:
+        """Latent cells per token."""
+        return self.patch**2
+
+    @property
+    def token_channels(self) -> int:
+        """C: values per token."""
+        return self.cells * self.channels
+
+
+Conditioning = Literal["concat+modulate", "modulate", "concat", "add", "cross_attention"]
+"""How actions reach the trunk (paper section 4.1, reference section 1.6): as K more tokens per
+frame, through a shift and scale in every block, both, added to every token in every block, or
+attended to in every block."""
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """The discrete HMA transformer. Defaults are the released base model (43.6 M, one robot)."""
+    """The HMA transformer. Defaults are the released discrete base model (43.6 M, one robot).
+
+    With `diffusion` set it is the continuous variant: tokens are latent vectors, and `factors`
+    and `factor_vocab` mean nothing.
+    """
 
     width: int = 256  # D
     layers: int = 32  # N
@@ -233,14 +278,17 @@ class ModelConfig:
     action_tokens: int = 64  # K
     factors: int = 2  # Q
     factor_vocab: int = 512  # V
+    diffusion: DiffusionConfig | None = None
+    conditioning: Conditioning = "concat+modulate"
+    # Which chunk conditions frame t: the one executed after it (`released`; the chunk that led
+    # to it then arrives through temporal attention) or the one that led to it (`causal`).
+    action_alignment: Literal["released", "causal"] = "released"
+    action_heads: bool = True  # what predicts actions; forward dynamics does without
     mlp_ratio: float = 4.0
     qkv_bias: bool = False
     proj_bias: bool = True
     mlp_bias: bool = True
     qk_norm: bool = False
-    # Which chunk conditions frame t: the one executed after it (`released`; the chunk that led
-    # to it then arrives through temporal attention) or the one that led to it (`causal`).
-    action_alignment: Literal["released", "causal"] = "released"
     trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
     stem_gain: float = 0.01  # Xavier gain of the action stems
     mup: MupConfig = field(default_factory=MupConfig)
@@ -252,9 +300,8 @@ class ModelConfig:
             self.width % self.heads == 0,
             f"model.width {self.width} is not a multiple of model.heads {self.heads}",
         )
-        for name in ("width", "layers", "heads", "frames", "tokens", "factors"):
+        for name in ("width", "layers", "heads", "frames", "tokens", "factors", "action_tokens"):
             require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
-        require(self.action_tokens >= 1, "model.action_tokens must be at least 1")
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
 
     @property
@@ -266,9 +313,21 @@ class ModelConfig:
         return int(self.width * self.mlp_ratio)
 
     @property
+    def concat(self) -> bool:
+        """Whether actions enter as tokens of their own."""
+        return "concat" in self.conditioning
+
+    @property
     def frame_tokens(self) -> int:
         """P: tokens per frame inside the trunk."""
-        return self.tokens + self.action_tokens
+        return self.tokens + (self.action_tokens if self.concat else 0)
+
+    @property
+    def position_slots(self) -> int:
+        """Position embeddings kept per frame. As released there are some for latent cells that
+        patches never reach, and for action tokens whether or not there are any."""
+        cells = self.diffusion.cells if self.diffusion else 1
+        return self.tokens * cells + self.action_tokens
 
     @property
     def vocab_size(self) -> int:
@@ -285,20 +344,44 @@ class ModelConfig:
         return self.width / self.mup.base_width if self.mup.enabled else 1.0
 
 
+Setting = Literal["forward", "passive", "full", "policy", "inverse"]
+"""What is hidden in training, and so predicted (paper section 3.1)."""
+
+
 @dataclass(frozen=True)
 class MaskingConfig:
-    """Training-time masking and corruption (reference section 1.9)."""
+    """Training-time masking and corruption (reference sections 1.9 and 2.3)."""
 
+    setting: Setting = "forward"
+    action_loss_weight: float = 0.5
     non_mlm_ratio: float = 0.2  # probability that prompt frames stay clean
     prompt_frames: int = 4
+    # A frame's mask rate is cos(pi/2 u) with u uniform from here to 1. DIFFERS: the release calls
+    # it the minimum mask ratio, but a larger value lowers the largest rate.
+    mask_angle_min: float = 0.0
+    # Continuous variant: mask whole patches. DIFFERS: the release masks single cells, so that
+    # patches are partly masked in training and never at inference; `cell` is as released.
+    mask_unit: Literal["patch", "cell"] = "patch"
     max_corrupt_rate: float = 0.2
     clean_rate_min: float = 0.2
     label_smoothing: float = 0.01
+    # DIFFERS: the release shows hidden actions to the blocks (`conditioning`, discrete variant)
+    # or everywhere (`all`, continuous variant), so that the objective gives them away.
+    action_leak: Literal["none", "conditioning", "all"] = "none"
 
     def __post_init__(self):
-        for name in ("non_mlm_ratio", "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
+        for name in ("non_mlm_ratio", "mask_angle_min", "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
+        require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
+
+    @property
+    def predicts_frames(self) -> bool:
+        return self.setting in ("forward", "passive", "full")
+
+    @property
+    def predicts_actions(self) -> bool:
+        return self.setting in ("full", "policy", "inverse")
 
 
 # --- Training --------------------------------------------------------------------------------
@@ -348,6 +431,7 @@ class TrainConfig:
     seed: int = 0
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
+    only: tuple[str, ...] = ()  # train these robots' own parameters and nothing else; (): everything
 
     def __post_init__(self):
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
