@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
 from experiments.workspace import Workspace
-from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, TrainConfig, stable_hash, to_dict
+from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, Setting, TrainConfig, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.evalset import EvalManifest
@@ -142,6 +142,7 @@ def evaluate_on(
     table: EmbodimentTable,
     materials: Materials,
     config: EvalConfig,
+    setting: Setting = "forward",
     *,
     first_batches: bool = False,
     progress: Progress = lambda *_: None,
@@ -161,6 +162,7 @@ def evaluate_on(
         materials.tokenizer,
         _first_of_each_dataset(batches) if first_batches else batches,
         config,
+        setting=setting,
         progress=lambda done: progress("evaluating", done, windows),
     )
 
@@ -190,7 +192,7 @@ def run_trial(
     declared = declare_model(trial.model, table)
     trained = train_trial(trial, materials, directory / "run", mesh=mesh, progress=progress)
 
-    subject = (trial.model, table, materials, trial.eval)
+    subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
     evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, progress=progress)
     untrained = None
     if trial.measure_untrained:  # what it says of one batch it says of all: it has learnt nothing

@@ -256,6 +256,58 @@ class DiffusionConfig:
         return self.cells * self.channels
 
 
+@dataclass(frozen=True)
+class SamplerConfig:
+    """How clean vectors are drawn (`diffusion.sample`).
+
+    `ddpm` is ancestral sampling, as released; `ddim` (eta 0), as the paper states, draws nothing
+    after the initial noise. `temperature` multiplies noise; 0 leaves what the condition implies.
+    """
+
+    kind: Literal["ddpm", "ddim"] = "ddpm"
+    steps: int = 100  # of the respaced process
+    temperature: float = 1.0
+    # DIFFERS: the release multiplies the noise of the steps only, so that at "temperature 0" its
+    # samples still depend on the random numbers they start from; False: as released.
+    scale_initial_noise: bool = True
+
+    def __post_init__(self):
+        require(self.steps >= 2, f"sampler.steps must be at least 2, got {self.steps}")
+        require(self.temperature >= 0, f"sampler.temperature must not be negative, got {self.temperature}")
+        require(
+            self.kind == "ddpm" or self.scale_initial_noise or self.temperature == 1,
+            "sampler.temperature has no effect on ddim without scale_initial_noise; "
+            "set scale_initial_noise or leave the temperature at 1",
+        )
+
+    @property
+    def noisy_steps(self) -> bool:
+        """Whether the steps after the first need random numbers."""
+        return self.kind == "ddpm" and self.temperature > 0
+
+
+@dataclass(frozen=True)
+class DecodeConfig:
+    """How a masked frame is filled (`decoding`).
+
+    `temperature` divides the logits of discrete tokens; 0 takes the most likely entry of each
+    factor. DIFFERS: the release divides probabilities, which a renormalising draw ignores
+    (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
+    """
+
+    unmask_steps: int = 2  # M
+    temperature: float = 0.0
+    top_k: int = 0  # draw from the k likeliest entries of each factor; 0: from all
+    order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    resample: bool = False  # continuous: predict every patch again in each step, as released
+
+    def __post_init__(self):
+        require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")
+        require(self.temperature >= 0, f"decode.temperature must not be negative, got {self.temperature}")
+        require(self.top_k >= 0, f"decode.top_k must not be negative, got {self.top_k}")
+
+
 Conditioning = Literal["concat+modulate", "modulate", "concat", "add", "cross_attention"]
 """How actions reach the trunk (paper section 4.1, reference section 1.6): as K more tokens per
 frame, through a shift and scale in every block, both, added to every token in every block, or
@@ -334,14 +386,13 @@ class ModelConfig:
         return self.factor_vocab**self.factors
 
     @property
-    def mask_id(self) -> int:
-        """The id that stands for a masked position: one past the last token."""
-        return self.vocab_size
-
-    @property
     def width_multiplier(self) -> float:
         """muP's m = D / base width; 1 when muP is off."""
         return self.width / self.mup.base_width if self.mup.enabled else 1.0
+
+    def mup_multiplier(self, ingredient: str) -> float:
+        """m where `ingredient` of muP applies, 1 where it was taken away."""
+        return 1.0 if ingredient in self.mup.without else self.width_multiplier
 
 
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
@@ -448,6 +499,7 @@ class EvalConfig:
     windows_per_dataset: int = 500
     prompt_frames: int = 4
     unmask_steps: int = 2  # M
+    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(temperature=0.0))  # continuous
     random_actions: int = 5  # draws for delta PSNR
     batch: int = 32
     perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import ConfigError, require
@@ -18,7 +20,7 @@ DEAD_STD = 1e-6
 
 @dataclass(frozen=True)
 class Embodiment:
-    """One robot and its action space.
+    """One robot and its action space; `action_dim` 0 is a video without recorded actions.
 
     `mean` and `std` are over single native actions, length `action_dim`, in raw units. The
     action chunk of a frame is `stride` native actions, flattened sub-step-major.
@@ -29,6 +31,8 @@ class Embodiment:
     stride: int
     mean: tuple[float, ...]
     std: tuple[float, ...]
+    # False: its video is of no use as a target (a policy dataset with blank cameras, say).
+    video_targets: bool = True
 
     def __post_init__(self):
         require(
@@ -70,8 +74,13 @@ class EmbodimentTable:
 
     @property
     def action_width(self) -> int:
-        """U: the widest chunk; narrower ones are padded with zeros."""
-        return max(e.chunk for e in self.entries)
+        """U: the widest chunk, at least 1; narrower ones are padded with zeros."""
+        return max(1, *(e.chunk for e in self.entries))
+
+    @property
+    def chunks(self) -> np.ndarray:
+        """int [E]: values in each robot's own chunk; 0 for videos without actions."""
+        return np.array([e.chunk for e in self.entries])
 
     def index(self, name: str) -> int:
         for i, entry in enumerate(self.entries):
@@ -89,11 +98,26 @@ class EmbodimentTable:
             std[i, : e.chunk] = np.tile(alive, e.stride)
         return mean, std
 
-    def normaliser(self) -> tuple[np.ndarray, np.ndarray]:
-        """(mean_EU, inverse_std_EU), float32: padding and dead dimensions normalise to exactly 0.
+    def alive(self) -> np.ndarray:
+        """bool [E, U]: values that carry a signal, neither padding nor a dead dimension."""
+        return self.statistics()[1] > 0
 
-        DIFFERS: the release divides by std + 1e-10, which turns rounding noise on a constant
-        dimension into values of order 100 (reference section 5.6).
+    def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """Raw chunks [B, ..., U] in units of each robot's standard deviation, from its mean.
+
+        DIFFERS: padding and dead dimensions become exactly 0; the release divides by std + 1e-10,
+        which turns rounding noise on a constant dimension into values of order 100 (reference
+        section 5.6).
         """
-        mean, std = self.statistics()
-        return mean, np.where(std > 0, 1 / np.where(std > 0, std, 1), 0).astype(np.float32)
+        mean, std = self._of(embodiment_B, actions.ndim)
+        return (actions - mean) * jnp.where(std > 0, 1 / jnp.where(std > 0, std, 1), 0)
+
+    def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """The inverse of `normalise`: raw units; dead dimensions take their mean."""
+        mean, std = self._of(embodiment_B, actions.ndim)
+        return actions * std + mean
+
+    def _of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, jax.Array]:
+        """(mean, std) of each example's robot, shaped to meet [B, ..., U]."""
+        shape = (-1, *(1,) * (ndim - 2), self.action_width)
+        return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.statistics())

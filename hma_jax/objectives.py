@@ -1,108 +1,40 @@
-"""What the discrete model is trained on: corrupted, masked windows and their cross-entropy.
+"""What is learnt: the losses of masked tokens and hidden actions, for both variants.
 
-Random numbers (`draw`) are kept apart from what is done with them (`corrupt_and_mask`), so
-the masking can be checked against recorded numbers.
+Discrete tokens cost their cross-entropy and actions their squared error (paper, equation 2);
+continuous ones cost what diffusion costs (equation 3).
 """
 
 from __future__ import annotations
 
-import itertools
-import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import MaskingConfig, ModelConfig
-from hma_jax.model.hma import HMA, compose, factorise
-
-
-class MaskingDraws(NamedTuple):
-    """The random numbers of one example; u_* are uniform in [0, 1)."""
-
-    u_corrupt: jax.Array  # []
-    u_replace_TSQ: jax.Array
-    noise_TSQ: jax.Array  # int32 in [0, V)
-    first_masked: jax.Array  # int32 []: 1, or later when the prompt stays clean
-    u_clean: jax.Array  # []
-    u_decay_T: jax.Array
-    u_degrade_TSQ: jax.Array
-    u_rate_T: jax.Array
-    u_mask_TS: jax.Array
-
-
-class Masked(NamedTuple):
-    """A window as the model sees it in training."""
-
-    inputs_TS: jax.Array  # corrupted ids, mask id where masked
-    masked_TS: jax.Array  # bool: where the loss is taken
-
-
-def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> MaskingDraws:
-    """One example's random numbers.
-
-    DIFFERS: the release draws the corruption rate and the masking mode once per batch (its
-    batches hold one dataset); here each example draws its own.
-    """
-    t, s, q = config.frames, config.tokens, config.factors
-    shapes = MaskingDraws((), (t, s, q), (t, s, q), (2,), (), (t,), (t, s, q), (t,), (t, s))
-    # One call for all numbers: random generators are slow to compile.
-    sizes = [math.prod(shape) for shape in shapes]
-    flat = jax.random.uniform(key, (sum(sizes),))
-    pieces = jnp.split(flat, list(itertools.accumulate(sizes))[:-1])
-    u = MaskingDraws(*[piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)])
-
-    earliest = min(masking.prompt_frames, t - 1)
-    late = earliest + jnp.floor(u.first_masked[0] * (t - earliest)).astype(jnp.int32)
-    return u._replace(
-        noise_TSQ=jnp.floor(u.noise_TSQ * config.factor_vocab).astype(jnp.int32),
-        first_masked=jnp.where(u.first_masked[1] < masking.non_mlm_ratio, late, 1),
-    )
-
-
-def corrupt_and_mask(
-    tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig
-) -> Masked:
-    """Random-token corruption, degradation of late frames, then masking (reference 1.9).
-
-    Frame 0 is never masked. In prompt mode (first_masked > 1) frames from there on are also
-    degraded, later ones more. A frame's mask rate is cos(pi u / 2), mean 2 / pi.
-    """
-    frame = jnp.arange(tokens_TS.shape[0])
-    ids = factorise(tokens_TS, config.factors, config.factor_vocab)
-    replace = draws.u_replace_TSQ < masking.max_corrupt_rate * draws.u_corrupt
-
-    start_rate = masking.clean_rate_min + (1 - masking.clean_rate_min) * draws.u_clean
-    late = frame >= draws.first_masked
-    clean_T = start_rate * jnp.cumprod(jnp.where(late, 0.9 + 0.1 * draws.u_decay_T, 1.0))
-    degrade_T = late & (draws.first_masked > 1)
-    replace |= degrade_T[:, None, None] & (draws.u_degrade_TSQ > clean_T[:, None, None])
-    corrupted = compose(jnp.where(replace, draws.noise_TSQ, ids), config.factor_vocab)
-
-    rate_T = jnp.cos(jnp.pi / 2 * draws.u_rate_T)
-    masked = late[:, None] & (draws.u_mask_TS < rate_T[:, None])
-    return Masked(jnp.where(masked, config.mask_id, corrupted), masked)
-
-
-def mask_batch(
-    key: jax.Array, tokens_BTS: jax.Array, rows_B: jax.Array, config: ModelConfig, masking: MaskingConfig
-) -> Masked:
-    """Masks every example with its own key, fold_in(key, row): the layout of the batch over
-    devices, processes and micro-batches does not change an example's masks."""
-
-    def one(tokens_TS: jax.Array, row: jax.Array) -> Masked:
-        draws = draw(jax.random.fold_in(key, row), config, masking)
-        return corrupt_and_mask(tokens_TS, draws, config, masking)
-
-    return jax.vmap(one)(tokens_BTS, rows_B)
+from hma_jax.config import DiffusionConfig, MaskingConfig
+from hma_jax.diffusion import diffusion_loss, make_process
+from hma_jax.masking import Masked
+from hma_jax.model.frames import factorise
+from hma_jax.model.hma import HMA
 
 
 class LossSums(NamedTuple):
-    """Sums over masked positions; divide by `count` over the whole batch."""
+    """Sums over a batch's targets; divide by their number in the whole batch."""
 
-    loss: jax.Array
-    correct: jax.Array
-    count: jax.Array
+    tokens: jax.Array
+    correct: jax.Array  # targets whose likeliest id is right; 0 in the continuous variant
+    actions: jax.Array
+
+
+class TargetCounts(NamedTuple):
+    """How many targets a batch has. A mean over none is 0."""
+
+    tokens: jax.Array
+    actions: jax.Array
+
+
+def count_targets(masked: Masked) -> TargetCounts:
+    return TargetCounts(*(jnp.maximum(jnp.sum(x), 1) for x in (masked.targets_TS, masked.action_targets_T)))
 
 
 def smoothed_cross_entropy(logits: jax.Array, labels: jax.Array, smoothing: float) -> jax.Array:
@@ -115,16 +47,83 @@ def smoothed_cross_entropy(logits: jax.Array, labels: jax.Array, smoothing: floa
 def masked_loss(
     model: HMA,
     masked: Masked,
-    tokens_BTS: jax.Array,
-    actions_BTU: jax.Array | None,
+    tokens: jax.Array,
+    actions_BTU: jax.Array,
     embodiment_B: jax.Array,
-    smoothing: float,
+    masking: MaskingConfig,
+    key_B: jax.Array,
 ) -> LossSums:
-    """Forward dynamics: predict masked tokens given the rest and the actions (reference 1.8)."""
-    actions = None if actions_BTU is None else model.align(actions_BTU)
-    logits, _ = model(masked.inputs_TS, actions, embodiment_B)
-    labels = factorise(tokens_BTS, model.config.factors, model.config.factor_vocab)
-    loss = smoothed_cross_entropy(logits, labels, smoothing)
-    correct = jnp.all(jnp.argmax(logits, axis=-1) == labels, axis=-1)
-    weight = masked.masked_TS.astype(jnp.float32)
-    return LossSums(jnp.sum(loss * weight), jnp.sum(correct * weight), jnp.sum(weight))
+    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise."""
+    all_shown = masking.setting == "forward" and all(model.table.chunks)
+    hidden = None if all_shown else model.align_hidden(masked.hidden_T)
+    frames = tokens.shape[1]
+    everything = jnp.ones((frames, frames), bool) if masking.setting == "inverse" else None
+    out = model(
+        masked.inputs,
+        masked.masked,
+        model.align(actions_BTU),
+        embodiment_B,
+        hidden_BT=hidden,
+        leak=masking.action_leak,
+        visible=everything,
+    )
+    zero = jnp.zeros(())
+    loss = correct = action_loss = zero
+    if masking.predicts_frames:
+        weight = masked.targets_TS.astype(jnp.float32)
+        if model.config.diffusion:
+            per_token = frame_diffusion_loss(model, out.frames, tokens, key_B)
+        else:
+            labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
+            per_token = smoothed_cross_entropy(out.frames, labels, masking.label_smoothing)
+            right = jnp.all(jnp.argmax(out.frames, axis=-1) == labels, axis=-1)
+            correct = jnp.sum(right * weight)
+        loss = jnp.sum(per_token * weight)
+    if masking.predicts_actions:
+        per_step = action_loss_per_step(model, out.actions, actions_BTU, embodiment_B, key_B)
+        action_loss = jnp.sum(per_step * masked.action_targets_T)
+    return LossSums(loss, correct, action_loss)
+
+
+def frame_diffusion_loss(model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array) -> jax.Array:
+    """Per token [B, T, S]: squared error of the noise plus the bound's variance term (section 2.4)."""
+    config = model.config.diffusion
+    process = make_process(config.steps)
+
+    def one(key: jax.Array, z: jax.Array, x0: jax.Array) -> jax.Array:
+        time, noise = draw_noise(key, x0.shape, config)
+        mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z), x0, time, noise, process)
+        return mse + vb
+
+    # The trunk's work is shared by all noised copies of a token.
+    keys_RB = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]
+    x0 = tokens_BTSC.astype(jnp.float32)
+    return jnp.stack([jax.vmap(one)(key, z_BTSD, x0) for key in keys_RB]).mean(axis=0)
+
+
+def draw_noise(key: jax.Array, shape: tuple[int, ...], config: DiffusionConfig) -> tuple[jax.Array, jax.Array]:
+    """(time int [...], noise [..., C]) for values of `shape` [..., C]."""
+    time_key, noise_key = jax.random.split(key)
+    return jax.random.randint(time_key, shape[:-1], 0, config.steps), jax.random.normal(noise_key, shape)
+
+
+def action_loss_per_step(
+    model: HMA, pooled_BTD: jax.Array, actions_BTU: jax.Array, embodiment_B: jax.Array, key_B: jax.Array
+) -> jax.Array:
+    """[B, T]: error of predicted, normalised actions, averaged over each robot's own live values.
+
+    DIFFERS: the release compares with raw actions and averages over everything times the mean
+    of the mask (reference section 9.1).
+    """
+    target = model.table.normalise(actions_BTU, embodiment_B)
+    alive_BTU = jnp.broadcast_to(jnp.asarray(model.table.alive())[embodiment_B][:, None], target.shape)
+    if model.config.diffusion:
+        keys = jax.vmap(lambda k: jax.random.fold_in(k, 2**20))(key_B)  # not one of the repeats'
+        time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion))(keys)
+        network = lambda x, t: model.action_head(x, t, pooled_BTD, embodiment_B)  # noqa: E731
+        noise = jnp.where(alive_BTU, noise, 0)
+        process = make_process(model.config.diffusion.steps)
+        some_BTU = alive_BTU | ~alive_BTU.any(axis=-1, keepdims=True)  # a mean over nothing is no number
+        return sum(diffusion_loss(network, target, time, noise, process, valid=some_BTU))
+    error = jnp.square(model.action_head(pooled_BTD, embodiment_B) - target)
+    return jnp.sum(error * alive_BTU, axis=-1) / jnp.maximum(jnp.sum(alive_BTU, axis=-1), 1)

@@ -29,6 +29,10 @@ Role = Literal["hidden", "input", "output", "vector"]
 """What width does to a parameter (muP): `hidden` has two axes that grow with width, `input`
 and `output` one (from and to a fixed size), `vector` is a bias, a gain or an embedding."""
 
+Use = Literal["always", "actions_shown", "actions_hidden", "actions_predicted", "frames_predicted"]
+"""Which examples a parameter has to do with. In a step without one it stands still, as an absent
+robot's do: no update, no decay, no count."""
+
 Initializer = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 """init(rng, shape) -> float32 array."""
 
@@ -45,6 +49,7 @@ class ParamSpec:
     role: Role
     decay: bool
     init: Initializer
+    use: Use = "always"
 
     @property
     def embodiment_axis(self) -> int | None:
@@ -69,7 +74,7 @@ def param(
     No array is made here: `Declared.init` makes them all.
     """
     require(len(shape) == len(axes), f"a parameter of shape {shape} needs {len(shape)} axes, got {axes}")
-    return nnx.Param(jnp.zeros(shape, jnp.float32), axes=axes, init=init, role=role, decay=decay)
+    return nnx.Param(jnp.zeros(shape, jnp.float32), axes=axes, init=init, role=role, decay=decay, use="always")
 
 
 def bias(shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
@@ -106,9 +111,23 @@ def xavier_uniform(fan_in: int, fan_out: int, gain: float = 1.0) -> Initializer:
     return lambda rng, shape: uniform(rng, shape, bound)
 
 
-def stack(make: Callable[[], nnx.Module], count: int) -> nnx.Module:
-    """`count` modules as one whose parameters have a leading layer axis N."""
-    return nnx.vmap(lambda _: make(), in_axes=0, out_axes=0)(jnp.arange(count))
+def stack(make: Callable[[], nnx.Module], count: int, axis: str = LAYER_AXIS) -> nnx.Module:
+    """`count` modules as one whose parameters have a leading axis, of layers unless named otherwise."""
+    module = nnx.vmap(lambda _: make(), in_axes=0, out_axes=0)(jnp.arange(count))
+    for variable in _params(module):
+        variable.set_metadata(axes=(axis, *variable.axes))
+    return module
+
+
+def used(use: Use, module: nnx.Module) -> nnx.Module:
+    """`module`, its parameters declared to be of `use`."""
+    for variable in _params(module):
+        variable.set_metadata(use=use)
+    return module
+
+
+def _params(module: nnx.Module) -> list[nnx.Param]:
+    return [node for _, node in nnx.iter_graph(module) if isinstance(node, nnx.Param)]
 
 
 @dataclass(frozen=True)
@@ -174,7 +193,6 @@ def path_name(path: tuple[Any, ...]) -> str:
 
 def _spec(variable: nnx.Param) -> ParamSpec:
     shape = tuple(variable.get_value().shape)
-    axes = tuple(variable.axes)
-    if len(shape) == len(axes) + 1:  # made by `stack`
-        axes = (LAYER_AXIS, *axes)
-    return ParamSpec(shape, axes, variable.role, variable.decay, variable.init)
+    return ParamSpec(
+        shape, tuple(variable.axes), variable.role, variable.decay, variable.init, variable.use
+    )

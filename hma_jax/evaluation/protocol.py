@@ -2,11 +2,16 @@
 
 Paper section 4 (Metrics), reference section 6. For every window of a frozen manifest:
 
-* likelihood: cross-entropy of each frame, wholly masked, given the true frames before it;
+* likelihood: cross-entropy (continuous: diffusion loss) of each frame, wholly masked, given the
+  true frames before it;
 * fidelity: PSNR and SSIM of an autoregressive rollout from the prompt against the recorded
   frames (not their reconstruction by the tokenizer);
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
-  under random action sequences, unmasking with the same random numbers.
+  under random action sequences, unmasking with the same random numbers;
+* policy, where the model was trained to predict actions: squared error of the chunks after the
+  prompt, read off the true frames with those chunks hidden, against that of the mean action.
+
+A model trained on passive video is shown no action anywhere.
 
 DIFFERS: the release's rollout replaces one context frame only (reference section 6.2); its
 random actions also overwrite the prompt's and use other random numbers (section 6.3).
@@ -24,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import EvalConfig, ModelConfig, require
+from hma_jax.config import DecodeConfig, EvalConfig, ModelConfig, Setting, require
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.evaluation.metrics import (
     Stat,
@@ -36,9 +41,10 @@ from hma_jax.evaluation.metrics import (
     ssim,
     stratified,
 )
-from hma_jax.generation import DecodeConfig, next_frame_logits, rollout
-from hma_jax.model import declare_model
-from hma_jax.model.hma import compose
+from hma_jax.generation import next_frame_outputs, predict_actions, rollout
+from hma_jax.model import HMA, declare_model
+from hma_jax.model.frames import compose
+from hma_jax.objectives import frame_diffusion_loss
 from hma_jax.params import Params
 
 
@@ -92,36 +98,87 @@ def random_actions(
     return mean_EU[embodiment_B][:, None, None] + std_EU[embodiment_B][:, None, None] * noise
 
 
+def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
+    """Whether a model so trained has a policy to evaluate."""
+    return model.action_heads and setting in ("full", "policy", "inverse")
+
+
 @functools.lru_cache(maxsize=4)  # a second evaluation of the same shapes compiles nothing
-def make_evaluator(model: ModelConfig, table: EmbodimentTable, config: EvalConfig) -> Callable:
-    """A jitted f(params, batch) -> (loss [B], correct [B], tokens [B, 1 + draws, T - prompt, S])."""
+def make_evaluator(
+    model: ModelConfig, table: EmbodimentTable, config: EvalConfig, setting: Setting = "forward"
+) -> Callable:
+    """A jitted f(params, batch) -> (metrics {name: [B]}, frames [B, 1 + draws, T - prompt, S (, C)])."""
     require(
         config.prompt_frames < model.frames,
         f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of "
         f"{model.frames} frames",
     )
     declared = declare_model(model, table)
-    decode = DecodeConfig(unmask_steps=config.unmask_steps)
+    decode = DecodeConfig(unmask_steps=config.unmask_steps, sampler=config.sampler)
     first_free = config.prompt_frames - 1  # the first chunk that leads to a predicted frame
+
+    def hidden(embodiment_B: jax.Array) -> jax.Array | None:
+        if setting == "passive":
+            return jnp.ones((len(embodiment_B), model.frames), bool)
+        if all(table.chunks):
+            return None
+        return jnp.repeat(jnp.asarray(table.chunks == 0)[embodiment_B][:, None], model.frames, axis=1)
 
     def evaluate_batch(params: Params, batch: dict[str, jax.Array]):
         hma = declared.merge(params)
         tokens, actions, embodiment = batch["tokens"], batch["actions"], batch["embodiment"]
-        logits = next_frame_logits(hma, tokens, actions, embodiment)
-        loss = factored_cross_entropy(logits, tokens[:, 1:]).mean((1, 2))
-        guess = compose(jnp.argmax(logits, -1), model.factor_vocab)
-        correct = (guess == tokens[:, 1:]).astype(jnp.float32).mean((1, 2))
+        not_shown = hidden(embodiment)
+        key = jax.random.key(config.seed + 1)
+        keys = jax.vmap(lambda w: jax.random.fold_in(key, w))(batch["window"])
+        out = next_frame_outputs(hma, tokens, actions, embodiment, not_shown)
+        metrics = _likelihood(hma, out, tokens[:, 1:], keys)
+        if predicts_actions(model, setting):
+            causally = setting != "inverse"
+            metrics |= _policy_errors(hma, tokens, actions, embodiment, keys, decode, first_free, causally)
 
         shape = (config.random_actions, model.frames)
         other = random_actions(config.seed, batch["window"], embodiment, table, shape)
         other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
         sequences = jnp.concatenate([actions[:, None], other], axis=1)
-        key = jax.random.key(config.seed + 1)
-        keys = jax.vmap(lambda w: jax.random.fold_in(key, w))(batch["window"])
         prompt = tokens[:, : config.prompt_frames]
-        return loss, correct, rollout(hma, prompt, sequences, embodiment, keys, decode)
+        return metrics, rollout(hma, prompt, sequences, embodiment, keys, decode, hidden_BT=not_shown)
 
     return jax.jit(evaluate_batch)
+
+
+def _likelihood(model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array) -> dict[str, jax.Array]:
+    """Per window [B]: what `out` says of the true frames."""
+    if model.config.diffusion:
+        return {"diffusion_loss": frame_diffusion_loss(model, out, truth, key_B).mean((1, 2))}
+    guess = compose(jnp.argmax(out, -1), model.config.factor_vocab)
+    return {
+        "cross_entropy": factored_cross_entropy(out, truth).mean((1, 2)),
+        "accuracy": (guess == truth).astype(jnp.float32).mean((1, 2)),
+    }
+
+
+def _policy_errors(
+    model: HMA,
+    frames: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+    first: int,
+    causally: bool,
+) -> dict[str, jax.Array]:
+    """Per window [B]: mean squared error of the chunks from `first` on, in variances of each live
+    action value, of the model and of always giving the mean."""
+    hidden = jnp.broadcast_to(jnp.arange(frames.shape[1]) >= first, frames.shape[:2])
+    predicted = predict_actions(
+        model, frames, actions_BTU, embodiment_B, hidden, key_B, decode, causally=causally
+    )
+    table = model.table
+    alive_BU = jnp.asarray(table.alive())[embodiment_B]
+    truth, guess = (table.normalise(x, embodiment_B)[:, first:] for x in (actions_BTU, predicted))
+    mean = lambda error: jnp.sum(error.mean(1) * alive_BU, -1) / jnp.maximum(alive_BU.sum(-1), 1)  # noqa: E731
+    error, of_mean = mean((guess - truth) ** 2), mean(truth**2)
+    return {"action_error": error, "action_error_of_mean": of_mean, "action_gain": of_mean - error}
 
 
 def evaluate(
@@ -132,26 +189,27 @@ def evaluate(
     batches: Iterator[dict[str, Any]],
     config: EvalConfig,
     *,
+    setting: Setting = "forward",
     samples_per_dataset: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
     """Applies the protocol to `batches` (each of one dataset, its name under "dataset").
 
     A batch holds tokens, actions, embodiment, window (numbers), frames (uint8, recorded) and
-    valid (bool [B]: rows that are not padding). `progress` is told the windows done so far.
+    valid (bool [B]: rows that are not padding). `setting` is what the model was trained for.
+    `progress` is told the windows done so far.
     """
-    evaluator = make_evaluator(model, table, config)
+    evaluator = make_evaluator(model, table, config, setting)
     columns: dict[str, dict[str, list[np.ndarray]]] = {}
     result = Evaluation()
     done = 0
     for batch in batches:
         name, valid = batch["dataset"], batch["valid"]
         arrays = {k: batch[k] for k in ("tokens", "actions", "embodiment", "window")}
-        loss, correct, tokens = (np.asarray(x)[valid] for x in evaluator(params, arrays))
+        values, tokens = jax.tree.map(lambda x: np.asarray(x)[valid], evaluator(params, arrays))
         truth = batch["frames"][valid]
         predicted, last_random = _decode_rollouts(tokenizer, tokens)
-        values = _compare(truth, predicted, last_random, config.prompt_frames)
-        values |= {"cross_entropy": loss, "accuracy": correct}
+        values |= _compare(truth, predicted, last_random, config.prompt_frames)
         for metric, column in values.items():
             columns.setdefault(name, {}).setdefault(metric, []).append(column)
         if name not in result.samples and samples_per_dataset > 0:
@@ -166,18 +224,19 @@ def evaluate(
     for name, metrics in columns.items():
         joined = {metric: np.concatenate(parts) for metric, parts in metrics.items()}
         stats = {metric: mean_and_sem(values) for metric, values in joined.items()}
-        stats["perplexity"] = perplexity(joined["cross_entropy"], config.perplexity_group)
-        stats["perplexity_corpus"] = corpus_perplexity(joined["cross_entropy"])
+        if not model.diffusion:
+            stats["perplexity"] = perplexity(joined["cross_entropy"], config.perplexity_group)
+            stats["perplexity_corpus"] = corpus_perplexity(joined["cross_entropy"])
         result.datasets[name] = stats
     return result
 
 
 def _decode_rollouts(tokenizer: Decoder, tokens: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """tokens [B, 1 + draws, T', S] -> frames under true actions [B, T', ...] and last frames
+    """tokens [B, 1 + draws, T', S (, C)] -> frames under true actions [B, T', ...] and last frames
     under random ones [B, draws, ...]."""
-    batch, _, frames, size = tokens.shape
-    predicted = tokenizer.decode(tokens[:, 0].reshape(-1, size))
-    last = tokenizer.decode(tokens[:, 1:, -1].reshape(-1, size))
+    batch, _, frames, *size = tokens.shape
+    predicted = tokenizer.decode(tokens[:, 0].reshape(-1, *size))
+    last = tokenizer.decode(tokens[:, 1:, -1].reshape(-1, *size))
     shape = predicted.shape[1:]
     return predicted.reshape(batch, frames, *shape), last.reshape(batch, -1, *shape)
 
@@ -204,8 +263,8 @@ def _clips(
     tokenizer: Decoder, truth: np.ndarray, predicted: np.ndarray, tokens: np.ndarray, prompt: int
 ) -> dict[str, np.ndarray]:
     """Clips to look at: true, predicted and under the first random actions, all [n, T, ...]."""
-    count, _, frames, size = tokens.shape
-    random = tokenizer.decode(tokens[:, 1].reshape(-1, size)).reshape(predicted.shape)
+    size = tokens.shape[3:]
+    random = tokenizer.decode(tokens[:, 1].reshape(-1, *size)).reshape(predicted.shape)
     start = truth[:, :prompt]
     return {
         "true": truth,

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
+from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm
-from hma_jax.params import bias, param, xavier_uniform
+from hma_jax.params import bias, param
 
 
 def attention_scale(config: ModelConfig) -> float:
@@ -17,7 +18,7 @@ def attention_scale(config: ModelConfig) -> float:
     Under muP attention_scale / head width: 8 / I as released, so that logits stay of order one
     as heads widen; otherwise 1 / sqrt(I).
     """
-    if config.mup.enabled:
+    if config.mup.enabled and "attention" not in config.mup.without:
         return config.mup.attention_scale / config.head_width
     return config.head_width**-0.5
 
@@ -28,11 +29,11 @@ class Attention(nnx.Module):
     def __init__(self, config: ModelConfig):
         width, heads, head = config.width, config.heads, config.head_width
         # The fans are those of the fused (3D, D) matrix of the release.
-        init = xavier_uniform(width, 3 * width, config.trunk_gain)
+        init = trunk_init(config, width, 3 * width)
         self.qkv = param((width, 3, heads, head), ("D", None, "H", None), init, role="hidden")
         shape, axes = (3, heads, head), (None, "H", None)
         self.qkv_bias = bias(shape, axes) if config.qkv_bias else None
-        init = xavier_uniform(width, width, config.trunk_gain)
+        init = trunk_init(config, width, width)
         self.out = param((heads, head, width), ("H", None, "D"), init, role="hidden")
         self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
         self.norm = LayerNorm(head, axis=None) if config.qk_norm else None
@@ -57,7 +58,7 @@ class Attention(nnx.Module):
         """Every token sees every token of its own frame."""
         q, k, v = self.project(x_BTPD)
         logits = jnp.einsum("btphi,btshi->bthps", q, k)
-        weights = _softmax(logits)
+        weights = masked_softmax(logits)
         return self.project_out(jnp.einsum("bthps,btshi->btphi", weights, v))
 
     def over_time(
@@ -77,9 +78,12 @@ class Attention(nnx.Module):
             k = jnp.concatenate([past[0], k], axis=1)
             v = jnp.concatenate([past[1], v], axis=1)
         logits = jnp.einsum("btphi,bsphi->bphts", q, k)
-        weights = _softmax(jnp.where(visible, logits, jnp.finfo(logits.dtype).min))
+        weights = masked_softmax(logits, visible)
         return self.project_out(jnp.einsum("bphts,bsphi->btphi", weights, v)), new
 
 
-def _softmax(logits: jax.Array) -> jax.Array:
+def masked_softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.Array:
+    """Softmax over the last axis in float32, over what is `visible` (which broadcasts)."""
+    if visible is not None:
+        logits = jnp.where(visible, logits, jnp.finfo(logits.dtype).min)
     return jax.nn.softmax(logits.astype(jnp.float32), axis=-1).astype(logits.dtype)

@@ -1,4 +1,4 @@
-"""HMA, discrete variant: token embedding -> stems -> trunk -> factored logits.
+"""HMA: frame embedding -> stems -> trunk -> heads.
 
 Owns the order of things and the views of a window that training, evaluation and generation
 need. Masking and losses are in `objectives`, decoding in `generation`.
@@ -6,30 +6,22 @@ need. Masking and losses are in `objectives`, decoding in `generation`.
 
 from __future__ import annotations
 
+from typing import Literal, NamedTuple
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.config import ModelConfig
+from hma_jax.config import ModelConfig, require
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.model.actions import Stem
-from hma_jax.model.layers import Linear
+from hma_jax.model.conditioning import ActionFeature
+from hma_jax.model.frames import make_embed, make_frame_head
+from hma_jax.model.heads import Denoiser, make_action_head
+from hma_jax.model.layers import FINE_EPS, LayerNorm
 from hma_jax.model.trunk import TemporalCache, Trunk
-from hma_jax.params import Declared, declare, normal, param, zeros
+from hma_jax.params import Declared, declare, param, used, zeros
 from hma_jax.sharding import constrain
-
-READOUT_GAIN = 0.01
-
-
-def factorise(tokens: jax.Array, factors: int, vocab: int) -> jax.Array:
-    """ids [...] -> factor ids [..., Q]; factor 0 holds the low digits (reference section 1.2)."""
-    return jnp.stack([(tokens // vocab**q) % vocab for q in range(factors)], axis=-1)
-
-
-def compose(factor_ids: jax.Array, vocab: int) -> jax.Array:
-    """Factor ids [..., Q] -> ids [...]."""
-    powers = vocab ** jnp.arange(factor_ids.shape[-1], dtype=factor_ids.dtype)
-    return jnp.sum(factor_ids * powers, axis=-1)
 
 
 def causal(frames: int) -> jax.Array:
@@ -37,77 +29,94 @@ def causal(frames: int) -> jax.Array:
     return jnp.tril(jnp.ones((frames, frames), bool))
 
 
-class TokenEmbed(nnx.Module):
-    """Sum of one table per factor; masked positions get one learned vector instead."""
+class Outputs(NamedTuple):
+    """What a pass says of the frames it was given."""
 
-    def __init__(self, config: ModelConfig):
-        q, v, d = config.factors, config.factor_vocab, config.width
-        self.tables = param((q, v, d), ("Q", "V", "D"), normal(1.0), role="vector")
-        self.mask = param((d,), ("D",), zeros, role="vector")
-        self.mask_id = config.mask_id
-
-    def __call__(self, tokens: jax.Array, dtype: jnp.dtype) -> jax.Array:
-        """ids [...] (mask id allowed) -> [..., D]."""
-        q, v, _ = self.tables.shape
-        ids = factorise(tokens, q, v)
-        x = sum(jnp.take(self.tables[i].astype(dtype), ids[..., i], axis=0) for i in range(q))
-        return jnp.where((tokens == self.mask_id)[..., None], self.mask.astype(dtype), x)
+    frames: jax.Array  # discrete: logits [B, T, S, Q, V]; continuous: conditions [B, T, S, D]; float32
+    actions: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
+    cache: TemporalCache | None
 
 
 class HMA(nnx.Module):
-    """The discrete model with `concat+modulate` conditioning."""
+    """Both variants, under every conditioning."""
 
     def __init__(self, config: ModelConfig, table: EmbodimentTable):
-        self.config = config
-        self.embed = TokenEmbed(config)
-        shape = (config.frames, config.frame_tokens, config.width)
+        self.config, self.table = config, table
+        self.embed = make_embed(config)
+        shape = (config.frames, config.position_slots, config.width)
         self.positions = param(shape, ("T", "P", "D"), zeros, role="vector")
-        self.stem = Stem(config, table)
+        self.norm = LayerNorm(config.width, eps=FINE_EPS) if config.diffusion else None
+        self.stem = used("actions_shown", Stem(config, table))
+        # One vector per frame for actions that are hidden.
+        self.action_mask = param((config.frames, config.width), ("T", "D"), zeros, role="vector")
+        self.action_mask.set_metadata(use="actions_hidden")
         self.trunk = Trunk(config, table.size)
-        # muP's read-out: its input is divided by m, its initial weights multiplied by sqrt(m).
-        self.readout = Linear(
-            (config.width, config.factors * config.factor_vocab),
-            ("D", "V"),
-            gain=READOUT_GAIN * config.width_multiplier**0.5,
-            role="output",
+        self.frame_head = make_frame_head(config)
+        self.denoiser = (
+            used("frames_predicted", Denoiser(config, config.diffusion.token_channels))
+            if config.diffusion
+            else None
         )
+        self.action_head = make_action_head(config, table)
 
     def __call__(
         self,
-        tokens_BTS: jax.Array,
+        frames: jax.Array,
+        masked: jax.Array | None,
         actions_BTU: jax.Array | None,
         embodiment_B: jax.Array,
         *,
+        hidden_BT: jax.Array | None = None,
+        leak: Literal["none", "conditioning", "all"] = "none",
         visible: jax.Array | None = None,
         first: int | jax.Array = 0,
         positions: jax.Array | None = None,
         past: TemporalCache | None = None,
         keep: bool = False,
-    ) -> tuple[jax.Array, TemporalCache | None]:
-        """Logits [B, T, S, Q, V] (float32) of every frame given, and their cache if `keep`.
+    ) -> Outputs:
+        """One pass over ids [B, T, S] or latents [B, T, S, C], masked where bool `masked` says.
 
         `actions_BTU` are raw chunks as `align` arranges them: as released, frame t carries the
-        chunk executed after it was seen (reference section 1.3). None runs without any
-        conditioning. The frames stand at window positions `positions` (int [T], default `first`
-        onwards); `visible` [T, T_past + T] defaults to causal.
+        chunk executed after it was seen (reference section 1.3). Where `hidden_BT` the model is
+        not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
+        instead of actions runs without action tokens and conditioning. The frames stand at window
+        positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T]
+        defaults to causal. With `keep` the frames' cache is returned.
         """
         config = self.config
-        frames = tokens_BTS.shape[1]
+        count = frames.shape[1]
         dtype = jnp.dtype(config.compute_dtype)
         if positions is None:
-            positions = first + jnp.arange(frames)
+            positions = first + jnp.arange(count)
         if visible is None:
-            visible = causal(frames)
-        x = self.embed(tokens_BTS, dtype)
+            visible = causal(count)
+        x = self.embed(frames, masked, dtype)
         action = None
         if actions_BTU is not None:
-            action = self.stem(actions_BTU, embodiment_B, dtype)
-            copies = (*action.shape[:2], config.action_tokens, config.width)
-            x = jnp.concatenate([x, jnp.broadcast_to(action[:, :, None], copies)], axis=2)
+            feature = self.stem(actions_BTU, embodiment_B, dtype)
+            shown = None if hidden_BT is None or leak != "none" else ~hidden_BT
+            action = ActionFeature(feature, shown)
+            if config.concat:
+                x = jnp.concatenate([x, self._action_tokens(feature, hidden_BT, leak, positions)], axis=2)
         x = x + jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]].astype(dtype)
+        if self.norm is not None:
+            x = self.norm(x)
         x = constrain(x, ("B", None, None, "D_act"))
         x, cache = self.trunk(x, action, embodiment_B, visible, past, keep)
-        return self.logits(x[:, :, : config.tokens]), cache
+        pooled = x[:, :, config.tokens :].mean(axis=2) if x.shape[2] > config.tokens else None
+        x = x[:, :, : config.tokens]
+        out = self.frame_head(x, positions) if config.diffusion else self.frame_head(x)
+        return Outputs(out, pooled, cache)
+
+    def _action_tokens(
+        self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, leak: str, positions: jax.Array
+    ) -> jax.Array:
+        """K copies of each frame's feature, or of its learned vector where it is hidden."""
+        if hidden_BT is not None and leak != "all":
+            vector = jnp.take(self.action_mask.get_value(), positions, axis=0).astype(feature_BTD.dtype)
+            feature_BTD = jnp.where(hidden_BT[..., None], vector, feature_BTD)
+        b, t, d = feature_BTD.shape
+        return jnp.broadcast_to(feature_BTD[:, :, None], (b, t, self.config.action_tokens, d))
 
     def align(self, actions: jax.Array) -> jax.Array:
         """Recorded chunks [..., T, U] -> the chunk that conditions each frame.
@@ -119,10 +128,12 @@ class HMA(nnx.Module):
             return actions
         return jnp.concatenate([actions[..., :1, :], actions[..., :-1, :]], axis=-2)
 
-    def logits(self, x: jax.Array) -> jax.Array:
-        """Trunk outputs [..., D] -> float32 logits [..., Q, V]."""
-        y = self.readout(x / self.config.width_multiplier).astype(jnp.float32)
-        return y.reshape(*y.shape[:-1], self.config.factors, self.config.factor_vocab)
+    def align_hidden(self, hidden: jax.Array) -> jax.Array:
+        """Which recorded chunks [..., T] are hidden -> which frames' conditions are. With `causal`
+        alignment the first frame's is: its own chunk lies in its future."""
+        if self.config.action_alignment == "released":
+            return hidden
+        return jnp.concatenate([jnp.ones_like(hidden[..., :1]), hidden[..., :-1]], axis=-1)
 
 
 def declare_model(config: ModelConfig, table: EmbodimentTable) -> Declared:

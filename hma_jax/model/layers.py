@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.params import Initializer, Role, bias, ones, param, xavier_uniform
+from hma_jax.params import Initializer, Role, bias, ones, param
 
 BLOCK_EPS = 1e-5
-MODULATION_EPS = 1e-6
+FINE_EPS = 1e-6  # modulation, diffusion heads and the norms around the continuous trunk
 
 
 def normalise(x: jax.Array, eps: float) -> jax.Array:
@@ -39,13 +39,12 @@ class Linear(nnx.Module):
     def __init__(
         self,
         sizes: tuple[int, int],
-        axes: tuple[str, str],
+        axes: tuple[str | None, str | None],
         *,
-        gain: float,
+        init: Initializer,
         role: Role,
         with_bias: bool = True,
     ):
-        init = xavier_uniform(*sizes, gain)
         self.kernel = param(sizes, axes, init, role=role)
         self.bias = bias((sizes[1],), (axes[1],)) if with_bias else None
 
@@ -71,9 +70,13 @@ class EmbodimentLinear(nnx.Module):
 
     def __call__(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
-        kernel = jnp.take(self.kernel.get_value(), embodiment_B, axis=0).astype(x.dtype)
         offset = jnp.take(self.bias.get_value(), embodiment_B, axis=0).astype(x.dtype)
-        middle = x.shape[1:-1]
-        rows = x.reshape(x.shape[0], -1, x.shape[-1])
-        y = jnp.einsum("bri,bio->bro", rows, kernel) + offset[:, None]
-        return y.reshape(x.shape[0], *middle, y.shape[-1])
+        return per_example(x, self.kernel, embodiment_B) + offset.reshape(-1, *(1,) * (x.ndim - 2), offset.shape[-1])
+
+
+def per_example(x: jax.Array, kernel: nnx.Param, embodiment_B: jax.Array) -> jax.Array:
+    """x [B, ..., in] times each example's own slice of a kernel [E, in, out] -> [B, ..., out]."""
+    own = jnp.take(kernel.get_value(), embodiment_B, axis=0).astype(x.dtype)
+    rows = x.reshape(x.shape[0], -1, x.shape[-1])
+    y = jnp.einsum("bri,bio->bro", rows, own)
+    return y.reshape(*x.shape[:-1], y.shape[-1])

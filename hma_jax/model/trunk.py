@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.model.actions import Modulation
 from hma_jax.model.attention import Attention
+from hma_jax.model.conditioning import ActionFeature, make_conditioning
+from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm, Linear
 from hma_jax.params import stack
 from hma_jax.sharding import constrain
 
 
 class TemporalCache(NamedTuple):
-    """Temporal keys and values of finished frames, each [N, B, T_past, P, H, I]."""
+    """What later frames need of finished ones; every array is [N, B, T_past, ...]."""
 
-    keys: jax.Array
-    values: jax.Array
+    time: tuple[jax.Array, jax.Array]  # keys and values of temporal attention [N, B, T_past, P, H, I]
+    actions: Any  # keys, values and shown of cross-attention to actions; otherwise None
 
 
 class Block(nnx.Module):
-    """Spatial attention, modulation by the action, causal temporal attention, MLP.
+    """Spatial attention, conditioning on the action, temporal attention, MLP.
 
     The order is the release's (reference section 1.4). There is no norm before temporal
     attention: the released checkpoints were trained so.
@@ -33,35 +34,39 @@ class Block(nnx.Module):
         # With qk_norm the release drops both block norms (reference section 1.4).
         self.norm_space = None if config.qk_norm else LayerNorm(config.width)
         self.space = Attention(config)
-        self.modulation = Modulation(config, embodiments)
+        self.conditioning = make_conditioning(config, embodiments)
         self.time = Attention(config)
         self.norm_mlp = None if config.qk_norm else LayerNorm(config.width)
         sizes = (config.width, config.mlp_width)
-        options = {"gain": config.trunk_gain, "role": "hidden", "with_bias": config.mlp_bias}
+        options = {"init": trunk_init(config, *sizes), "role": "hidden", "with_bias": config.mlp_bias}
         self.mlp_in = Linear(sizes, ("D", "F"), **options)
         self.mlp_out = Linear(sizes[::-1], ("F", "D"), **options)
 
     def __call__(
         self,
         x_BTPD: jax.Array,
-        action_BTD: jax.Array | None,
+        action: ActionFeature | None,
         embodiment_B: jax.Array,
         visible: jax.Array,
-        past: tuple[jax.Array, jax.Array] | None,
-    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        past: TemporalCache | None,
+    ) -> tuple[jax.Array, TemporalCache]:
+        """`past` and what is returned are this layer's part of the cache."""
+        past_time, past_actions = past or (None, None)
+        new_actions = None
         x = x_BTPD
         x = x + self.space.over_space(self.norm_space(x) if self.norm_space else x)
-        if action_BTD is not None:
-            x = x + self.modulation(x, action_BTD, embodiment_B)
-        y, new = self.time.over_time(x, visible, past)
+        if action is not None and self.conditioning is not None:
+            y, new_actions = self.conditioning(x, action, embodiment_B, visible, past_actions)
+            x = x + y
+        y, new_time = self.time.over_time(x, visible, past_time)
         x = x + y
         h = self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x)
         x = x + self.mlp_out(jax.nn.gelu(h, approximate=False))
-        return x, new
+        return x, TemporalCache(new_time, new_actions)
 
 
 class Trunk(nnx.Module):
-    """The part all robots share, but for the modulation slices inside its blocks."""
+    """The part all robots share, but for the conditioning inside its blocks."""
 
     def __init__(self, config: ModelConfig, embodiments: int):
         self.blocks = stack(lambda: Block(config, embodiments), config.layers)
@@ -70,7 +75,7 @@ class Trunk(nnx.Module):
     def __call__(
         self,
         x_BTPD: jax.Array,
-        action_BTD: jax.Array | None,
+        action: ActionFeature | None,
         embodiment_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None = None,
@@ -79,16 +84,16 @@ class Trunk(nnx.Module):
         """Runs all blocks.
 
         `visible` [T, T_past + T] says which frames each frame's temporal attention may see.
-        With `keep` the new frames' keys and values are returned for a cache.
+        With `keep` the new frames' cache is returned.
         """
         block_def, layers = nnx.split(self.blocks)
 
         def body(x, xs):
             layer, layer_past = xs
-            x, new = nnx.merge(block_def, layer)(x, action_BTD, embodiment_B, visible, layer_past)
+            x, new = nnx.merge(block_def, layer)(x, action, embodiment_B, visible, layer_past)
             return constrain(x, ("B", None, None, "D_act")), new if keep else None
 
         if self.remat:
             body = jax.checkpoint(body, prevent_cse=False)
         x, new = jax.lax.scan(body, x_BTPD, (layers, past))
-        return x, TemporalCache(*new) if keep else None
+        return x, new

@@ -1,33 +1,37 @@
-"""AdamW with muP multipliers, in which robots absent from a step stand still.
+"""AdamW with muP multipliers, in which what a step does not concern stands still.
 
-Multipliers, decay mask and embodiment axes are read off the parameter declarations. A robot
-without an example in the global batch keeps its slices, moments and bias-correction count as
-they were; a dense AdamW would go on decaying them (reference, appendix B.1).
+Multipliers, decay mask, embodiment axes and uses are read off the parameter declarations. A
+robot without an example in the global batch keeps its slices, moments and bias-correction
+count as they were, and so does a head without a target; a dense AdamW would go on decaying
+them (reference, appendix B.1).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from hma_jax.config import ModelConfig, OptimizerConfig
-from hma_jax.params import Params, ParamSpec, is_spec
+from hma_jax.params import Params, ParamSpec, Use, is_spec
+
+
+class Presence(NamedTuple):
+    """What a step concerns: per use of a parameter, whether it has any example, and each robot's."""
+
+    shared: dict[Use, jax.Array]  # bool []
+    robots: dict[Use, jax.Array]  # bool [E]
 
 
 class AdamState(NamedTuple):
-    """Moments like the parameters, and how often each was updated.
-
-    Shared parameters are updated every step; a robot's own only when it is present, so each
-    robot has its own count for bias correction.
-    """
+    """Moments like the parameters, and how often each was updated, for bias correction."""
 
     first: Params
     second: Params
-    count: jax.Array  # int32 []
-    count_E: jax.Array  # int32 [E]
+    count: dict[Use, jax.Array]  # int32 []: of parameters that all robots share
+    count_E: dict[Use, jax.Array]  # int32 [E]: of each robot's own
 
 
 def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
@@ -53,15 +57,15 @@ def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
 
 def learning_rate_multiplier(spec: ParamSpec, config: ModelConfig) -> float:
     """muP for Adam: 1 / m for matrices with two width axes, 1 for everything else."""
-    return 1.0 / config.width_multiplier if spec.role == "hidden" else 1.0
+    return 1.0 / config.mup_multiplier("learning_rate") if spec.role == "hidden" else 1.0
 
 
 def init_adam(params: Params, embodiments: int) -> AdamState:
     return AdamState(
         jax.tree.map(jnp.zeros_like, params),
         jax.tree.map(jnp.zeros_like, params),
-        jnp.zeros((), jnp.int32),
-        jnp.zeros((embodiments,), jnp.int32),
+        {use: jnp.zeros((), jnp.int32) for use in get_args(Use)},
+        {use: jnp.zeros((embodiments,), jnp.int32) for use in get_args(Use)},
     )
 
 
@@ -71,7 +75,7 @@ def apply_adamw(
     params: Params,
     specs: Params,
     multipliers: Params,
-    present_E: jax.Array,
+    presence: Presence,
     learning_rate: jax.Array,
     config: OptimizerConfig,
 ) -> tuple[Params, AdamState]:
@@ -81,25 +85,24 @@ def apply_adamw(
     declaration says so. Weight decay is not divided by m: muP scales a hidden matrix's decay
     up as much as its rate down (reference section 4.4).
     """
-    count = state.count + 1
-    count_E = state.count_E + present_E.astype(jnp.int32)
+    count = {use: n + presence.shared[use] for use, n in state.count.items()}
+    count_E = {use: n + presence.robots[use] for use, n in state.count_E.items()}
     b1, b2 = config.beta1, config.beta2
 
     def update(p, g, m, v, spec: ParamSpec, multiplier: float):
-        steps, present = count.astype(jnp.float32), None
-        if spec.embodiment_axis is not None:
+        if spec.embodiment_axis is None:
+            steps, present = count[spec.use], presence.shared[spec.use]
+        else:
             shape = [1] * p.ndim
             shape[spec.embodiment_axis] = -1
-            present = present_E.reshape(shape)
-            # An absent robot's count may be 0; its (unused) correction must stay finite.
-            steps = jnp.maximum(count_E, 1).astype(jnp.float32).reshape(shape)
+            steps, present = (x[spec.use].reshape(shape) for x in (count_E, presence.robots))
+        # The count may be 0 before a first example; its (unused) correction must stay finite.
+        steps = jnp.maximum(steps, 1).astype(jnp.float32)
         new_m = b1 * m + (1 - b1) * g
         new_v = b2 * v + (1 - b2) * jnp.square(g)
         adam = new_m / (1 - b1**steps) / (jnp.sqrt(new_v / (1 - b2**steps)) + config.epsilon)
         decay = config.weight_decay * p if spec.decay else 0.0
         new_p = p - learning_rate * (multiplier * adam + decay)
-        if present is None:
-            return new_p, new_m, new_v
         return tuple(jnp.where(present, new, old) for new, old in ((new_p, p), (new_m, m), (new_v, v)))
 
     leaves, treedef = jax.tree.flatten(params)
@@ -108,6 +111,19 @@ def apply_adamw(
     new = [update(*args) for args in zip(leaves, *others, *declared, strict=True)]
     params, first, second = (jax.tree.unflatten(treedef, column) for column in zip(*new, strict=True))
     return params, AdamState(first, second, count, count_E)
+
+
+def keep_own(grads: Params, specs: Params, trained_E: jax.Array) -> Params:
+    """Gradients of the `trained_E` robots' own parameters; zero for everything else."""
+
+    def keep(g: jax.Array, spec: ParamSpec) -> jax.Array:
+        if spec.embodiment_axis is None:
+            return jnp.zeros_like(g)
+        shape = [1] * g.ndim
+        shape[spec.embodiment_axis] = -1
+        return g * trained_E.reshape(shape)
+
+    return jax.tree.map(keep, grads, specs)
 
 
 def clip_by_global_norm(grads: Params, limit: float) -> tuple[Params, jax.Array]:

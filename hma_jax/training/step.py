@@ -9,21 +9,25 @@ import jax
 import jax.numpy as jnp
 from einops import rearrange
 
-from hma_jax.config import ModelConfig, TrainConfig
+from hma_jax.config import ModelConfig, TrainConfig, require
 from hma_jax.embodiments import EmbodimentTable
-from hma_jax.objectives import LossSums, mask_batch, masked_loss
-from hma_jax.params import Declared, is_spec
+from hma_jax.masking import Masked, mask_batch
+from hma_jax.objectives import LossSums, TargetCounts, count_targets, masked_loss
+from hma_jax.params import Declared, Use, is_spec
 from hma_jax.training.optimizer import (
+    Presence,
     apply_adamw,
     clip_by_global_norm,
     init_adam,
+    keep_own,
     learning_rate_multiplier,
     make_schedule,
 )
 from hma_jax.training.state import TrainState
 
 Batch = dict[str, jax.Array]
-"""tokens int32 [B, T, S], actions float32 [B, T, U] (raw, zero-padded), embodiment int32 [B]."""
+"""tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
+embodiment int32 [B]."""
 
 
 def init_state(
@@ -40,48 +44,63 @@ def make_train_step(
 ) -> Callable[[TrainState, Batch], tuple[TrainState, dict[str, jax.Array]]]:
     """step(state, batch) -> (state, metrics), to be jitted with the state donated.
 
-    The loss is the mean over all masked positions of the global batch, whatever the number of
-    micro-batches. Randomness is fold_in(seed, step), then the example's row.
+    The loss is the mean over all masked tokens of the global batch, plus the weighted mean over
+    its hidden actions, whatever the number of micro-batches. Randomness is fold_in(seed, step),
+    then the example's row.
     """
     schedule = make_schedule(config.optimizer, config.steps)
+    masking = config.masking
+    require(
+        model.action_heads or not masking.predicts_actions,
+        f"train.masking.setting {masking.setting!r} predicts actions, but the model has nothing to predict "
+        "them with; set model.action_heads=true",
+    )
+    require(
+        model.concat or not masking.predicts_actions,
+        f"train.masking.setting {masking.setting!r} predicts actions from action tokens, of which "
+        f"model.conditioning {model.conditioning!r} has none; choose one with concat",
+    )
     multipliers = jax.tree.map(
         lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
     )
+    trained_E = jnp.array([name in (config.only or table.names) for name in table.names])
+    require(
+        not set(config.only) - set(table.names),
+        f"train.only names {', '.join(config.only)}; the embodiments are {', '.join(table.names)}",
+    )
 
-    def sums(params: Any, batch: Batch, key: jax.Array) -> tuple[jax.Array, LossSums]:
-        masked = mask_batch(key, batch["tokens"], batch["row"], model, config.masking)
+    def sums(params: Any, batch: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
+        model = declared.merge(params)
         result = masked_loss(
-            declared.merge(params),
-            masked,
-            batch["tokens"],
-            batch["actions"],
-            batch["embodiment"],
-            config.masking.label_smoothing,
+            model, batch["masked"], batch["tokens"], batch["actions"], batch["embodiment"], masking, batch["key"]
         )
-        return result.loss, result
+        loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
+        return loss, result
 
-    def accumulated(params: Any, batch: Batch, key: jax.Array) -> tuple[Any, LossSums]:
+    def accumulated(params: Any, batch: Batch, counts: TargetCounts) -> tuple[Any, LossSums]:
         gradient = jax.grad(sums, has_aux=True)
         if config.accumulate == 1:
-            return gradient(params, batch, key)
+            return gradient(params, batch, counts)
         # Micro-batch a takes rows a, a + A, ...: every device keeps the rows it has.
         micro = jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=config.accumulate), batch)
         zero = jax.tree.map(jnp.zeros_like, params)
 
         def body(carry: tuple[Any, LossSums], one: Batch) -> tuple[tuple[Any, LossSums], None]:
-            return jax.tree.map(jnp.add, carry, gradient(params, one, key)), None
+            return jax.tree.map(jnp.add, carry, gradient(params, one, counts)), None
 
         (grads, total), _ = jax.lax.scan(body, (zero, LossSums(*[jnp.zeros(())] * 3)), micro)
         return grads, total
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-        batch = batch | {"row": jnp.arange(config.batch)}
-        grads, total = accumulated(state.params, batch, key)
-        count = jnp.maximum(total.count, 1.0)
-        grads = jax.tree.map(lambda g: g / count, grads)
+        masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table)
+        noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
+        keys = jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(config.batch))
+        counts = count_targets(masked)
+        grads, total = accumulated(state.params, batch | {"masked": masked, "key": keys}, counts)
+        if config.only:
+            grads = keep_own(grads, declared.specs, trained_E)
         grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
-        present_E = jnp.zeros(table.size, bool).at[batch["embodiment"]].set(True)
         rate = schedule(state.step)
         params, opt_state = apply_adamw(
             grads,
@@ -89,16 +108,39 @@ def make_train_step(
             state.params,
             declared.specs,
             multipliers,
-            present_E,
+            find_presence(masked, batch["embodiment"], trained_E, everything=not config.only),
             rate,
             config.optimizer,
         )
-        metrics = {
-            "loss": total.loss / count,
-            "accuracy": total.correct / count,
-            "grad_norm": norm,
-            "learning_rate": rate,
-        }
+        metrics = {"loss": total.tokens / counts.tokens}
+        if masking.predicts_frames and not model.diffusion:
+            metrics["accuracy"] = total.correct / counts.tokens
+        if masking.predicts_actions:
+            metrics["action_loss"] = total.actions / counts.actions
+            metrics["loss"] += masking.action_loss_weight * metrics["action_loss"]
+        metrics |= {"grad_norm": norm, "learning_rate": rate}
         return TrainState(state.step + 1, params, opt_state), metrics
 
     return step
+
+
+def find_presence(
+    masked: Masked, embodiment_B: jax.Array, trained_E: jax.Array, everything: bool = True
+) -> Presence:
+    """Which parameters a batch concerns. Only `trained_E` robots' own are moved, and the shared
+    ones not at all unless `everything` is trained."""
+    hidden_BT = masked.hidden_T
+    rows: dict[Use, jax.Array] = {
+        "always": jnp.ones(len(embodiment_B), bool),
+        "actions_shown": (~hidden_BT).any(axis=1),
+        "actions_hidden": hidden_BT.any(axis=1),
+        "actions_predicted": masked.action_targets_T.any(axis=1),
+        "frames_predicted": masked.targets_TS.any(axis=(1, 2)),
+    }
+    return Presence(
+        {use: here.any() & everything for use, here in rows.items()},
+        {
+            use: jnp.zeros(len(trained_E), bool).at[embodiment_B].max(here) & trained_E
+            for use, here in rows.items()
+        },
+    )

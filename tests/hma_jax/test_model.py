@@ -10,13 +10,13 @@ from hma_jax.embodiments import Embodiment, EmbodimentTable
 from hma_jax.evaluation.metrics import factored_cross_entropy
 from hma_jax.flops import forward_flops_per_window
 from hma_jax.model import declare_model
-from hma_jax.model.hma import compose, factorise
+from hma_jax.model.frames import compose, factorise
 from tests.tiny import TABLE, lively_params, model_config, random_batch
 
 
 def logits_of(config, declared, params, batch, actions=True):
-    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], b["actions"] if actions else None,
-                                                   b["embodiment"])[0])
+    given = batch["actions"] if actions else None
+    apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], None, given, b["embodiment"]).frames)
     return np.asarray(apply(params, batch))
 
 
@@ -108,7 +108,7 @@ def test_flops_formula_counts_what_the_program_multiplies():
     table = EmbodimentTable((Embodiment("a", 2, 1, (0.0,) * 2, (1.0,) * 2),))
     declared = declare_model(config, table)
     batch = random_batch(0, config, 1, table)
-    apply = jax.jit(lambda p: declared.merge(p)(batch["tokens"], batch["actions"], batch["embodiment"])[0])
+    apply = jax.jit(lambda p: declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).frames)
     counted = apply.lower(declared.init(0)).compile().cost_analysis()["flops"]
     formula = forward_flops_per_window(config, table)
     # XLA adds element-wise work and full (not causal) temporal scores.
@@ -126,5 +126,6 @@ def test_mup_scales_attention_with_the_head_and_the_readout_with_the_width():
     hma = declared.merge(params)
     assert hma.trunk.blocks.space.scale == 8.0 / 16
     x = jnp.ones((1, 64))
-    plain = x @ params["readout"]["kernel"] / 2 + params["readout"]["bias"]
-    np.testing.assert_allclose(hma.logits(x).reshape(1, -1), plain, rtol=1e-5)
+    linear = params["frame_head"]["linear"]
+    plain = x @ linear["kernel"] / 2 + linear["bias"]
+    np.testing.assert_allclose(hma.frame_head(x).reshape(1, -1), plain, rtol=1e-5)

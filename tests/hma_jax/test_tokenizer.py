@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
-from hma_jax.model.hma import compose, factorise
+from hma_jax.model.frames import compose, factorise
 from hma_jax.params import Declared, ParamSpec, normal
 from hma_jax.tokenizers import quantizer
 from hma_jax.tokenizers.base import PIECE, in_pieces

@@ -1,0 +1,150 @@
+"""Filling one masked frame, step by step: the part of generation that differs between variants.
+
+A frame is a `Frame`: what is known of it and what is still masked. Each step looks at it once,
+proposes values for masked tokens and commits some of them; the rest wait for another look.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.config import DecodeConfig, ModelConfig, require
+from hma_jax.diffusion import make_process, respace, sample_with_key
+from hma_jax.model.frames import compose
+from hma_jax.model.hma import HMA
+
+
+class Frame(NamedTuple):
+    """One frame per example: ids [B, S] or latents [B, S, C], 0 where `masked` [B, S]."""
+
+    values: jax.Array
+    masked: jax.Array
+
+
+def blank_frame(config: ModelConfig, batch: int) -> Frame:
+    """A wholly masked frame."""
+    shape, dtype = (batch, config.tokens), jnp.int32
+    if config.diffusion:
+        shape, dtype = (*shape, config.diffusion.token_channels), jnp.float32
+    return Frame(jnp.zeros(shape, dtype), jnp.ones((batch, config.tokens), bool))
+
+
+def masked_counts(config: ModelConfig, steps: int) -> list[int]:
+    """Tokens still masked after each step: cos(pi/2 (k+1)/M) S, and none after the last.
+
+    As released the discrete variant rounds up; the continuous one down, but to at least one and
+    at most S - 1 (reference sections 3.2 and 3.3).
+    """
+    size = config.tokens
+    exact = [math.cos(math.pi / 2 * (k + 1) / steps) * size for k in range(steps - 1)]
+    if config.diffusion:
+        return [min(max(math.floor(x), 1), size - 1) for x in exact] + [0]
+    return [math.ceil(x) for x in exact] + [0]
+
+
+def sample_tokens(
+    logits_BSQV: jax.Array, key_B: jax.Array, temperature: float, top_k: int = 0
+) -> tuple[jax.Array, jax.Array]:
+    """(ids [B, S], confidence [B, S]): factors are drawn independently, confidence is the
+    product of the chosen probabilities."""
+    if temperature == 0:
+        ids = jnp.argmax(logits_BSQV, axis=-1)
+    else:
+        scaled = logits_BSQV / temperature
+        if top_k:
+            least = jax.lax.top_k(scaled, top_k)[0][..., -1:]
+            scaled = jnp.where(scaled < least, -jnp.inf, scaled)
+        ids = jax.vmap(jax.random.categorical)(key_B, scaled)
+    probabilities = jax.nn.softmax(logits_BSQV, axis=-1)
+    chosen = jnp.take_along_axis(probabilities, ids[..., None], axis=-1)[..., 0]
+    return compose(ids, logits_BSQV.shape[-1]).astype(jnp.int32), jnp.prod(chosen, axis=-1)
+
+
+def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, keep: int) -> Frame:
+    """Fills masked positions of a discrete frame but for the `keep` with the lowest score.
+
+    Known positions are never drawn again.
+    """
+    filled = jnp.where(frame.masked, sampled_BS, frame.values)
+    still = frame.masked & (_ranks(jnp.where(frame.masked, score_BS, jnp.inf)) < keep)
+    return Frame(jnp.where(still, 0, filled), still)
+
+
+def choose_patches(order_BS: jax.Array, before: int, keep: int) -> jax.Array:
+    """Token numbers [B, n] that a step samples: those that leave the mask when the first `before`
+    of an order become the first `keep`, in ascending order."""
+    return jnp.sort(order_BS[:, keep:before], axis=-1)
+
+
+def _ranks(score_BS: jax.Array) -> jax.Array:
+    return jnp.argsort(jnp.argsort(score_BS, axis=-1), axis=-1)
+
+
+Look = Callable[[Frame], jax.Array]
+"""What the model says of a frame: logits [B, S, Q, V] or conditions [B, S, D]."""
+
+
+def decode_frame(model: HMA, first: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+    """Values of a frame that starts wholly masked; `first` is what `look` says of that one."""
+    if model.config.diffusion:
+        return _decode_latents(model, first, look, key_B, decode)
+    return _decode_tokens(model, first, look, key_B, decode)
+
+
+def _decode_tokens(model: HMA, logits: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+    batch, size = logits.shape[:2]
+    frame = blank_frame(model.config, batch)
+    for step, keep in enumerate(masked_counts(model.config, decode.unmask_steps)):
+        keys = jax.vmap(lambda k, s=step: jax.random.split(jax.random.fold_in(k, s)))(key_B)
+        sampled, score = sample_tokens(logits, keys[:, 0], decode.temperature, decode.top_k)
+        if decode.order == "random":
+            score = jax.vmap(lambda k: jax.random.uniform(k, (size,)))(keys[:, 1])
+        frame = unmask(frame, sampled, score, keep)
+        if keep:
+            logits = look(frame)
+    return frame.values
+
+
+def _decode_latents(model: HMA, z: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+    """Patches in a random order fixed at the start, each predicted once.
+
+    DIFFERS: the release never marks what it has predicted and samples it again in every step,
+    all of it in the last (reference section 3.3); `resample` does so too.
+    """
+    require(decode.order == "random", "decode.order 'confidence' needs probabilities: continuous tokens have none")
+    batch, size = z.shape[:2]
+    frame = blank_frame(model.config, batch)
+    order = jax.vmap(lambda k: jax.random.permutation(jax.random.fold_in(k, decode.unmask_steps), size))(key_B)
+    before = size
+    for step, keep in enumerate(masked_counts(model.config, decode.unmask_steps)):
+        chosen = choose_patches(order, size if decode.resample else before, keep)
+        keys = jax.vmap(lambda k, s=step: jax.random.fold_in(k, s))(key_B)
+        # The denoiser, not the trunk, costs most: it sees only the patches it is asked for.
+        new = denoise(model, jnp.take_along_axis(z, chosen[..., None], axis=1), keys, decode)
+        frame = commit(frame, chosen, new)
+        before = keep
+        if keep:
+            z = look(frame)
+    return frame.values
+
+
+def denoise(model: HMA, z: jax.Array, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+    """Latents [B, n, C] under conditions z [B, n, D]."""
+    config = model.config.diffusion
+    process = respace(make_process(config.steps), decode.sampler.steps)
+    shape = (*z.shape[:-1], config.token_channels)
+    network = lambda x, t: model.denoiser(x, t, z)  # noqa: E731
+    return sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)
+
+
+def commit(frame: Frame, chosen_Bn: jax.Array, values_BnC: jax.Array) -> Frame:
+    """`values` written into the chosen tokens, which are known from now on."""
+    row = jnp.arange(len(chosen_Bn))[:, None]
+    return Frame(
+        frame.values.at[row, chosen_Bn].set(values_BnC), frame.masked.at[row, chosen_Bn].set(False)
+    )

@@ -1,0 +1,293 @@
+"""The mathematics of diffusion over continuous vectors: process, training terms, sampling.
+
+A cosine noising process with epsilon prediction and learned-range variance (reference sections
+2.4 and 2.5). The denoising network is an argument everywhere: network(x_t [..., C], t [...]) ->
+[..., 2 C], the predicted noise and then the variance, where t is int32 and counts steps of the
+original process also when a respaced one is run. Which tokens are noised, at which t, and how
+their losses are weighted is the caller's business, and so are the parameters.
+
+Tables are float64 numpy, computation is float32.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import SamplerConfig, require
+
+Network = Callable[[jax.Array, jax.Array], jax.Array]
+
+
+# --- The process -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)  # compared and hashed by identity: a static argument
+class Process:
+    """Tables of one noising process, one entry per step; index 0 is the cleanest.
+
+    x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) eps. The posterior q(x_{t-1} | x_t, x0) has mean
+    posterior_x0 * x0 + posterior_xt * x_t.
+    """
+
+    betas: np.ndarray
+    log_betas: np.ndarray
+    alphas_cumprod: np.ndarray  # abar
+    alphas_cumprod_prev: np.ndarray  # abar one step cleaner; 1 at index 0
+    clean_from_xt: np.ndarray  # x0 = clean_from_xt * x_t - clean_from_eps * eps
+    clean_from_eps: np.ndarray
+    posterior_x0: np.ndarray
+    posterior_xt: np.ndarray
+    posterior_log_variance_clipped: np.ndarray  # the variance at index 0 is 0: index 1 stands in
+    timestep_map: np.ndarray  # int: the step of the original process
+
+    @property
+    def steps(self) -> int:
+        return len(self.betas)
+
+
+def _from_betas(betas: np.ndarray, timestep_map: np.ndarray) -> Process:
+    abar = np.cumprod(1.0 - betas)
+    abar_prev = np.append(1.0, abar[:-1])
+    variance = betas * (1.0 - abar_prev) / (1.0 - abar)
+    return Process(
+        betas=betas,
+        log_betas=np.log(betas),
+        alphas_cumprod=abar,
+        alphas_cumprod_prev=abar_prev,
+        clean_from_xt=np.sqrt(1.0 / abar),
+        clean_from_eps=np.sqrt(1.0 / abar - 1.0),
+        posterior_x0=betas * np.sqrt(abar_prev) / (1.0 - abar),
+        posterior_xt=(1.0 - abar_prev) * np.sqrt(1.0 - betas) / (1.0 - abar),
+        posterior_log_variance_clipped=np.log(np.append(variance[1], variance[1:])),
+        timestep_map=timestep_map,
+    )
+
+
+@functools.cache
+def make_process(steps: int) -> Process:
+    """The cosine process: abar(u) = cos^2(pi/2 (u + 0.008) / 1.008), betas at most 0.999."""
+    require(steps >= 2, f"a noising process needs at least 2 steps, got {steps}")
+
+    def abar(u: float) -> float:
+        return math.cos((u + 0.008) / 1.008 * math.pi / 2) ** 2
+
+    betas = [min(1 - abar((i + 1) / steps) / abar(i / steps), 0.999) for i in range(steps)]
+    return _from_betas(np.array(betas), np.arange(steps))
+
+
+@functools.cache
+def respace(process: Process, count: int) -> Process:
+    """The process that visits `count` steps of `process`, evenly spaced from first to last.
+
+    Positions are summed up in floating point and then rounded, as released, so that ties fall
+    the same way.
+    """
+    require(
+        2 <= count <= process.steps,
+        f"cannot visit {count} steps of a noising process of {process.steps}; "
+        f"set sampler.steps between 2 and {process.steps}",
+    )
+    stride = (process.steps - 1) / (count - 1)
+    position, chosen = 0.0, []
+    for _ in range(count):
+        chosen.append(round(position))
+        position += stride
+    abar = process.alphas_cumprod[chosen]
+    return _from_betas(1.0 - abar / np.append(1.0, abar[:-1]), process.timestep_map[chosen])
+
+
+def _at(table: np.ndarray, t: jax.Array) -> jax.Array:
+    """table[t] in float32 with an axis for the channels: t [...] -> [..., 1]."""
+    return jnp.asarray(table, jnp.float32)[t][..., None]
+
+
+def timestep_embedding(t: jax.Array, size: int = 256) -> jax.Array:
+    """[cos | sin] of t times size/2 frequencies from 1 down to nearly 1/10000: t [...] -> [..., size].
+
+    t is the raw step of the original process.
+    """
+    half = size // 2
+    frequencies = np.exp(-math.log(10_000) * np.arange(half) / half)
+    angles = t[..., None].astype(jnp.float32) * jnp.asarray(frequencies, jnp.float32)
+    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
+
+
+# --- What the network says -------------------------------------------------------------------
+
+
+class Prediction(NamedTuple):
+    eps: jax.Array  # [..., C]
+    log_variance: jax.Array  # [..., C], of x_{t-1} given x_t
+
+
+def _predict(network: Network, x_t: jax.Array, t: jax.Array, process: Process) -> Prediction:
+    """Runs the network; its second half, nominally in [-1, 1], places the log-variance between
+    the posterior's and log beta (appendix B, item 8)."""
+    out = network(x_t, jnp.asarray(process.timestep_map, jnp.int32)[t]).astype(jnp.float32)
+    eps, variance = jnp.split(out, 2, axis=-1)
+    fraction = (variance + 1) / 2
+    low, high = _at(process.posterior_log_variance_clipped, t), _at(process.log_betas, t)
+    return Prediction(eps, fraction * high + (1 - fraction) * low)
+
+
+# --- Training --------------------------------------------------------------------------------
+
+
+def diffusion_loss(
+    network: Network,
+    x0: jax.Array,
+    t: jax.Array,
+    noise: jax.Array,
+    process: Process,
+    valid: jax.Array | None = None,
+) -> tuple[jax.Array, jax.Array]:
+    """The two loss terms of every row: (mse [...], vb [...]), each a mean over channels.
+
+    mse is the squared error of the predicted noise. vb, in bits, is the row's term of the
+    variational bound; only the variance learns from it. x0 and noise [..., C], t int [...]
+    counts steps of `process`. `valid` (bool [..., C]) leaves padded channels out of the means;
+    every row needs at least one channel.
+    """
+    x0, noise = jnp.asarray(x0, jnp.float32), jnp.asarray(noise, jnp.float32)
+    keep, spread = np.sqrt(process.alphas_cumprod), np.sqrt(1.0 - process.alphas_cumprod)
+    predicted = _predict(network, _at(keep, t) * x0 + _at(spread, t) * noise, t, process)
+    mse = (noise - predicted.eps) ** 2
+
+    # True minus predicted posterior mean. x_t cancels, and written like this no rounding remains.
+    to_mean = process.posterior_x0 * process.clean_from_eps
+    gap = _at(to_mean, t) * (jax.lax.stop_gradient(predicted.eps) - noise)
+    kl = _gaussian_kl(gap, _at(process.posterior_log_variance_clipped, t), predicted.log_variance)
+    # At t = 0 the posterior's mean is x0 itself, and the bound holds the likelihood of x0.
+    nll = -_binned_log_likelihood(x0, gap, predicted.log_variance)
+    vb = jnp.where(t[..., None] == 0, nll, kl) / math.log(2)
+    return jnp.mean(mse, axis=-1, where=valid), jnp.mean(vb, axis=-1, where=valid)
+
+
+def _gaussian_kl(gap: jax.Array, log_variance: jax.Array, model_log_variance: jax.Array) -> jax.Array:
+    """KL, in nats, of a Gaussian from the model's, whose mean lies `gap` away."""
+    ratio = log_variance - model_log_variance
+    return 0.5 * (jnp.exp(ratio) - 1.0 - ratio + gap**2 * jnp.exp(-model_log_variance))
+
+
+def _binned_log_likelihood(x: jax.Array, gap: jax.Array, log_variance: jax.Array) -> jax.Array:
+    """Log-probability, in nats, of the bin x +- 1/255 under a Gaussian with mean x - gap.
+
+    As released: bins for 8-bit images, so that beyond +-0.999 they are open-ended although
+    latents go further; tanh approximates the error function.
+    """
+
+    def cdf(z: jax.Array) -> jax.Array:
+        return 0.5 * (1.0 + jnp.tanh(math.sqrt(2 / math.pi) * (z + 0.044715 * z**3)))
+
+    sharpness = jnp.exp(-0.5 * log_variance)
+    upper, lower = cdf((gap + 1 / 255) * sharpness), cdf((gap - 1 / 255) * sharpness)
+    upper = jnp.where(x > 0.999, 1.0, upper)
+    lower = jnp.where(x < -0.999, 0.0, lower)
+    return jnp.log(jnp.maximum(upper - lower, 1e-12))
+
+
+# --- Sampling --------------------------------------------------------------------------------
+
+
+class Trajectory(NamedTuple):
+    """Every step of a sampling run, noisiest first."""
+
+    x: jax.Array  # [steps, ..., C], after the step
+    x0: jax.Array  # [steps, ..., C], the clean vectors predicted in the step
+
+
+def sample(
+    network: Network,
+    noise_init: jax.Array,
+    noise_steps: jax.Array | None,
+    process: Process,
+    sampler: SamplerConfig,
+    clip: float,
+    trajectory: bool = False,
+) -> jax.Array | tuple[jax.Array, Trajectory]:
+    """Clean vectors [..., C] from recorded noise; with `trajectory` also every step.
+
+    noise_init [..., C]; noise_steps [steps, ..., C], first the noisiest step's (the last step
+    adds none), or None where `sampler.noisy_steps` is false. Predicted clean vectors are kept in
+    +-clip.
+    """
+    shape = (sampler.steps, *noise_init.shape)
+    require(
+        not sampler.noisy_steps or (noise_steps is not None and noise_steps.shape == shape),
+        f"{sampler.kind} at temperature {sampler.temperature} needs noise of shape {shape}, "
+        f"got {None if noise_steps is None else noise_steps.shape}",
+    )
+    recorded = jnp.asarray(noise_steps if sampler.noisy_steps else [], jnp.float32)
+    noise_at = lambda index: recorded[-1 - index]  # noqa: E731
+    return _run(network, noise_init, noise_at, process, sampler, clip, trajectory)
+
+
+def sample_with_key(
+    network: Network,
+    key: jax.Array,
+    shape: tuple[int, ...],
+    process: Process,
+    sampler: SamplerConfig,
+    clip: float,
+) -> jax.Array:
+    """Clean vectors of `shape` [..., C], the noise of a step drawn when the step is run.
+
+    `key` is one key, or an array of keys along the first axes of `shape`, so that what is drawn
+    for one example does not depend on its neighbours.
+    """
+    require(
+        key.shape == shape[: key.ndim],
+        f"keys of shape {key.shape} do not lie along the first axes of samples of shape {shape}",
+    )
+
+    def draw(index: jax.Array | int) -> jax.Array:
+        one = lambda k: jax.random.normal(jax.random.fold_in(k, index), shape[key.ndim :])  # noqa: E731
+        for _ in range(key.ndim):
+            one = jax.vmap(one)
+        return one(key)
+
+    return _run(network, draw(process.steps), draw, process, sampler, clip)
+
+
+def _run(
+    network: Network,
+    noise_init: jax.Array,
+    noise_at: Callable[[jax.Array], jax.Array],
+    process: Process,
+    sampler: SamplerConfig,
+    clip: float,
+    trajectory: bool = False,
+) -> jax.Array | tuple[jax.Array, Trajectory]:
+    """From the last index of the process down to 0; noise_at(index) -> [..., C]."""
+    require(
+        process.steps == sampler.steps,
+        f"sampler.steps is {sampler.steps} but the process has {process.steps}; use respace(process, steps)",
+    )
+
+    def step(x: jax.Array, index: jax.Array) -> tuple[jax.Array, Trajectory | None]:
+        t = jnp.full(x.shape[:-1], index)
+        predicted = _predict(network, x, t, process)
+        from_xt, from_eps = _at(process.clean_from_xt, index), _at(process.clean_from_eps, index)
+        x0 = jnp.clip(from_xt * x - from_eps * predicted.eps, -clip, clip)
+        if sampler.kind == "ddim":
+            eps = (from_xt * x - x0) / from_eps  # what the clipped x0 leaves
+            cleaner = process.alphas_cumprod_prev
+            x = _at(np.sqrt(cleaner), index) * x0 + _at(np.sqrt(1.0 - cleaner), index) * eps
+        else:
+            x = _at(process.posterior_x0, index) * x0 + _at(process.posterior_xt, index) * x
+            if sampler.noisy_steps:
+                scale = jnp.where(index > 0, sampler.temperature, 0.0)
+                x += scale * jnp.exp(0.5 * predicted.log_variance) * noise_at(index)
+        return x, Trajectory(x, x0) if trajectory else None
+
+    x = jnp.asarray(noise_init, jnp.float32) * (sampler.temperature if sampler.scale_initial_noise else 1.0)
+    x, visited = jax.lax.scan(step, x, jnp.arange(process.steps - 1, -1, -1))
+    return (x, visited) if trajectory else x

@@ -1,0 +1,177 @@
+"""What is hidden from the model in training: one mechanism for both variants and every setting.
+
+Random numbers (`draw`) are kept apart from what is done with them, so that masking can be
+checked against recorded numbers. The settings of the paper's section 3.1 differ only in which
+frames' tokens are masked and which actions are hidden:
+
+    setting   tokens          actions hidden            predicted
+    forward   masked          none                      tokens
+    passive   masked          all                       tokens
+    full      masked          some, by a random rate    tokens and hidden actions
+    policy    none            from a random frame on    hidden actions
+    inverse   none            all                       hidden actions; attention is not causal
+
+A robot without recorded actions has all of them hidden and none predicted; one whose video is
+no target has no token masked. Each trains what it can.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.config import MaskingConfig, ModelConfig
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.frames import compose, factorise
+
+
+class MaskingDraws(NamedTuple):
+    """The random numbers of one discrete example; u_* are uniform in [0, 1)."""
+
+    u_corrupt: jax.Array  # []
+    u_replace_TSQ: jax.Array
+    noise_TSQ: jax.Array  # int32 in [0, V)
+    first_masked: jax.Array  # int32 []: 1, or later when the prompt stays clean
+    u_clean: jax.Array  # []
+    u_decay_T: jax.Array
+    u_degrade_TSQ: jax.Array
+    u_rate_T: jax.Array
+    u_mask_TS: jax.Array
+
+
+class LatentDraws(NamedTuple):
+    """The random numbers of one continuous example. The last axis of `u_mask` is the mask unit's:
+    one for whole patches, else the cells of a patch."""
+
+    first_masked: jax.Array
+    u_rate_T: jax.Array
+    u_mask_TSc: jax.Array
+
+
+class Masked(NamedTuple):
+    """Windows [T, ...] as the model sees them in training, or a batch of them."""
+
+    inputs: jax.Array  # ids, corrupted, or latents
+    masked: jax.Array  # bool [T, S] or [T, S, cells]: not shown
+    targets_TS: jax.Array  # bool: tokens that the loss counts
+    hidden_T: jax.Array  # bool: recorded chunks that are not shown
+    action_targets_T: jax.Array  # bool: recorded chunks that the loss counts
+
+
+def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> MaskingDraws | LatentDraws:
+    """One example's random numbers.
+
+    DIFFERS: the release draws the corruption rate and the masking mode once per batch (its
+    batches hold one dataset); here each example draws its own.
+    """
+    t, s, q = config.frames, config.tokens, config.factors
+    if config.diffusion:
+        unit = config.diffusion.cells if masking.mask_unit == "cell" else 1
+        shapes = LatentDraws((2,), (t,), (t, s, unit))
+    else:
+        shapes = MaskingDraws((), (t, s, q), (t, s, q), (2,), (), (t,), (t, s, q), (t,), (t, s))
+    # One call for all numbers: random generators are slow to compile.
+    sizes = [math.prod(shape) for shape in shapes]
+    flat = jax.random.uniform(key, (sum(sizes),))
+    pieces = jnp.split(flat, list(itertools.accumulate(sizes))[:-1])
+    u = type(shapes)(*[piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)])
+
+    earliest = min(masking.prompt_frames, t - 1)
+    late = earliest + jnp.floor(u.first_masked[0] * (t - earliest)).astype(jnp.int32)
+    u = u._replace(first_masked=jnp.where(u.first_masked[1] < masking.non_mlm_ratio, late, 1))
+    if config.diffusion:
+        return u
+    return u._replace(noise_TSQ=jnp.floor(u.noise_TSQ * config.factor_vocab).astype(jnp.int32))
+
+
+def corrupt(
+    tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig
+) -> jax.Array:
+    """Random-token corruption, and degradation of late frames in prompt mode (reference 1.9).
+
+    In prompt mode (first_masked > 1) frames from there on are degraded, later ones more.
+    """
+    ids = factorise(tokens_TS, config.factors, config.factor_vocab)
+    replace = draws.u_replace_TSQ < masking.max_corrupt_rate * draws.u_corrupt
+    start_rate = masking.clean_rate_min + (1 - masking.clean_rate_min) * draws.u_clean
+    late_T = jnp.arange(tokens_TS.shape[0]) >= draws.first_masked
+    clean_T = start_rate * jnp.cumprod(jnp.where(late_T, 0.9 + 0.1 * draws.u_decay_T, 1.0))
+    degrade_T = late_T & (draws.first_masked > 1)
+    replace |= degrade_T[:, None, None] & (draws.u_degrade_TSQ > clean_T[:, None, None])
+    return compose(jnp.where(replace, draws.noise_TSQ, ids), config.factor_vocab)
+
+
+def mask_tokens(
+    u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array, masking: MaskingConfig
+) -> jax.Array:
+    """bool like `u_mask` [T, ...]: a frame's rate is cos(pi/2 u), its mean 2 / pi for u over [0, 1).
+
+    Frames before `first_masked`, at least frame 0, are never masked (reference 1.9 and 2.3).
+    """
+    angle = masking.mask_angle_min + (1 - masking.mask_angle_min) * u_rate_T
+    late_T = jnp.arange(len(u_rate_T)) >= first_masked
+    shape = (-1, *(1,) * (u_mask.ndim - 1))
+    return late_T.reshape(shape) & (u_mask < jnp.cos(jnp.pi / 2 * angle).reshape(shape))
+
+
+def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Array:
+    """bool [T]: the recorded chunks that one example does not show."""
+    if masking.setting in ("passive", "inverse"):
+        return jnp.ones(frames, bool)
+    if masking.setting == "full":  # as the release: a rate per example, then every step by itself
+        u = jax.random.uniform(key, (frames + 1,))
+        return u[1:] < u[0]
+    if masking.setting == "policy":
+        return jnp.arange(frames) >= jax.random.randint(key, (), 0, frames)
+    return jnp.zeros(frames, bool)
+
+
+def mask_example(
+    key: jax.Array,
+    tokens: jax.Array,
+    config: ModelConfig,
+    masking: MaskingConfig,
+    has_actions: jax.Array,
+    has_video: jax.Array,
+) -> Masked:
+    """One window, [T, S] ids or [T, S, C] latents, under `masking.setting`."""
+    frames = tokens.shape[0]
+    hidden = hide_actions(jax.random.fold_in(key, 1), frames, masking) | ~has_actions
+    inputs = tokens
+    if masking.predicts_frames:
+        draws = draw(key, config, masking)
+        u_mask = draws.u_mask_TSc if config.diffusion else draws.u_mask_TS
+        masked = mask_tokens(draws.u_rate_T, u_mask, draws.first_masked, masking) & has_video
+        if config.diffusion:
+            targets = masked.any(axis=-1)
+            masked = masked if masking.mask_unit == "cell" else targets
+        else:
+            inputs, targets = corrupt(tokens, draws, config, masking), masked
+    else:
+        masked = targets = jnp.zeros((frames, config.tokens), bool)
+    action_targets = hidden & has_actions & masking.predicts_actions
+    return Masked(inputs, masked, targets, hidden, action_targets)
+
+
+def mask_batch(
+    key: jax.Array,
+    tokens: jax.Array,
+    embodiment_B: jax.Array,
+    config: ModelConfig,
+    masking: MaskingConfig,
+    table: EmbodimentTable,
+) -> Masked:
+    """Masks every example with its own key, fold_in(key, row): the layout of the batch over
+    devices, processes and micro-batches does not change an example's masks."""
+    has_actions = jnp.asarray(table.chunks > 0)[embodiment_B]
+    has_video = jnp.array([e.video_targets for e in table.entries])[embodiment_B]
+
+    def one(row: jax.Array, *example: jax.Array) -> Masked:
+        window, actions, video = example
+        return mask_example(jax.random.fold_in(key, row), window, config, masking, actions, video)
+
+    return jax.vmap(one)(jnp.arange(len(tokens)), tokens, has_actions, has_video)

@@ -1,0 +1,126 @@
+"""How actions act inside every block, between spatial and temporal attention.
+
+Reference section 1.6. A hidden action acts on no path: where `shown` is False nothing is added.
+DIFFERS: the release masks action tokens only and goes on modulating by what it masked.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from hma_jax.config import ModelConfig
+from hma_jax.model.attention import attention_scale, masked_softmax
+from hma_jax.model.initial import trunk_init
+from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, normalise, per_example
+from hma_jax.params import bias, ones, param, used
+
+
+class ActionFeature(NamedTuple):
+    """What a block sees of the actions of its frames."""
+
+    feature_BTD: jax.Array
+    shown_BT: jax.Array | None  # bool; None: all of them
+
+
+def make_conditioning(config: ModelConfig, embodiments: int) -> nnx.Module | None:
+    """The module of one block; None where actions enter as tokens only."""
+    if "modulate" in config.conditioning:
+        return used("actions_shown", Modulation(config, embodiments))
+    if config.conditioning == "cross_attention":
+        return used("actions_shown", CrossAttention(config, embodiments))
+    return Addition() if config.conditioning == "add" else None
+
+
+class Modulation(nnx.Module):
+    """W_o[LN(x) (1 + scale) + shift] with (shift, scale) from the action feature."""
+
+    def __init__(self, config: ModelConfig, embodiments: int):
+        width = config.width
+        init, wide = trunk_init(config, width, width), trunk_init(config, width, 2 * width)
+        square, double = (width, width), (width, 2 * width)
+        axes = ("D", "D_out")
+        self.hidden = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")
+        self.shift_scale = EmbodimentLinear(embodiments, double, axes, init=wide, role="hidden")
+        self.out = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")
+
+    def __call__(
+        self, x_BTPD: jax.Array, action: ActionFeature, embodiment_B: jax.Array, visible: jax.Array, past: None
+    ) -> tuple[jax.Array, None]:
+        del visible, past
+        both = self.shift_scale(jax.nn.silu(self.hidden(action.feature_BTD, embodiment_B)), embodiment_B)
+        shift, scale = jnp.split(both[:, :, None], 2, axis=-1)
+        y = self.out(normalise(x_BTPD, FINE_EPS) * (1 + scale) + shift, embodiment_B)
+        return _where_shown(action, y), None
+
+
+class Addition(nnx.Module):
+    """The feature itself, on every token of its frame; no parameters."""
+
+    def __call__(
+        self, x_BTPD: jax.Array, action: ActionFeature, embodiment_B: jax.Array, visible: jax.Array, past: None
+    ) -> tuple[jax.Array, None]:
+        del embodiment_B, visible, past
+        return _where_shown(action, jnp.broadcast_to(action.feature_BTD[:, :, None], x_BTPD.shape)), None
+
+
+class CrossAttention(nnx.Module):
+    """Every token attends to the actions of its own and earlier frames, with normalised q and k.
+
+    DIFFERS: the release's heads attend to each other at one position and its results are
+    scrambled over time (reference section 9.1), so a checkpoint of it converts but does not
+    compute what it was trained to. A frame to which no action is shown gets nothing.
+    """
+
+    def __init__(self, config: ModelConfig, embodiments: int):
+        width, heads, head = config.width, config.heads, config.head_width
+        init = trunk_init(config, width, width)
+
+        def project() -> nnx.Param:
+            return param((embodiments, width, width), ("E", "D", "D_out"), init, role="hidden")
+
+        self.q, self.k, self.v = project(), project(), project()
+        self.out = EmbodimentLinear(embodiments, (width, width), ("D_out", "D"), init=init, role="hidden")
+        self.gain = param((embodiments, head), ("E", None), ones, role="vector")
+        self.bias = bias((embodiments, head), ("E", None))
+        self.heads, self.scale = heads, attention_scale(config)
+
+    def __call__(
+        self,
+        x_BTPD: jax.Array,
+        action: ActionFeature,
+        embodiment_B: jax.Array,
+        visible: jax.Array,
+        past: tuple[jax.Array, jax.Array, jax.Array] | None,
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
+        """`visible` [T, T_past + T] as for temporal attention; `past` are keys, values and shown."""
+        a = action.feature_BTD
+        shown = jnp.ones(a.shape[:2], bool) if action.shown_BT is None else action.shown_BT
+        q = self._heads(per_example(x_BTPD, self.q, embodiment_B), embodiment_B) * self.scale
+        k = self._heads(per_example(a, self.k, embodiment_B), embodiment_B)
+        v = per_example(a, self.v, embodiment_B).reshape(k.shape)
+        new = (k, v, shown)
+        if past is not None:
+            k, v, shown = (jnp.concatenate([old, own], axis=1) for old, own in zip(past, new, strict=True))
+        allowed_BTs = visible & shown[:, None]
+        logits = jnp.einsum("btphi,bshi->bphts", q, k)
+        weights = masked_softmax(logits, allowed_BTs[:, None, None])
+        y = jnp.einsum("bphts,bshi->btphi", weights, v).reshape(x_BTPD.shape)
+        some = jnp.any(allowed_BTs, axis=-1)
+        return jnp.where(some[:, :, None, None], self.out(y, embodiment_B), 0), new
+
+    def _heads(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """[B, ..., D] -> normalised [B, ..., H, I]."""
+        x = normalise(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
+        gain, offset = (
+            jnp.take(v.get_value(), embodiment_B, 0).astype(x.dtype).reshape(-1, *(1,) * (x.ndim - 2), x.shape[-1])
+            for v in (self.gain, self.bias)
+        )
+        return x * gain + offset
+
+
+def _where_shown(action: ActionFeature, y: jax.Array) -> jax.Array:
+    return y if action.shown_BT is None else jnp.where(action.shown_BT[:, :, None, None], y, 0)

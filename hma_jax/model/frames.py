@@ -1,0 +1,126 @@
+"""How frames enter the trunk and leave it, for both variants.
+
+Discrete: ids with one table per vocabulary factor in, logits out. Continuous: latent patches
+in, out the vectors that condition the diffusion head (`diffusion_head`). Masked tokens enter
+as one learned vector in both.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from hma_jax.config import DiffusionConfig, ModelConfig
+from hma_jax.model.initial import readout_init, trunk_init
+from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
+from hma_jax.params import normal, param, used, xavier_uniform, zeros
+
+
+def factorise(tokens: jax.Array, factors: int, vocab: int) -> jax.Array:
+    """ids [...] -> factor ids [..., Q]; factor 0 holds the low digits (reference section 1.2)."""
+    return jnp.stack([(tokens // vocab**q) % vocab for q in range(factors)], axis=-1)
+
+
+def compose(factor_ids: jax.Array, vocab: int) -> jax.Array:
+    """Factor ids [..., Q] -> ids [...]."""
+    powers = vocab ** jnp.arange(factor_ids.shape[-1], dtype=factor_ids.dtype)
+    return jnp.sum(factor_ids * powers, axis=-1)
+
+
+def patchify(latents: jax.Array, patch: int) -> jax.Array:
+    """Latent cells [..., h, w, c] -> tokens [..., S, patch^2 c], row by row (reference 2.1)."""
+    *batch, h, w, c = latents.shape
+    x = latents.reshape(*batch, h // patch, patch, w // patch, patch, c)
+    return jnp.moveaxis(x, -4, -3).reshape(*batch, (h // patch) * (w // patch), patch * patch * c)
+
+
+def unpatchify(tokens: jax.Array, patch: int, columns: int) -> jax.Array:
+    """The inverse of `patchify` for a grid of `columns` tokens per row."""
+    *batch, s, c = tokens.shape
+    x = tokens.reshape(*batch, s // columns, columns, patch, patch, c // patch**2)
+    x = jnp.moveaxis(x, -3, -4)
+    return x.reshape(*batch, s // columns * patch, columns * patch, c // patch**2)
+
+
+def mask_cells(
+    tokens: jax.Array, masked: jax.Array, vector: jax.Array, config: DiffusionConfig
+) -> jax.Array:
+    """Tokens [..., S, C] with the learned `vector` [channels] in place of masked cells.
+
+    `masked` is bool [..., S] for whole tokens or [..., S, cells].
+    """
+    if masked.ndim == tokens.ndim - 1:
+        return jnp.where(masked[..., None], jnp.tile(vector, config.cells), tokens)
+    cells = tokens.reshape(*tokens.shape[:-1], config.cells, config.channels)
+    return jnp.where(masked[..., None], vector, cells).reshape(tokens.shape)
+
+
+class TokenEmbed(nnx.Module):
+    """Sum of one table per factor; masked positions get one learned vector instead."""
+
+    def __init__(self, config: ModelConfig):
+        q, v, d = config.factors, config.factor_vocab, config.width
+        self.tables = param((q, v, d), ("Q", "V", "D"), normal(1.0), role="vector")
+        self.mask = param((d,), ("D",), zeros, role="vector")
+
+    def __call__(self, ids: jax.Array, masked: jax.Array | None, dtype: jnp.dtype) -> jax.Array:
+        """ids [...] and bool [...] -> [..., D]."""
+        q, v, _ = self.tables.shape
+        digits = factorise(ids, q, v)
+        x = sum(jnp.take(self.tables[i].astype(dtype), digits[..., i], axis=0) for i in range(q))
+        return x if masked is None else jnp.where(masked[..., None], self.mask.astype(dtype), x)
+
+
+class LatentEmbed(nnx.Module):
+    """A linear map of a patch's values; masked cells hold one learned vector instead."""
+
+    def __init__(self, config: ModelConfig):
+        self.diffusion = config.diffusion
+        c, d = config.diffusion.token_channels, config.width
+        self.kernel = param((c, d), ("C", "D"), xavier_uniform(c, d), role="input")
+        self.mask = param((config.diffusion.channels,), (None,), zeros, role="vector")
+
+    def __call__(self, tokens: jax.Array, masked: jax.Array | None, dtype: jnp.dtype) -> jax.Array:
+        """Tokens [..., S, C] and bool [..., S] or [..., S, cells] -> [..., S, D]."""
+        if masked is not None:
+            tokens = mask_cells(tokens, masked, self.mask.get_value(), self.diffusion)
+        return tokens.astype(dtype) @ self.kernel.astype(dtype)
+
+
+class Readout(nnx.Module):
+    """Trunk outputs [..., D] -> float32 logits [..., Q, V]."""
+
+    def __init__(self, config: ModelConfig):
+        self.factors, self.multiplier = config.factors, config.mup_multiplier("readout")
+        entries = config.factors * config.factor_vocab
+        init = readout_init(config, entries)
+        self.linear = Linear((config.width, entries), ("D", "V"), init=init, role="output")
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        y = self.linear(x / self.multiplier).astype(jnp.float32)
+        return y.reshape(*y.shape[:-1], self.factors, -1)
+
+
+class Condition(nnx.Module):
+    """Trunk outputs -> what the diffusion head is told of each token (reference section 2.2)."""
+
+    def __init__(self, config: ModelConfig):
+        width, shape = config.width, (config.frames, config.tokens, config.width)
+        init = trunk_init(config, width, width)
+        self.linear = Linear((width, width), ("D", "D_out"), init=init, role="hidden")
+        self.norm = LayerNorm(width, eps=FINE_EPS)
+        self.positions = param(shape, ("T", "S", "D"), normal(0.02), role="vector")
+
+    def __call__(self, x_BTSD: jax.Array, positions_T: jax.Array) -> jax.Array:
+        """[B, T, S, D] of frames at window positions `positions_T` -> float32 of that shape."""
+        z = self.norm(self.linear(x_BTSD)).astype(jnp.float32)
+        return z + jnp.take(self.positions.get_value(), positions_T, axis=0)
+
+
+def make_embed(config: ModelConfig) -> nnx.Module:
+    return LatentEmbed(config) if config.diffusion else TokenEmbed(config)
+
+
+def make_frame_head(config: ModelConfig) -> nnx.Module:
+    return used("frames_predicted", Condition(config) if config.diffusion else Readout(config))

@@ -1,0 +1,106 @@
+"""Small networks behind the trunk: the denoiser of the continuous variant, and action heads.
+
+An action head reads the mean of a frame's action-token outputs: a linear regression in the
+discrete variant, a denoiser per robot in the continuous one (reference sections 1.7 and 2.4).
+Both predict normalised actions.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from hma_jax.config import ModelConfig
+from hma_jax.diffusion import timestep_embedding
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.initial import readout_init
+from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear, normalise
+from hma_jax.params import bias, normal, param, stack, used, xavier_uniform, zeros
+
+TIME_FEATURES = 256
+
+
+class ResBlock(nnx.Module):
+    """x + gate * mlp(norm(x) (1 + scale) + shift), all three from the condition."""
+
+    def __init__(self, width: int):
+        init = xavier_uniform(width, width)
+        self.norm = LayerNorm(width, axis=None, eps=FINE_EPS)
+        self.into = Linear((width, width), (None, "F"), init=init, role="vector")
+        self.out = Linear((width, width), ("F", None), init=init, role="vector")
+        self.modulation = Linear((width, 3 * width), (None, "F"), init=zeros, role="vector")
+
+    def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
+        shift, scale, gate = jnp.split(self.modulation(jax.nn.silu(condition)), 3, axis=-1)
+        h = self.norm(x) * (1 + scale) + shift
+        return x + gate * self.out(jax.nn.silu(self.into(h)))
+
+
+class Denoiser(nnx.Module):
+    """A residual MLP modulated by time and condition: noise and a variance fraction (section 2.4).
+
+    Its width does not follow the trunk's: only the condition's input scales under muP, as a
+    read-out's. DIFFERS: modulation and last layer start at zero in every head; the release draws
+    them from N(0, 0.02) in the frames' head only, by the order of its constructors.
+    """
+
+    def __init__(self, config: ModelConfig, channels: int, axis: str = "C"):
+        width = config.diffusion.width
+        small = normal(0.02)
+        self.multiplier = config.mup_multiplier("readout")
+        self.time_in = Linear((TIME_FEATURES, width), (None, "F"), init=small, role="vector")
+        self.time_out = Linear((width, width), ("F", None), init=small, role="vector")
+        self.condition = Linear((config.width, width), ("D", "F"), init=small, role="output")
+        init = xavier_uniform(channels, width)
+        self.into = Linear((channels, width), (axis, "F"), init=init, role="vector")
+        self.blocks = nnx.List([ResBlock(width) for _ in range(config.diffusion.depth)])
+        self.modulation = Linear((width, 2 * width), (None, "F"), init=zeros, role="vector")
+        self.out = param((width, 2, channels), ("F", None, axis), zeros, role="vector")
+        self.out_bias = bias((2, channels), (None, axis))
+
+    def __call__(self, x: jax.Array, time: jax.Array, z: jax.Array) -> jax.Array:
+        """x [..., C] noised at `time` [...] given z [..., D] -> [..., 2 C], noise first."""
+        y = self.time_out(jax.nn.silu(self.time_in(timestep_embedding(time, TIME_FEATURES))))
+        y = y + self.condition(z / self.multiplier)
+        x = self.into(x)
+        for block in self.blocks:
+            x = block(x, y)
+        shift, scale = jnp.split(self.modulation(jax.nn.silu(y)), 2, axis=-1)
+        x = normalise(x, FINE_EPS) * (1 + scale) + shift
+        y = jnp.einsum("...f,fkc->...kc", x, self.out.get_value()) + self.out_bias.get_value()
+        return y.reshape(*y.shape[:-2], -1)
+
+
+class ActionRegression(nnx.Module):
+    """One linear read-out per robot."""
+
+    def __init__(self, config: ModelConfig, table: EmbodimentTable):
+        sizes = (config.width, table.action_width)
+        self.multiplier = config.mup_multiplier("readout")
+        init = readout_init(config, table.action_width)
+        self.linear = EmbodimentLinear(table.size, sizes, ("D", "U"), init=init, role="output")
+
+    def __call__(self, pooled_BTD: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """-> normalised actions, float32 [B, T, U]."""
+        return self.linear(pooled_BTD / self.multiplier, embodiment_B).astype(jnp.float32)
+
+
+class ActionDenoiser(nnx.Module):
+    """One denoiser per robot, over its chunk padded to U."""
+
+    def __init__(self, config: ModelConfig, table: EmbodimentTable):
+        self.robots = stack(lambda: Denoiser(config, table.action_width, "U"), table.size, axis="E")
+
+    def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+        """Normalised, noised chunks -> [B, T, 2 U], noise first."""
+        graphdef, params = nnx.split(self.robots)
+        own = jax.tree.map(lambda p: jnp.take(p, embodiment_B, axis=0), params)
+        return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)
+
+
+def make_action_head(config: ModelConfig, table: EmbodimentTable) -> nnx.Module | None:
+    if not config.action_heads:
+        return None
+    head = ActionDenoiser if config.diffusion else ActionRegression
+    return used("actions_predicted", head(config, table))
