@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import ModelConfig, MupConfig, OptimizerConfig, TrainConfig
+from hma_jax.config import DiffusionConfig, ModelConfig, MupConfig, OptimizerConfig, TrainConfig
 from hma_jax.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model import declare_model
 
@@ -19,6 +19,10 @@ TABLE = EmbodimentTable(
         Embodiment("base", 3, 3, (0.0,) * 3, (1.0, 0.0, 3.0)),
     )
 )
+
+
+DIFFUSION = DiffusionConfig(channels=2, patch=2, width=16, depth=2, steps=20)
+"""The continuous variant: model_config(diffusion=DIFFUSION)."""
 
 
 def model_config(**changes) -> ModelConfig:
@@ -50,8 +54,12 @@ def random_batch(seed: int, config: ModelConfig, batch: int = 8, table=TABLE) ->
     actions = rng.normal(size=(*shape, table.action_width)).astype(np.float32)
     for row, index in enumerate(embodiment):
         actions[row, :, table.entries[index].chunk :] = 0
+    tokens = rng.integers(0, config.vocab_size, (*shape, config.tokens), dtype=np.int32)
+    if config.diffusion:
+        size = (*shape, config.tokens, config.diffusion.token_channels)
+        tokens = rng.normal(size=size).astype(np.float32)
     return {
-        "tokens": rng.integers(0, config.vocab_size, (*shape, config.tokens), dtype=np.int32),
+        "tokens": tokens,
         "actions": actions,
         "embodiment": embodiment,
     }

@@ -3,23 +3,44 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError
-from hma_jax.generation import (
-    DecodeConfig,
-    masked_counts,
-    next_frame_logits,
-    rollout,
-    rollout_naive,
-    unmask,
-)
-from tests.tiny import TABLE, lively_params, model_config, random_batch
+from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
+from hma_jax.decoding import Frame, masked_counts, unmask
+from hma_jax.generation import next_frame_outputs, predict_actions, rollout, rollout_naive, rollout_policy
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
+
+SAMPLER = SamplerConfig(steps=5)
 
 
 def test_masked_counts_are_the_cosine_schedule_of_the_release():
-    assert masked_counts(1, 256) == []
-    assert masked_counts(2, 256) == [182]
-    assert masked_counts(4, 256) == [237, 182, 98]
-    assert masked_counts(8, 256) == [252, 237, 213, 182, 143, 98, 50]
+    discrete = model_config(tokens=256)
+    assert masked_counts(discrete, 1) == [0]
+    assert masked_counts(discrete, 2) == [182, 0]
+    assert masked_counts(discrete, 4) == [237, 182, 98, 0]
+    assert masked_counts(discrete, 8) == [252, 237, 213, 182, 143, 98, 50, 0]
+    continuous = model_config(tokens=256, diffusion=DIFFUSION)
+    assert masked_counts(continuous, 4) == [236, 181, 97, 0]
+
+
+def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
+    declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
+    batch = random_batch(0, config, 4)
+    other = batch["actions"].copy()
+    other[:, prompt - 1 :] = random_batch(1, config, 4)["actions"][:, prompt - 1 :]
+    keys = jax.random.split(jax.random.key(0), 4)
+    start = batch["tokens"][:, :prompt]
+
+    both = np.stack([batch["actions"], other], axis=1)
+    args = (batch["embodiment"], keys, decode)
+    cached = jax.jit(lambda p: rollout(declared.merge(p), start, both, *args, hidden_BT=hidden))
+    naive = jax.jit(lambda p, a: rollout_naive(declared.merge(p), start, a, *args, hidden_BT=hidden))
+    got = np.asarray(cached(params))
+    for index, actions in enumerate((batch["actions"], other)):
+        want = naive(params, actions)
+        if config.diffusion:
+            np.testing.assert_allclose(got[:, index], want, atol=2e-3)
+        else:
+            np.testing.assert_array_equal(got[:, index], want)
+    return got
 
 
 @pytest.mark.parametrize(
@@ -32,23 +53,100 @@ def test_the_cached_rollout_equals_recomputing_the_window(
     decode: DecodeConfig, prompt: int, alignment: str
 ):
     config = model_config(action_alignment=alignment)
-    declared, params = lively_params(config)
-    batch = random_batch(0, config, 4)
-    other = batch["actions"].copy()
-    other[:, prompt - 1 :] = random_batch(1, config, 4)["actions"][:, prompt - 1 :]
-    keys = jax.random.split(jax.random.key(0), 4)
-    start = batch["tokens"][:, :prompt]
-
-    both = np.stack([batch["actions"], other], axis=1)
-    cached = jax.jit(lambda p: rollout(declared.merge(p), start, both, batch["embodiment"], keys, decode))
-    naive = jax.jit(
-        lambda p, a: rollout_naive(declared.merge(p), start, a, batch["embodiment"], keys, decode)
-    )
-    got = np.asarray(cached(params))
-    np.testing.assert_array_equal(got[:, 0], naive(params, batch["actions"]))
-    np.testing.assert_array_equal(got[:, 1], naive(params, other))
+    got = compare_with_naive(config, decode, prompt)
     assert (got[:, 0] != got[:, 1]).any()
     assert got.max() < config.vocab_size
+
+
+@pytest.mark.parametrize("conditioning", ["modulate", "concat", "add", "cross_attention"])
+def test_the_cached_rollout_is_exact_under_every_conditioning(conditioning: str):
+    got = compare_with_naive(model_config(conditioning=conditioning), DecodeConfig(2), 2)
+    assert (got[:, 0] != got[:, 1]).any()
+
+
+@pytest.mark.parametrize("resample", [False, True])
+def test_the_cached_rollout_is_exact_for_continuous_tokens(resample: bool):
+    config = model_config(diffusion=DIFFUSION)
+    got = compare_with_naive(config, DecodeConfig(3, sampler=SAMPLER, resample=resample), 2)
+    assert np.abs(got[:, 0] - got[:, 1]).max() > 1e-2
+
+
+@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention"])
+def test_the_cached_rollout_is_exact_with_hidden_actions(conditioning: str):
+    hidden = np.random.default_rng(0).random((4, 6)) < 0.5
+    compare_with_naive(model_config(conditioning=conditioning), DecodeConfig(2), 3, hidden)
+
+
+@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention", "add", "concat"])
+def test_actions_that_are_all_hidden_make_no_difference(conditioning: str):
+    config = model_config(conditioning=conditioning)
+    declared, params = lively_params(config)
+    batch = random_batch(0, config, 2)
+    actions = np.stack([batch["actions"], batch["actions"] + 3], axis=1)
+    keys = jax.random.split(jax.random.key(0), 2)
+    args = (declared.merge(params), batch["tokens"][:, :2], actions, batch["embodiment"], keys, DecodeConfig(2))
+    blind = rollout(*args, hidden_BT=np.ones((2, 6), bool))
+    np.testing.assert_array_equal(blind[:, 0], blind[:, 1])
+
+
+def test_top_1_is_greedy():
+    config = model_config()
+    declared, params = lively_params(config)
+    batch = random_batch(0, config, 2)
+    keys = jax.random.split(jax.random.key(0), 2)
+    run = lambda decode: rollout(  # noqa: E731
+        declared.merge(params), batch["tokens"][:, :2], batch["actions"][:, None], batch["embodiment"], keys, decode
+    )
+    np.testing.assert_array_equal(run(DecodeConfig(2, 1.0, top_k=1)), run(DecodeConfig(2)))
+
+
+@pytest.mark.parametrize("alignment", ["released", "causal"])
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["discrete", "continuous"])
+def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(alignment: str, diffusion):
+    """The cached loop against whole-window calls of `predict_actions` and `rollout_naive`."""
+    config = model_config(action_alignment=alignment, frames=5, diffusion=diffusion)
+    declared, params = lively_params(config, scale=0.05)
+    hma = declared.merge(params)
+    batch = random_batch(0, config, 2)
+    keys = jax.random.split(jax.random.key(0), 2)
+    decode = DecodeConfig(1, sampler=SamplerConfig(steps=4, temperature=0.0))
+    prompt, robots = 2, batch["embodiment"]
+    frames, chunks = jax.jit(
+        lambda p: rollout_policy(
+            declared.merge(p), batch["tokens"][:, :prompt], batch["actions"], robots, keys, decode
+        )
+    )(params)
+
+    window, actions = jnp.asarray(batch["tokens"][:, :prompt]), jnp.asarray(batch["actions"])
+    for t in range(prompt, config.frames):
+        hidden = jnp.broadcast_to(jnp.arange(t) >= t - 1, (2, t))
+        chosen = predict_actions(hma, window, actions[:, :t], robots, hidden, keys, decode)[:, t - 1]
+        actions = actions.at[:, t - 1].set(chosen)
+        unknown = jnp.broadcast_to(jnp.arange(t + 1) >= t, (2, t + 1))
+        new = rollout_naive(hma, window, actions[:, : t + 1], robots, keys, decode, hidden_BT=unknown)
+        window = jnp.concatenate([window, new], axis=1)
+    np.testing.assert_allclose(chunks, actions, atol=1e-3)
+    np.testing.assert_allclose(frames, window[:, prompt:], atol=1e-3)
+
+
+@pytest.mark.parametrize("alignment", ["released", "causal"])
+def test_a_policy_never_sees_what_it_predicts(alignment: str):
+    config = model_config(action_alignment=alignment)
+    declared, params = lively_params(config)
+    batch = random_batch(0, config, 2)
+    keys = jax.random.split(jax.random.key(0), 2)
+    changed = dict(batch, tokens=batch["tokens"].copy(), actions=batch["actions"].copy())
+    changed["actions"][:, 3:] += 5.0
+    changed["tokens"][:, 4:] = (changed["tokens"][:, 4:] + 1) % config.vocab_size
+    hidden = np.broadcast_to(np.arange(6) >= 3, (2, 6))
+    predict = jax.jit(
+        lambda b: predict_actions(
+            declared.merge(params), b["tokens"], b["actions"], b["embodiment"], hidden, keys, DecodeConfig()
+        )
+    )
+    a, b = predict(batch), predict(changed)
+    np.testing.assert_array_equal(a[:, :4], b[:, :4])
+    assert np.abs(a[:, 4:] - b[:, 4:]).max() > 1e-3
 
 
 def test_equal_actions_give_equal_rollouts_even_when_sampled():
@@ -71,7 +169,8 @@ def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
         batch = random_batch(0, config, 2)
         actions = batch["actions"].copy()
         actions[:, chunk, :2] += 3.0
-        logits = [hma(batch["tokens"], hma.align(a), batch["embodiment"])[0] for a in (batch["actions"], actions)]
+        given = [hma.align(a) for a in (batch["actions"], actions)]
+        logits = [hma(batch["tokens"], None, a, batch["embodiment"]).frames for a in given]
         changed = np.abs(logits[0] - logits[1]).max((0, 2, 3, 4)) > 1e-3
         return int(np.argmax(changed))
 
@@ -80,25 +179,26 @@ def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
 
 
 @pytest.mark.parametrize("alignment", ["released", "causal"])
-def test_next_frame_logits_equal_one_masked_window_per_frame(alignment: str):
+def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
     config = model_config(action_alignment=alignment)
     declared, params = lively_params(config, scale=0.1)
     batch = random_batch(0, config, 3)
     hma = declared.merge(params)
     args = (hma.align(batch["actions"]), batch["embodiment"])
-    fast = np.asarray(next_frame_logits(hma, batch["tokens"], batch["actions"], batch["embodiment"]))
+    fast = np.asarray(next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))
     for t in range(1, config.frames):
-        window = jnp.asarray(batch["tokens"]).at[:, t:].set(config.mask_id)
-        slow = np.asarray(hma(window, *args)[0][:, t])
+        masked = np.broadcast_to(np.arange(config.frames)[None, :, None] >= t, batch["tokens"].shape)
+        slow = np.asarray(hma(batch["tokens"], masked, *args).frames[:, t])
         np.testing.assert_allclose(fast[:, t - 1], slow, atol=1e-4 * np.abs(slow).max())
 
 
 def test_known_positions_are_never_drawn_again():
-    frame = jnp.array([[7, 99, 99, 99]])
-    out = unmask(frame, jnp.array([[1, 2, 3, 4]]), jnp.array([[0.0, 0.1, 0.9, 0.5]]), 1, mask_id=99)
-    np.testing.assert_array_equal(out, [[7, 99, 3, 4]])
-    out = unmask(out, jnp.array([[5, 6, 7, 8]]), jnp.zeros((1, 4)), 0, mask_id=99)
-    np.testing.assert_array_equal(out, [[7, 6, 3, 4]])
+    frame = Frame(jnp.array([[7, 0, 0, 0]]), jnp.array([[False, True, True, True]]))
+    out = unmask(frame, jnp.array([[1, 2, 3, 4]]), jnp.array([[0.0, 0.1, 0.9, 0.5]]), 1)
+    np.testing.assert_array_equal(out.values, [[7, 0, 3, 4]])
+    np.testing.assert_array_equal(out.masked, [[False, True, False, False]])
+    out = unmask(out, jnp.array([[5, 6, 7, 8]]), jnp.zeros((1, 4)), 0)
+    np.testing.assert_array_equal(out.values, [[7, 6, 3, 4]])
 
 
 def test_temperature_is_a_temperature():

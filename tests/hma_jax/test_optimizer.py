@@ -1,3 +1,5 @@
+from typing import get_args
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,8 +8,9 @@ import pytest
 
 from hma_jax.config import MupConfig, OptimizerConfig
 from hma_jax.model import declare_model
-from hma_jax.params import is_spec
+from hma_jax.params import Use, is_spec
 from hma_jax.training.optimizer import (
+    Presence,
     apply_adamw,
     clip_by_global_norm,
     init_adam,
@@ -16,6 +19,7 @@ from hma_jax.training.optimizer import (
 )
 from tests.tiny import TABLE, lively_params, model_config
 
+USES = get_args(Use)
 CONFIG = OptimizerConfig(learning_rate=1e-2, weight_decay=0.1)
 
 
@@ -27,9 +31,8 @@ def gradients(params, seed=0):
 
 def update(declared, params, state, present, seed=0, config=CONFIG):
     ones = jax.tree.map(lambda _: 1.0, declared.specs, is_leaf=is_spec)
-    return apply_adamw(
-        gradients(params, seed), state, params, declared.specs, ones, jnp.array(present), 1e-2, config
-    )
+    here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, jnp.array(present)))
+    return apply_adamw(gradients(params, seed), state, params, declared.specs, ones, here, 1e-2, config)
 
 
 def slices(declared, tree, robot):
@@ -54,7 +57,8 @@ def test_robots_absent_from_a_step_do_not_move():
     for old, new in ((state1.first, state2.first), (state1.second, state2.second)):
         for name, before in slices(declared, old, 1).items():
             np.testing.assert_array_equal(before, slices(declared, new, 1)[name], err_msg=name)
-    assert state2.count_E.tolist() == [2, 1, 2] and int(state2.count) == 2
+    assert all(count.tolist() == [2, 1, 2] for count in state2.count_E.values())
+    assert all(int(count) == 2 for count in state2.count.values())
     moved = slices(declared, params2, 0)
     assert all((moved[n] != x).any() for n, x in slices(declared, params1, 0).items() if x.any())
 
@@ -95,7 +99,7 @@ def test_mup_divides_the_rate_of_hidden_matrices_only():
     leaves = declare_model(config, TABLE).leaves()
     scaled = {n for n, s in leaves.items() if learning_rate_multiplier(s, config) == 0.25}
     assert {"trunk/blocks/space/qkv", "trunk/blocks/mlp_in/kernel", "stem/out/kernel"} <= scaled
-    for name in ("stem/into/kernel", "readout/kernel", "embed/tables", "positions"):
+    for name in ("stem/into/kernel", "frame_head/linear/kernel", "embed/tables", "positions"):
         assert name not in scaled
     assert all(s.role == "hidden" for n, s in leaves.items() if n in scaled)
 

@@ -177,4 +177,4 @@ def test_every_step_counts_robots_that_were_present(tmp_path: Path):
             yield batch | {"embodiment": np.zeros_like(batch["embodiment"])}
 
     state = train(tmp_path, make=only_pusher, config=dataclasses.replace(train_config(), steps=3)).state
-    assert state.opt_state.count_E.tolist() == [3, 0, 0]
+    assert state.opt_state.count_E["always"].tolist() == [3, 0, 0]

@@ -1,0 +1,46 @@
+"""New robots for a trained model: their own slices are appended, what was there stays.
+
+Everything a robot owns has an embodiment axis, and widths of actions are padded to U, so a
+wider newcomer adds rows of zeros that nobody's padded actions ever meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from hma_jax.config import ModelConfig, require
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model import declare_model
+from hma_jax.params import EMBODIMENT_AXIS, Params, ParamSpec, is_spec
+
+
+def add_embodiments(
+    params: Params, model: ModelConfig, table: EmbodimentTable, new: Sequence[Embodiment], seed: int
+) -> tuple[Params, EmbodimentTable]:
+    """Parameters and table with the `new` robots after those of `table`.
+
+    What the model says of the old robots does not change by a bit. The new slices are drawn as
+    in a model that had the robots from the start, from `seed`. Raises ConfigError for a name that
+    the table has already.
+    """
+    known = [e.name for e in new if e.name in table.names]
+    require(not known, f"the model already knows {', '.join(known)}; go on training it instead of adding them")
+    wider = EmbodimentTable((*table.entries, *new))
+    declared = declare_model(model, wider)
+
+    def extend(spec: ParamSpec, fresh: np.ndarray, old: jax.Array) -> np.ndarray:
+        if EMBODIMENT_AXIS not in spec.axes:
+            return np.asarray(old)
+        # Old slices over the start of every axis; beyond them, in the axis of actions, zeros.
+        everywhere = [slice(0, size) for size in old.shape]
+        robots = [slice(None)] * old.ndim
+        robots[spec.embodiment_axis] = slice(0, table.size)
+        fresh = np.array(fresh)
+        fresh[tuple(robots)] = 0
+        fresh[tuple(everywhere)] = np.asarray(old)
+        return fresh
+
+    return jax.tree.map(extend, declared.specs, declared.init(seed), params, is_leaf=is_spec), wider

@@ -1,0 +1,64 @@
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.adapt import add_embodiments
+from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
+from hma_jax.embodiments import Embodiment
+from hma_jax.generation import read_actions
+from hma_jax.model import declare_model
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
+
+NEWCOMERS = (
+    Embodiment("humanoid", 26, 3, (0.1,) * 26, (2.0,) * 26),  # wider than anyone before
+    Embodiment("cart", 1, 1, (0.0,), (1.0,)),
+)
+
+
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["discrete", "continuous"])
+@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention"])
+def test_old_robots_answers_stay_bit_identical(diffusion, conditioning: str):
+    config = model_config(diffusion=diffusion, conditioning=conditioning)
+    declared, params = lively_params(config)
+    wider, table = add_embodiments(params, config, TABLE, NEWCOMERS, seed=3)
+    batch = random_batch(0, config)
+    decode = DecodeConfig(sampler=SamplerConfig(steps=3, temperature=0.0))
+
+    def answer(declared, params, table):
+        actions = np.pad(batch["actions"], ((0, 0), (0, 0), (0, table.action_width - TABLE.action_width)))
+
+        def run(p):
+            hma = declared.merge(p)
+            out = hma(batch["tokens"], None, actions, batch["embodiment"])
+            if out.actions is None:
+                return out.frames, 0
+            keys = jax.random.split(jax.random.key(0), 8)
+            chunks = read_actions(hma, out, batch["embodiment"], keys, decode)
+            return out.frames, chunks[..., : TABLE.action_width]
+
+        return jax.jit(run)(params)
+
+    before = answer(declared, params, TABLE)
+    after = answer(declare_model(config, table), wider, table)
+    np.testing.assert_array_equal(before[0], after[0])
+    np.testing.assert_array_equal(before[1], after[1])
+
+
+def test_new_robots_start_as_they_would_have_from_the_beginning():
+    config = model_config()
+    _, params = lively_params(config)
+    wider, table = add_embodiments(params, config, TABLE, NEWCOMERS, seed=3)
+    fresh = declare_model(config, table).init(3)
+    assert table.names == (*TABLE.names, "humanoid", "cart")
+    np.testing.assert_array_equal(wider["stem"]["into"]["kernel"][3:], fresh["stem"]["into"]["kernel"][3:])
+    assert not wider["stem"]["into"]["kernel"][:3, TABLE.action_width :].any()
+    np.testing.assert_array_equal(wider["trunk"]["blocks"]["space"]["qkv"], params["trunk"]["blocks"]["space"]["qkv"])
+
+
+def test_a_name_the_model_knows_is_refused():
+    config = model_config()
+    _, params = lively_params(config)
+    with pytest.raises(ConfigError, match="already knows arm"):
+        add_embodiments(params, config, TABLE, [dataclasses.replace(NEWCOMERS[0], name="arm")], seed=0)

@@ -1,0 +1,211 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, MaskingConfig
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.masking import mask_batch
+from hma_jax.model import declare_model
+from hma_jax.objectives import masked_loss
+from hma_jax.training.step import find_presence, init_state, make_train_step
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
+
+MIXED = EmbodimentTable(
+    (
+        Embodiment("arm", 2, 1, (0.0, 1.0), (1.0, 2.0)),
+        Embodiment("film", 0, 1, (), ()),  # a video without actions
+        Embodiment("blind", 3, 1, (0.0,) * 3, (1.0,) * 3, video_targets=False),
+    )
+)
+
+
+def masked_batch(config, masking, table=TABLE, seed=0, batch=64):
+    data = random_batch(seed, config, batch, table)
+    return data, mask_batch(jax.random.key(0), data["tokens"], data["embodiment"], config, masking, table)
+
+
+def test_the_settings_differ_in_what_is_hidden_and_predicted():
+    config = model_config()
+    seen = {}
+    for setting in ("forward", "passive", "full", "policy", "inverse"):
+        _, masked = masked_batch(config, MaskingConfig(setting=setting))
+        seen[setting] = [
+            float(np.mean(x)) for x in (masked.targets_TS, masked.hidden_T, masked.action_targets_T)
+        ]
+    assert seen["forward"][1:] == [0, 0] and seen["passive"][1:] == [1, 0] and seen["inverse"] == [0, 1, 1]
+    assert seen["policy"][0] == 0 and seen["policy"][1] == seen["policy"][2]
+    assert all(0.3 < seen[s][0] < 0.7 for s in ("forward", "passive", "full"))
+    assert 0.4 < seen["full"][1] == seen["full"][2] < 0.6
+
+
+def test_a_policy_s_hidden_actions_are_all_from_one_frame_on():
+    _, masked = masked_batch(model_config(), MaskingConfig(setting="policy"))
+    hidden = np.asarray(masked.hidden_T)
+    assert (np.diff(hidden.astype(int), axis=1) >= 0).all() and hidden[:, -1].all()
+    assert len(np.unique(hidden.sum(1))) == 6
+
+
+def test_frame_zero_is_always_shown():
+    for config in (model_config(), model_config(diffusion=DIFFUSION)):
+        _, masked = masked_batch(config, MaskingConfig())
+        assert not np.asarray(masked.masked)[:, 0].any() and np.asarray(masked.masked)[:, 1:].any()
+
+
+def test_an_example_s_masks_do_not_depend_on_its_batch():
+    config = model_config()
+    data, whole = masked_batch(config, MaskingConfig(setting="full"), batch=8)
+    part = mask_batch(
+        jax.random.key(0), data["tokens"][:3], data["embodiment"][:3], config, MaskingConfig(setting="full"), TABLE
+    )
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3], b), whole, part)
+
+
+def test_continuous_tokens_are_masked_whole_unless_by_cell():
+    config = model_config(diffusion=DIFFUSION)
+    _, by_patch = masked_batch(config, MaskingConfig())
+    assert by_patch.masked.shape == by_patch.targets_TS.shape
+    _, by_cell = masked_batch(config, MaskingConfig(mask_unit="cell"))
+    cells = np.asarray(by_cell.masked)
+    assert cells.shape[-1] == DIFFUSION.cells
+    np.testing.assert_array_equal(cells.any(-1), by_cell.targets_TS)
+    assert (cells.any(-1) != cells.all(-1)).any()
+
+
+@pytest.mark.parametrize("setting", ["full", "policy", "forward"])
+def test_robots_without_actions_or_video_targets_train_what_they_can(setting: str):
+    _, masked = masked_batch(model_config(), MaskingConfig(setting=setting), MIXED)
+    robots = random_batch(0, model_config(), 64, MIXED)["embodiment"]
+    film, blind = robots == 1, robots == 2
+    assert np.asarray(masked.hidden_T)[film].all() and not np.asarray(masked.action_targets_T)[film].any()
+    assert not np.asarray(masked.masked)[blind].any()
+    if setting != "policy":
+        assert np.asarray(masked.targets_TS)[film].any()
+    if setting != "forward":
+        assert np.asarray(masked.action_targets_T)[blind].any()
+
+
+def losses(config, masking, changes=None, table=TABLE):
+    """The loss sums of one batch, optionally with hidden or masked values replaced by nonsense."""
+    declared, params = lively_params(config, table, scale=0.1)
+    data, masked = masked_batch(config, masking, table, batch=8)
+    if changes:
+        data, masked = changes(data, masked)
+    keys = jax.random.split(jax.random.key(1), 8)
+    run = jax.jit(
+        lambda p: masked_loss(
+            declared.merge(p), masked, data["tokens"], data["actions"], data["embodiment"], masking, keys
+        )
+    )
+    return np.array(run(params))
+
+
+def poison_hidden(data, masked):
+    """Hidden chunks become nonsense, as the model would be given them; targets are not asked for."""
+    nonsense = np.where(np.asarray(masked.hidden_T)[..., None], 1e3, data["actions"])
+    return data | {"actions": nonsense.astype(np.float32)}, masked
+
+
+@pytest.mark.parametrize("conditioning", ["concat+modulate", "modulate", "concat", "add", "cross_attention"])
+@pytest.mark.parametrize("alignment", ["released", "causal"])
+def test_hidden_actions_do_not_reach_the_frames_on_any_path(conditioning: str, alignment: str):
+    config = model_config(conditioning=conditioning, action_alignment=alignment)
+    passive = MaskingConfig(setting="passive")
+    np.testing.assert_array_equal(losses(config, passive), losses(config, passive, poison_hidden))
+    leaky = dataclasses.replace(passive, action_leak="conditioning")
+    if conditioning != "concat":
+        assert losses(config, leaky)[0] != losses(config, leaky, poison_hidden)[0]
+
+
+def test_hidden_actions_are_predicted_without_being_seen():
+    """What is read off a frame is the same whatever the hidden chunks hold."""
+    config = model_config()
+    declared, params = lively_params(config)
+    data, masked = masked_batch(config, MaskingConfig(setting="full"), batch=8)
+    poisoned, _ = poison_hidden(data, masked)
+    hma = declared.merge(params)
+
+    def read(batch):
+        out = hma(masked.inputs, masked.masked, batch["actions"], batch["embodiment"], hidden_BT=masked.hidden_T)
+        return hma.action_head(out.actions, batch["embodiment"])
+
+    np.testing.assert_array_equal(read(data), read(poisoned))
+
+
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["discrete", "continuous"])
+@pytest.mark.parametrize("setting", ["forward", "full", "policy", "inverse"])
+def test_every_setting_learns_a_repeated_batch(setting: str, diffusion):
+    config = model_config(diffusion=diffusion, action_alignment="causal", trunk_gain=0.5, stem_gain=0.5, frames=4)
+    train = train_config(masking=MaskingConfig(setting=setting), batch=8)
+    train = dataclasses.replace(
+        train, steps=80, optimizer=dataclasses.replace(train.optimizer, learning_rate=3e-3)
+    )
+    declared = declare_model(config, TABLE)
+    step = jax.jit(make_train_step(declared, TABLE, config, train))
+    state, batch = init_state(declared, TABLE, 0), random_batch(0, config)
+    history = []
+    for _ in range(train.steps):
+        state, metrics = step(state, batch)
+        history.append(float(metrics["loss"]))
+    assert np.mean(history[-10:]) < 0.92 * np.mean(history[:10])
+
+
+def test_what_a_step_does_not_concern_stands_still():
+    config = model_config()
+    for setting, still in (("forward", "actions_hidden"), ("passive", "actions_shown"), ("policy", "frames_predicted")):
+        train = train_config(masking=MaskingConfig(setting=setting), steps=1)
+        declared = declare_model(config, TABLE)
+        _, params = lively_params(config)
+        state = init_state(declared, TABLE, 0)._replace(params=params)
+        new, _ = jax.jit(make_train_step(declared, TABLE, config, train))(state, random_batch(0, config))
+        for (path, spec), old, moved in zip(
+            declared.leaves().items(), jax.tree.leaves(params), jax.tree.leaves(new.params), strict=True
+        ):
+            if spec.use == still:
+                np.testing.assert_array_equal(old, moved, err_msg=f"{setting}: {path}")
+            elif spec.use == "always":
+                assert (np.asarray(old) != np.asarray(moved)).any(), f"{setting}: {path}"
+
+
+def test_presence_is_by_use_and_robot():
+    config = model_config()
+    data, masked = masked_batch(config, MaskingConfig(setting="full"), MIXED)
+    presence = find_presence(masked, jnp.asarray(data["embodiment"]), jnp.ones(3, bool))
+    assert presence.robots["actions_shown"].tolist() == [True, False, True]
+    assert presence.robots["actions_predicted"].tolist() == [True, False, True]
+    assert presence.robots["frames_predicted"].tolist() == [True, True, False]
+
+
+def test_only_the_named_robots_own_parameters_are_trained():
+    config = model_config()
+    declared, params = lively_params(config)
+    train = train_config(steps=1, only=("arm",))
+    state = init_state(declared, TABLE, 0)._replace(params=params)
+    new, _ = jax.jit(make_train_step(declared, TABLE, config, train))(state, random_batch(0, config))
+    for (path, spec), old, moved in zip(
+        declared.leaves().items(), jax.tree.leaves(params), jax.tree.leaves(new.params), strict=True
+    ):
+        changed = np.asarray(old) != np.asarray(moved)
+        axis = spec.embodiment_axis
+        if axis is None:
+            assert not changed.any(), path
+        else:
+            own = np.moveaxis(changed, axis, 0)
+            assert not own[[0, 2]].any(), path
+            assert own[1].any() == (spec.use == "actions_shown"), path
+
+
+@pytest.mark.parametrize(
+    "changes, masking, message",
+    [
+        ({"action_heads": False}, {"setting": "policy"}, "set model.action_heads=true"),
+        ({"conditioning": "modulate"}, {"setting": "full"}, "choose one with concat"),
+    ],
+)
+def test_predicting_actions_without_the_means_is_refused(changes, masking, message):
+    config = model_config(**changes)
+    with pytest.raises(ConfigError, match=message):
+        train = train_config(masking=MaskingConfig(**masking))
+        make_train_step(declare_model(config, TABLE), TABLE, config, train)
