@@ -1,0 +1,387 @@
+"""Diffusion where the right answer is known: Gaussian data, for which the best network is a formula."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, SamplerConfig, from_dict, to_dict
+from hma_jax.diffusion import (
+    Process,
+    diffusion_loss,
+    make_process,
+    respace,
+    sample,
+    sample_with_key,
+    timestep_embedding,
+)
+
+FULL = make_process(1000)
+MEAN, STD = np.array([2.0, -1.0, 0.3], np.float32), 0.6
+CLIP = 10.0
+
+
+def gaussian_network(process: Process, mean=MEAN):
+    """The best prediction of noise and variance when x0 ~ N(mean, STD^2), for steps of `process`."""
+    abar = process.alphas_cumprod
+    var_xt = abar * STD**2 + 1 - abar
+    slope = np.sqrt(1 - abar) / var_xt
+    var_x0 = STD**2 * (1 - abar) / var_xt  # of x0 given x_t
+    low, high = process.posterior_log_variance_clipped, process.log_betas
+    variance = np.exp(low) + process.posterior_x0**2 * var_x0
+    fraction = (np.log(variance) - low)[1:] / (high - low)[1:]
+    fraction = np.append(0.0, fraction)  # the last step draws nothing
+    at = lambda table, t: jnp.asarray(table, jnp.float32)[t][..., None]  # noqa: E731
+
+    def network(x_t, t):
+        index = jnp.searchsorted(jnp.asarray(process.timestep_map), t)
+        eps = at(slope, index) * (x_t - at(np.sqrt(abar), index) * mean)
+        return jnp.concatenate([eps, jnp.broadcast_to(at(2 * fraction - 1, index), x_t.shape)], -1)
+
+    return network
+
+
+def drawn(sampler: SamplerConfig, rows: int = 20_000, seed: int = 0) -> np.ndarray:
+    process = respace(FULL, sampler.steps)
+    network = gaussian_network(process)
+    draw = jax.jit(lambda key: sample_with_key(network, key, (rows, 3), process, sampler, CLIP))
+    return np.asarray(draw(jax.random.key(seed)))
+
+
+# --- The process -----------------------------------------------------------------------------
+
+
+def test_numbers_of_the_reference():
+    """Section 11."""
+    np.testing.assert_allclose(FULL.betas[[0, 500, 999]], [4.12842e-5, 3.15569e-3, 0.999], rtol=2e-6)
+    want = [0.9999587, 0.845888, 0.492285, 0.143179, 2.42877e-9]
+    np.testing.assert_allclose(FULL.alphas_cumprod[[0, 250, 500, 750, 999]], want, rtol=3e-6)
+    want = [-10.734083, -10.734083, -10.343210]
+    np.testing.assert_allclose(FULL.posterior_log_variance_clipped[:3], want, rtol=1e-7)
+    short = respace(FULL, 100)
+    assert np.flatnonzero(np.diff(short.timestep_map) == 11).tolist() == [5, 16, 27, 38, 49, 60, 71, 82, 93]
+    np.testing.assert_allclose(
+        short.betas[[0, 1, 50, 99]], [4.12842e-5, 6.79840e-4, 0.0341717, 0.99999], rtol=2e-6
+    )
+    frequencies = np.asarray(timestep_embedding(jnp.array(1)))[128:]  # their sines
+    np.testing.assert_allclose(
+        np.arcsin(frequencies[[0, 1, 2, 127]]), [1, 0.930572, 0.865964, 1.07461e-4], rtol=1e-5
+    )
+
+
+def test_respacing_keeps_the_noise_level_of_every_step_it_visits():
+    short = respace(FULL, 37)
+    np.testing.assert_allclose(short.alphas_cumprod, FULL.alphas_cumprod[short.timestep_map], rtol=1e-8)
+    assert short.timestep_map[[0, -1]].tolist() == [0, 999]
+    np.testing.assert_allclose(respace(FULL, 1000).betas, FULL.betas, rtol=1e-10)
+    twice = respace(respace(FULL, 100), 10)
+    np.testing.assert_allclose(twice.alphas_cumprod, FULL.alphas_cumprod[twice.timestep_map], rtol=1e-8)
+
+
+@pytest.mark.parametrize("count", [1, 1001])
+def test_a_process_cannot_be_respaced_to_any_length(count: int):
+    with pytest.raises(ConfigError, match="between 2 and 1000"):
+        respace(FULL, count)
+
+
+# --- Training terms --------------------------------------------------------------------------
+
+
+def rows_of_every_kind(rows: int = 64, channels: int = 5):
+    """x0, t, noise and a network whose output does not follow its input."""
+    rng = np.random.default_rng(3)
+    x0, noise = rng.normal(size=(2, rows, channels)).astype(np.float32)
+    t = rng.integers(1, 1000, rows)
+    t[:4] = [1, 2, 998, 999]
+    eps = noise + rng.normal(size=noise.shape).astype(np.float32) * 0.3
+    variance = rng.uniform(-1, 1, noise.shape).astype(np.float32)
+    return x0, t, noise, eps, variance
+
+
+@jax.jit
+def terms(x0, t, noise, eps, variance, valid=None):
+    """diffusion_loss of a network that says (eps, variance)."""
+    network = lambda x_t, t: jnp.concatenate([eps, variance], axis=-1)  # noqa: E731
+    return diffusion_loss(network, x0, t, noise, FULL, valid)
+
+
+def kl_by_integration(mean_p, var_p, mean_q, var_q) -> np.ndarray:
+    """KL(p | q) of Gaussians, in bits, summed up on a grid instead of in closed form."""
+    z = np.linspace(-12, 12, 4001)
+    x = mean_p[..., None] + np.sqrt(var_p)[..., None] * z
+    p = np.exp(-(z**2) / 2) / math.sqrt(2 * math.pi)
+    log_p = -(z**2) / 2 - np.log(var_p)[..., None] / 2
+    log_q = -((x - mean_q[..., None]) ** 2) / (2 * var_q[..., None]) - np.log(var_q)[..., None] / 2
+    return np.sum(p * (log_p - log_q), axis=-1) * (z[1] - z[0]) / math.log(2)
+
+
+def test_bound_is_the_kl_between_the_posteriors_of_the_true_and_the_predicted_clean_vector():
+    """Posteriors by Bayes' rule, as products of Gaussians, in float64."""
+    x0, t, noise, eps, variance = rows_of_every_kind()
+    _, vb = terms(x0, t, noise, eps, variance)
+
+    beta, abar = FULL.betas[t][:, None], FULL.alphas_cumprod[t][:, None]
+    abar_prev = abar / (1 - beta)
+    x_t = np.sqrt(abar) * x0.astype(np.float64) + np.sqrt(1 - abar) * noise
+    posterior_var = 1 / ((1 - beta) / beta + 1 / (1 - abar_prev)) * np.ones_like(x_t)
+
+    def posterior_mean(clean):
+        likelihood, prior = np.sqrt(1 - beta) / beta * x_t, np.sqrt(abar_prev) / (1 - abar_prev) * clean
+        return posterior_var * (likelihood + prior)
+
+    clean = (x_t - np.sqrt(1 - abar) * eps) / np.sqrt(abar)
+    model_var = np.exp(np.log(beta) * (1 + variance) / 2 + np.log(posterior_var) * (1 - variance) / 2)
+    want = kl_by_integration(posterior_mean(x0), posterior_var, posterior_mean(clean), model_var)
+    np.testing.assert_allclose(vb, want.mean(-1), rtol=2e-4, atol=1e-5)
+
+
+def test_at_step_0_the_bound_is_the_likelihood_of_the_bin_that_holds_the_clean_vector():
+    x0 = np.array([[0.5, -0.2, 3.0, -3.0]])
+    t, noise = np.zeros(1, int), np.array([[0.3, -1.0, 0.2, 1.1]])
+    eps = noise + np.array([[0.4, -0.7, 0.3, -0.5]])
+    variance = np.array([[-1.0, 0.5, 1.0, -1.0]])
+    _, vb = terms(x0, t, noise, eps, variance)
+
+    abar = FULL.alphas_cumprod[0]
+    x_t = np.sqrt(abar) * x0 + np.sqrt(1 - abar) * noise
+    mean = (x_t - np.sqrt(1 - abar) * eps) / np.sqrt(abar)
+    low, high = FULL.posterior_log_variance_clipped[1], FULL.log_betas[0]
+    std = np.exp((low + (high - low) * (variance + 1) / 2) / 2)
+    cdf = np.vectorize(lambda z: 0.5 * (1 + math.erf(z / math.sqrt(2))))
+    upper, lower = cdf((x0 + 1 / 255 - mean) / std), cdf((x0 - 1 / 255 - mean) / std)
+    upper[:, 2], lower[:, 3] = 1, 0  # beyond +-0.999 the bin is open
+    # The tanh approximation of the error function is good to three digits.
+    np.testing.assert_allclose(vb, -np.log2(upper - lower).mean(-1), rtol=2e-3)
+
+
+def test_the_bound_teaches_the_variance_only_and_the_error_the_noise_only():
+    x0, t, noise, eps, variance = rows_of_every_kind()
+    t[5] = 0
+
+    totals = lambda eps, variance: [v.sum() for v in terms(x0, t, noise, eps, variance)]  # noqa: E731
+    (mse_eps, vb_eps), (mse_variance, vb_variance) = jax.jit(jax.jacrev(totals, (0, 1)))(eps, variance)
+    assert np.all(mse_variance == 0) and np.all(vb_eps == 0)
+    np.testing.assert_allclose(mse_eps, 2 * (eps - noise) / eps.shape[-1], rtol=1e-4, atol=1e-6)
+    assert np.all(np.isfinite(vb_variance)) and np.mean(np.asarray(vb_variance) != 0) > 0.9
+
+
+def test_padded_channels_change_neither_loss_nor_gradient():
+    x0, t, noise, eps, variance = rows_of_every_kind()
+    t[5] = 0
+    want = terms(x0, t, noise, eps, variance)
+    rubbish = lambda x: np.pad(x, ((0, 0), (0, 3)), constant_values=7.0)  # noqa: E731
+    x0, noise, eps, variance = map(rubbish, (x0, noise, eps, variance))
+    eps[:, 5:] = -30.0
+    valid = np.broadcast_to(np.arange(8) < 5, x0.shape)
+    np.testing.assert_allclose(terms(x0, t, noise, eps, variance, valid), want, rtol=1e-5)
+
+    total = lambda *out: sum(v.sum() for v in terms(x0, t, noise, *out, valid))  # noqa: E731
+    for gradient in jax.jit(jax.grad(total, (0, 1)))(eps, variance):
+        assert np.all(gradient[:, 5:] == 0) and np.any(gradient[:, :5] != 0)
+
+
+def test_the_network_sees_vectors_noised_to_their_step():
+    x0, noise = jnp.full((2, 3, 4), 2.0), jnp.full((2, 3, 4), 0.5)
+    t = jnp.array([[0, 250, 999], [1, 500, 750]])
+
+    @jax.jit
+    def run():
+        seen = []
+
+        def network(x_t, times):
+            seen.extend([x_t, times])
+            return jnp.zeros((2, 3, 8))
+
+        return *diffusion_loss(network, x0, t, noise, FULL), *seen
+
+    mse, vb, x_t, times = run()
+    abar = FULL.alphas_cumprod[np.asarray(t)][..., None]
+    np.testing.assert_allclose(x_t, np.sqrt(abar) * x0 + np.sqrt(1 - abar) * noise, rtol=1e-6)
+    np.testing.assert_array_equal(times, t)
+    np.testing.assert_allclose(mse, np.full((2, 3), 0.25), rtol=1e-6)
+    assert vb.shape == (2, 3)
+
+
+# --- Sampling --------------------------------------------------------------------------------
+
+
+def ddim_spread(steps: int) -> float:
+    """Standard deviation that DDIM gives Gaussian data: every step multiplies x by a number."""
+    process, spread = respace(FULL, steps), 1.0
+    for abar, cleaner in zip(process.alphas_cumprod[::-1], process.alphas_cumprod_prev[::-1], strict=True):
+        slope = np.sqrt(1 - abar) / (abar * STD**2 + 1 - abar)  # of the predicted noise
+        clean = (1 - np.sqrt(1 - abar) * slope) / np.sqrt(abar)
+        spread *= np.sqrt(cleaner) * clean + np.sqrt(1 - cleaner) * slope
+    return spread
+
+
+@pytest.mark.parametrize(
+    "kind, steps, spread",
+    [
+        ("ddpm", 10, STD),  # with the best variance ancestral steps are exact however few
+        ("ddpm", 100, STD),
+        ("ddim", 100, ddim_spread(100)),
+        ("ddim", 5, ddim_spread(5)),
+    ],
+)
+def test_samples_have_the_mean_and_spread_of_the_data(kind, steps, spread):
+    samples = drawn(SamplerConfig(kind, steps))
+    np.testing.assert_allclose(samples.mean(0), MEAN, atol=0.02)
+    np.testing.assert_allclose(samples.std(0), spread, rtol=0.02)
+    assert np.all(np.abs(np.corrcoef(samples.T) - np.eye(3)) < 0.03)
+
+
+def test_ddim_nears_the_spread_of_the_data_with_more_steps():
+    lost = [1 - ddim_spread(steps) / STD for steps in (5, 10, 100, 1000)]
+    assert lost == sorted(lost, reverse=True)
+    np.testing.assert_allclose(lost, [0.305, 0.146, 0.015, 0.0015], rtol=0.1)
+
+
+def test_the_learned_variance_decides_the_spread_of_ancestral_samples():
+    """Two steps: the last draws nothing, so the first one's variance is what samples have."""
+    process, sampler = respace(FULL, 2), SamplerConfig(steps=2)
+    network = gaussian_network(process)
+
+    def narrow(x_t, t):
+        eps, _ = jnp.split(network(x_t, t), 2, axis=-1)
+        return jnp.concatenate([eps, -jnp.ones_like(eps)], -1)
+
+    draw = jax.jit(lambda key: sample_with_key(narrow, key, (20_000, 3), process, sampler, CLIP))
+    np.testing.assert_allclose(drawn(sampler).std(0), STD, rtol=0.02)
+    assert np.all(draw(jax.random.key(0)).std(0) < 0.02)
+
+
+@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+def test_temperature_0_depends_on_the_condition_alone(kind):
+    one, other = (drawn(SamplerConfig(kind, 20, temperature=0.0), 4, seed) for seed in (0, 1))
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(one, np.broadcast_to(MEAN, one.shape), atol=1e-3)
+
+
+def test_temperature_0_as_released_still_depends_on_the_initial_noise():
+    """Data at +1 and -1: without noise in the steps, the start decides where a sample ends."""
+    process = respace(FULL, 20)
+    abar = jnp.asarray(FULL.alphas_cumprod, jnp.float32)
+
+    def network(x_t, t):
+        a = abar[t][..., None]
+        eps = (x_t - jnp.sqrt(a) * jnp.tanh(jnp.sqrt(a) * x_t / (1 - a))) / jnp.sqrt(1 - a)
+        return jnp.concatenate([eps, jnp.zeros_like(eps)], -1)
+
+    start = jnp.array([[0.5], [-0.5]])
+    ours = SamplerConfig(steps=20, temperature=0.0)
+    released = SamplerConfig(steps=20, temperature=0.0, scale_initial_noise=False)
+    np.testing.assert_allclose(sample(network, start, None, process, released, CLIP), [[1], [-1]], atol=0.01)
+    np.testing.assert_array_equal(sample(network, start, None, process, ours, CLIP), [[0], [0]])
+
+
+@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+def test_spread_is_proportional_to_temperature(kind):
+    """For Gaussian data sampling is linear in the noise."""
+    process = respace(FULL, 20)
+    network = gaussian_network(process)
+    noise = np.random.default_rng(0).normal(size=(21, 8, 3)).astype(np.float32)
+    whole, half = (
+        sample(network, noise[0], noise[1:], process, SamplerConfig(kind, 20, temperature=v), CLIP)
+        for v in (1.0, 0.5)
+    )
+    assert np.abs(whole - MEAN).max() > 0.5
+    np.testing.assert_allclose(half - MEAN, (whole - MEAN) / 2, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+def test_predicted_clean_vectors_are_clipped_and_the_last_is_the_sample(kind):
+    process = respace(FULL, 20)
+    network = gaussian_network(process, mean=np.array([5.0, -5.0, 0.0], np.float32))
+    noise = np.random.default_rng(0).normal(size=(21, 6, 3)).astype(np.float32)
+    got, visited = sample(network, noise[0], noise[1:], process, SamplerConfig(kind, 20), 1.5, True)
+    assert visited.x.shape == visited.x0.shape == (20, 6, 3)
+    assert np.abs(visited.x0).max() == 1.5
+    np.testing.assert_allclose(got, visited.x0[-1], atol=1e-6)
+    np.testing.assert_array_equal(got, visited.x[-1])
+
+
+def test_ddim_moves_along_the_noise_that_the_clipped_clean_vector_leaves():
+    """By hand, in float64, with a network that always points far outside."""
+    process = respace(FULL, 4)
+    x = np.array([[0.3, -0.2]])
+    _, visited = sample(
+        lambda x_t, t: jnp.full((1, 4), 3.0), x, None, process, SamplerConfig("ddim", 4), 1.0, True
+    )
+    for step, index in enumerate([3, 2, 1, 0]):
+        abar, cleaner = process.alphas_cumprod[index], process.alphas_cumprod_prev[index]
+        clean = np.clip((x - np.sqrt(1 - abar) * 3.0) / np.sqrt(abar), -1, 1)
+        noise = (x - np.sqrt(abar) * clean) / np.sqrt(1 - abar)
+        x = np.sqrt(cleaner) * clean + np.sqrt(1 - cleaner) * noise
+        np.testing.assert_allclose(visited.x[step], x, rtol=1e-4, atol=1e-5)
+
+
+def test_recorded_noise_goes_from_the_noisiest_step_to_the_last_which_adds_none():
+    process, sampler = respace(FULL, 5), SamplerConfig(steps=5)
+    network = gaussian_network(process)
+    noise = np.random.default_rng(0).normal(size=(6, 2, 3)).astype(np.float32)
+
+    @jax.jit
+    def x_after(steps):
+        return sample(network, noise[0], steps, process, sampler, CLIP, True)[1].x
+
+    base = x_after(noise[1:])
+    for position in range(5):
+        changed = noise[1:].copy()
+        changed[position] += 1
+        moved = np.abs(x_after(changed) - base).max(axis=(1, 2)) > 0
+        assert moved.tolist() == [position < 4 and step >= position for step in range(5)]
+
+
+def test_the_network_is_told_steps_of_the_original_process():
+    process = respace(FULL, 5)
+    told = []
+
+    def network(x_t, t):
+        jax.debug.callback(lambda t: told.append(t.tolist()), t, ordered=True)
+        return jnp.zeros((*x_t.shape[:-1], 2 * x_t.shape[-1]))
+
+    sample(network, jnp.zeros((2, 3)), None, process, SamplerConfig("ddim", 5), CLIP).block_until_ready()
+    jax.effects_barrier()
+    assert told == [[step, step] for step in process.timestep_map[::-1]]
+
+
+def test_samples_of_an_example_do_not_depend_on_its_neighbours():
+    process, sampler = respace(FULL, 5), SamplerConfig(steps=5)
+    network, keys = gaussian_network(process), jax.random.split(jax.random.key(0), 4)
+    together = sample_with_key(network, keys, (4, 7, 3), process, sampler, CLIP)
+    alone = sample_with_key(network, keys[2], (7, 3), process, sampler, CLIP)
+    np.testing.assert_allclose(together[2], alone, rtol=1e-5)
+    assert np.abs(together[0] - together[1]).max() > 0.1
+
+
+def test_sampling_does_not_hold_the_noise_of_all_steps():
+    process, sampler = respace(FULL, 100), SamplerConfig()
+    shape = (1000, 3)
+    program = jax.jit(
+        lambda key: sample_with_key(gaussian_network(process), key, shape, process, sampler, CLIP)
+    ).lower(jax.random.key(0))
+    assert program.compile().memory_analysis().temp_size_in_bytes < 100 * 4 * math.prod(shape) / 4
+
+
+def test_what_cannot_be_sampled_is_refused():
+    process, x = respace(FULL, 5), jnp.zeros((2, 3))
+    network = gaussian_network(process)
+    with pytest.raises(ConfigError, match=r"needs noise of shape \(5, 2, 3\), got None"):
+        sample(network, x, None, process, SamplerConfig(steps=5), CLIP)
+    with pytest.raises(ConfigError, match="steps is 6 but the process has 5"):
+        sample(network, x, jnp.zeros((6, 2, 3)), process, SamplerConfig(steps=6), CLIP)
+    with pytest.raises(ConfigError, match="first axes"):
+        keys = jax.random.split(jax.random.key(0), 3)
+        sample_with_key(network, keys, (2, 3), process, SamplerConfig(steps=5), CLIP)
+    with pytest.raises(ConfigError, match="no effect on ddim"):
+        SamplerConfig("ddim", temperature=0.5, scale_initial_noise=False)
+
+
+def test_sampler_settings_survive_json():
+    settings = SamplerConfig("ddim", 25, 0.5)
+    assert from_dict(SamplerConfig, to_dict(settings)) == settings
