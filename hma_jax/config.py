@@ -286,6 +286,28 @@ class SamplerConfig:
         return self.kind == "ddpm" and self.temperature > 0
 
 
+@dataclass(frozen=True)
+class DecodeConfig:
+    """How a masked frame is filled (`decoding`).
+
+    `temperature` divides the logits of discrete tokens; 0 takes the most likely entry of each
+    factor. DIFFERS: the release divides probabilities, which a renormalising draw ignores
+    (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
+    """
+
+    unmask_steps: int = 2  # M
+    temperature: float = 0.0
+    top_k: int = 0  # draw from the k likeliest entries of each factor; 0: from all
+    order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    resample: bool = False  # continuous: predict every patch again in each step, as released
+
+    def __post_init__(self):
+        require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")
+        require(self.temperature >= 0, f"decode.temperature must not be negative, got {self.temperature}")
+        require(self.top_k >= 0, f"decode.top_k must not be negative, got {self.top_k}")
+
+
 Conditioning = Literal["concat+modulate", "modulate", "concat", "add", "cross_attention"]
 """How actions reach the trunk (paper section 4.1, reference section 1.6): as K more tokens per
 frame, through a shift and scale in every block, both, added to every token in every block, or
