@@ -97,7 +97,12 @@ class Manifest:
     def embodiment(self) -> Embodiment:
         """The model's view of this dataset's actions."""
         return Embodiment(
-            self.spec.name, self.spec.action_dim, self.stride, self.action_mean, self.action_std
+            self.spec.name,
+            self.spec.action_dim,
+            self.stride,
+            self.action_mean,
+            self.action_std,
+            self.spec.video_targets,
         )
 
     def hash(self) -> str:

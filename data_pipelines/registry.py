@@ -22,7 +22,8 @@ class DatasetSpec:
     """How one RLDS dataset is read.
 
     Keys are fields of a step as features.json names them. The action is the concatenation of
-    `action_keys` in their order; `action_dims` says how many values each has.
+    `action_keys` in their order; `action_dims` says how many values each has. Without any the
+    dataset is video alone; with `video_targets` False its frames are shown but never predicted.
     """
 
     name: str
@@ -33,11 +34,12 @@ class DatasetSpec:
     camera: str = ""  # for people
     split: str = "train"
     note: str = ""
+    video_targets: bool = True
 
     def __post_init__(self):
         require(
-            len(self.action_keys) == len(self.action_dims) >= 1,
-            f"dataset {self.name!r}: action_keys and action_dims must have the same length, at least 1",
+            len(self.action_keys) == len(self.action_dims),
+            f"dataset {self.name!r}: action_keys and action_dims must have the same length",
         )
         require(self.hz > 0, f"dataset {self.name!r}: hz must be positive, got {self.hz}")
 

@@ -235,7 +235,7 @@ class RldsDataset:
             ) from error
 
     def _actions(self, i: int, record: dict[str, Feature], keys: list[str], steps: int) -> np.ndarray:
-        columns = []
+        columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
         for key in keys:
             values, size = record.get(key, []), self.features[key].size
             if isinstance(values, list) or len(values) != steps * size or not steps:

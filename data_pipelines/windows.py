@@ -153,7 +153,7 @@ def cut_actions(
     followed by zeros.
     """
     stride, first = manifest.stride, start * manifest.frame_step
-    chunk = item.actions[first : first + frames * stride].reshape(frames, -1)
+    chunk = item.actions[first : first + frames * stride].reshape(frames, stride * item.actions.shape[1])
     padded = np.zeros((frames, width), np.float32)
     padded[:, : chunk.shape[1]] = chunk
     return padded

@@ -245,9 +245,11 @@ def evaluate(setting: Setting, run: Path) -> None:
             trained.table,
             materials,
             setting.study.eval,
+            trained.train.masking.setting,
             progress=lambda phase, done, total: update(done, total, phase),
         )
-    metrics = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr")
+    wanted = ("perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain")
+    metrics = [m for m in wanted if m in evaluation.overall]
     table = tidy_table(f"{_short(run)}, step {trained.step:,}", "dataset", *metrics)
     for name, stats in [*evaluation.datasets.items(), ("overall", evaluation.overall)]:
         table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
