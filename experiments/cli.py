@@ -20,11 +20,11 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from experiments import commands
+from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
 from hma_jax.host_memory import keep_freed_memory
 
-PROGRAM = "hma"
 Preset = Literal["smoke", "cpu", "accelerator", "paper"]
 Axis = Literal["datasets", "trajectories", "width"]
 
@@ -229,11 +229,6 @@ def _words(error: Exception) -> str:
 
 def _say(message: str) -> None:
     errors.print(message, markup=False, soft_wrap=True)
-
-
-def run_module(axis: str) -> None:
-    """The main of a sweep module: `python -m experiments.scale_width` is `hma sweep width`."""
-    sys.exit(main(["sweep", axis, *sys.argv[1:]]))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from experiments import scale_datasets, scale_trajectories, scale_width
 from experiments.atomic import write_atomically
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
+from experiments.program import PROGRAM
 from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
@@ -150,8 +151,8 @@ def wrote(*paths: Path, then: str = "") -> None:
 
 
 def command_line() -> str:
-    """The command as typed, with the program's name instead of its path."""
-    return shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    """The command as typed, whichever way the program was started."""
+    return shlex.join([PROGRAM, *sys.argv[1:]])
 
 
 def _short(path: Path) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweep import Sweep, make_sweep
 
@@ -31,6 +32,4 @@ def plan(study: Study) -> Sweep:
 
 
 if __name__ == "__main__":
-    from experiments.cli import run_module
-
-    run_module("trajectories")
+    run_sweep("trajectories")

@@ -1,7 +1,10 @@
 """The command line: one message and the right exit code for every mistake, fast and full help."""
 
+import ast
+import graphlib
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -77,6 +80,27 @@ def test_sweep_modules_run_as_programs():
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0 and "control" in done.stdout, done.stderr
+
+
+def test_experiments_do_not_import_in_a_circle():
+    """Imports inside functions count too; those for type checking only do not."""
+    folder = Path(commands.__file__).parent
+    graph = {path.stem: imports_of(path) for path in folder.glob("*.py")}
+    assert "commands" in graph["cli"] and "scale_width" in graph["commands"]
+    list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
+
+
+def imports_of(path):
+    """Modules of `experiments` that a file imports."""
+    tree = ast.parse(path.read_text())
+    unseen = [n for n in tree.body if isinstance(n, ast.If) and getattr(n.test, "id", "") == "TYPE_CHECKING"]
+    tree.body = [n for n in tree.body if n not in unseen]
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            own = node.module == "experiments"
+            names += [f"experiments.{alias.name}" for alias in node.names] if own else [node.module]
+    return {name.split(".")[1] for name in names if name.startswith("experiments.")}
 
 
 def test_report_is_drawn_again_from_disk(tmp_path, capsys):
