@@ -71,7 +71,7 @@ def study(where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
 
     Run the same command again after an interruption: only what is missing is done.
     """
-    _run(where, how, tuple(commands.AXES))
+    _run(where, how, commands.SCALING)
 
 
 @app.command(name="sweep")

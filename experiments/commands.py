@@ -23,7 +23,7 @@ from experiments.program import PROGRAM
 from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
-from experiments.sweep import reference_trial, unique_trials
+from experiments.sweep import reference_trial, titles, unique_trials
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
 from hma_jax.config import ConfigError, MeshConfig, to_dict
 
@@ -36,6 +36,8 @@ AXES = {
     "trajectories": scale_trajectories.plan,
     "width": scale_width.plan,
 }
+SCALING = ("datasets", "trajectories", "width")
+"""What `hma study` runs."""
 
 
 class TrialsFailed(Exception):
@@ -91,7 +93,8 @@ def run_study(
         common = {"provenance": to_dict(provenance), "mesh": to_dict(mesh)}
         # The widest take longest: first, so that no worker is left with one at the end.
         ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
-        jobs = [Job(id, trial.title, {"trial": to_dict(trial), **common}) for id, trial in ordered]
+        names = titles(sweeps, provenance)
+        jobs = [Job(id, names[id], {"trial": to_dict(trial), **common}) for id, trial in ordered]
         states = run_jobs(jobs, workspace, workers, retry_failed)
         draw(workspace, record)
     complain(jobs, states)
@@ -114,23 +117,29 @@ def run_jobs(
 
 def draw(workspace: Workspace, record: Record) -> None:
     """CSV, figures and page from whatever trials are finished."""
+    from experiments.optima import Optimum, find_optima
     from experiments.plots import plot_overview, plot_sweep
     from experiments.report import write_report
-    from experiments.rows import collect, read_csv, write_csv
+    from experiments.rows import Row, collect, read_csv, write_csv
 
     provenance = record.provenance
     if provenance is None:
         raise ConfigError(f"the study in {workspace.root} has not run yet; run `hma study --out {workspace.root}`")
     sweeps = [AXES[axis](record.study) for axis in record.axes]
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
-    write_csv(workspace.results, collect(sweeps, provenance, workspace.trials, states))
+    write_csv(workspace.results, Row, collect(sweeps, provenance, workspace.trials, states))
     rows = read_csv(workspace.results)  # figures show what the file says
     workspace.figures.mkdir(exist_ok=True)
     for sweep in sweeps:
-        plot_sweep(rows, sweep.name, workspace.figures / f"{sweep.name}.png")
-    plot_overview(rows, [s.name for s in sweeps], workspace.figures / "scaling.png")
-    write_report(workspace, record, sweeps, rows, states, provenance)
-    wrote(workspace.results, workspace.figures, workspace.report)
+        plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
+    plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")
+    tables = [workspace.results]
+    optima = find_optima(rows, sweeps)
+    if optima:
+        write_csv(workspace.optima, Optimum, optima)
+        tables.append(workspace.optima)
+    write_report(workspace, record, sweeps, rows, optima, states, provenance)
+    wrote(*tables, workspace.figures, workspace.report)
 
 
 def complain(jobs: Sequence[Job], states: dict[str, State]) -> None:

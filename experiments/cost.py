@@ -15,7 +15,7 @@ from experiments.paper_mixture import PAPER_MIXTURE
 from experiments.progress import tidy_table
 from experiments.provenance import Provenance
 from experiments.study import Study
-from experiments.sweep import Sweep, reference_trial, unique_trials
+from experiments.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
 from experiments.trial import Trial, trial_id
 from hma_jax.embodiments import Embodiment, EmbodimentTable
 
@@ -82,9 +82,9 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
     trials = unique_trials(sweeps, UNKNOWN)
     costs = {id: estimate(trial) for id, trial in trials.items()}
     total = sum(c.flops for c in costs.values())
-    train = study.train
+    budget = f"{all_steps(sweeps)} steps x batch {study.train.batch}"
     table = tidy_table(
-        f"Study '{study.name}': {len(trials)} trials of {train.steps:,} steps x batch {train.batch}",
+        f"Study '{study.name}': {len(trials)} trials of {budget}",
         "trial", "sets", "videos", "width", "params", "one robot", "FLOPs", "time",
     )  # fmt: skip
     table.caption = (
@@ -94,10 +94,11 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
         "single embodiment of 2 action dimensions. 'Videos' are per dataset. 'Control': trained on shuffled "
         "actions."
     )
-    shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in study.seeds}
+    seeds = {trial.train.seed for trial in trials.values()}
+    shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in seeds}
     for id, trial in trials.items():
         cost = costs[id]
-        seed = f", seed {trial.train.seed}" if len(study.seeds) > 1 else ""
+        seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
         table.add_row(
             ("reference" if id in shared else _axes_of(id, sweeps)) + seed,
             f"{len(trial.datasets)}",
@@ -112,10 +113,14 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
 
 
 def _axes_of(id: str, sweeps: Sequence[Sweep]) -> str:
-    """The axes of which a trial is a point, or that it is the control."""
-    owners = [(s.name, p.role) for s in sweeps for p in s.points if trial_id(p.trial, UNKNOWN) == id]
-    names = ["control" if role == "control" else name for name, role in owners]
-    return " + ".join(dict.fromkeys(names))
+    """What a trial is: the control, a variant, or a point of one axis or several."""
+    names: dict[str, str] = {}
+    for sweep in sweeps:
+        for point in sweep.points:
+            if trial_id(point.trial, UNKNOWN) == id:
+                own = "control" if point.role == CONTROL else sweep.remark(point) or sweep.name
+                names.setdefault(sweep.name, own)
+    return " + ".join(dict.fromkeys(names.values()))
 
 
 def _count(parameters: int) -> str:

@@ -1,4 +1,8 @@
-"""Scaling curves as PNG, from rows of the tidy CSV and nothing else."""
+"""Figures of sweeps as PNG: numbers from rows of the tidy CSV and nothing else.
+
+Curves over one number are drawn here, axes of names in `plot_names`, families of curves in
+`plot_families`.
+"""
 
 from __future__ import annotations
 
@@ -6,80 +10,70 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import NullLocator
 
-from experiments.rows import CurvePoint, Row, curve, tally
-
-INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
-COLOURS = {"perplexity": "#2b5c8a", "delta_psnr": "#b3541e"}
-LABELS = {
-    "perplexity": "perplexity",
-    "delta_psnr": "ΔPSNR, last frame (dB)",
-}
-AXES = {
-    "datasets": "datasets in the mixture",
-    "trajectories": "trajectories per dataset (at most)",
-    "width": "model width · parameters",
-}
-STYLE = {
-    "font.size": 10,
-    "axes.edgecolor": MUTED,
-    "axes.labelcolor": INK,
-    "xtick.color": MUTED,
-    "ytick.color": MUTED,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-}
+from experiments.plot_families import plot_family
+from experiments.plot_names import plot_names
+from experiments.plot_style import (
+    COLOURS,
+    LABELS,
+    MUTED,
+    STYLE,
+    drawn_metrics,
+    plain_log,
+    save,
+    show_control,
+    show_nothing,
+    show_tally,
+)
+from experiments.rows import UNTRAINED, CurvePoint, Row, curve
+from experiments.sweep import CONTROL, Sweep
 
 
-def plot_sweep(rows: Sequence[Row], sweep: str, path: Path) -> None:
-    """One axis of the study: perplexity and delta PSNR side by side."""
+def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
+    """One axis: a panel per metric."""
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(1, 2, figsize=(8.6, 3.5), layout="constrained")
-        for panel, metric in zip(panels, LABELS, strict=True):
-            _draw(panel, rows, sweep, metric)
-        _save(figure, path)
+        if sweep.labels:
+            figure = plot_names(rows, sweep)
+        elif sweep.base:
+            figure = plot_family(rows, sweep)
+        else:
+            metrics = drawn_metrics(rows, [sweep.name])
+            figure, panels = plt.subplots(
+                1, len(metrics), figsize=(4.3 * len(metrics), 3.5), layout="constrained", squeeze=False
+            )
+            for panel, metric in zip(panels[0], metrics, strict=True):
+                _draw(panel, rows, sweep, metric)
+        save(figure, path)
 
 
-def plot_overview(rows: Sequence[Row], sweeps: Sequence[str], path: Path) -> None:
-    """All axes in one figure: a column per sweep, laid out as figure 6 of the paper."""
+def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> None:
+    """All scaling curves in one figure: a column per sweep, laid out as figure 6 of the paper.
+
+    Without any, there is no file.
+    """
+    path.unlink(missing_ok=True)
+    if not sweeps:
+        return
+    metrics = drawn_metrics(rows, [s.name for s in sweeps])
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(
-            2, len(sweeps), figsize=(3.9 * len(sweeps), 6.2), layout="constrained", squeeze=False
-        )
+            len(metrics), len(sweeps), figsize=(3.9 * len(sweeps), 3.1 * len(metrics)),
+            layout="constrained", squeeze=False,
+        )  # fmt: skip
         for column, sweep in enumerate(sweeps):
-            for panel, metric in zip(panels[:, column], LABELS, strict=True):
+            for panel, metric in zip(panels[:, column], metrics, strict=True):
                 _draw(panel, rows, sweep, metric)
                 if column:
                     panel.set_ylabel("")
-        _save(figure, path)
+        save(figure, path)
 
 
-def _save(figure: plt.Figure, path: Path) -> None:
-    aside = path.with_suffix(".tmp.png")
-    figure.savefig(aside, dpi=160, metadata={"Software": None})
-    plt.close(figure)
-    aside.replace(path)
-
-
-def _draw(panel: Axes, rows: Sequence[Row], sweep: str, metric: str) -> None:
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     """One curve with standard errors, every seed's point, and the reference lines."""
-    points = curve(rows, sweep, metric)
+    points = curve(rows, sweep.name, metric)
     colour = COLOURS[metric]
     if points:
         xs = [p.x for p in points]
@@ -90,48 +84,33 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: str, metric: str) -> None:
         )  # fmt: skip
         if any(len(p.seeds) > 1 for p in points):
             panel.plot(
-                [p.x for p in points for _ in p.seeds], [v for p in points for v in p.seeds],
+                [p.x for p in points for _ in p.seeds], [v for p in points for v in p.seeds.values()],
                 "o", color=colour, alpha=0.45, markersize=3.5, markeredgewidth=0, zorder=4, label="seeds",
             )  # fmt: skip
         _x_axis(panel, points, sweep)
     else:
-        panel.text(0.5, 0.5, "no finished trial", transform=panel.transAxes, ha="center", color=MUTED)
-    _reference_line(panel, curve(rows, sweep, metric, role="control"), "shuffled actions", (0, (4, 2)))
+        show_nothing(panel)
+    show_control(panel, curve(rows, sweep.name, metric, CONTROL))
     if metric == "perplexity":
-        panel.set_yscale("log")
-        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-        panel.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-        panel.yaxis.set_minor_formatter(NullFormatter())
-        for p in curve(rows, sweep, metric, role="untrained"):  # far above: a line would flatten the curve
+        plain_log(panel, panel.yaxis)
+        for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve
             panel.set_title(f"untrained: {p.mean:.0f}", loc="left", fontsize=8.5, color=MUTED)
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
-    finished, total = tally(rows, sweep)
-    panel.set_title(f"{finished} of {total} trials", loc="right", fontsize=8.5, color=MUTED)
-    panel.set_xlabel(AXES.get(sweep, sweep))
+    show_tally(panel, rows, sweep.name)
+    panel.set_xlabel(sweep.axis + (" · parameters" if sweep.name == "width" else ""))
     panel.set_ylabel(LABELS[metric])
     if panel.get_legend_handles_labels()[0]:
         panel.legend(loc="best")
 
 
-def _reference_line(panel: Axes, points: list[CurvePoint], label: str, dashes: tuple) -> None:
-    """A horizontal line with its standard error, where such a trial finished."""
-    if not points:
-        return
-    mean, sem = points[-1].mean, points[-1].sem
-    panel.axhline(mean, color=MUTED, linewidth=1.3, linestyle=dashes, zorder=1, label=label)
-    if sem > 0:  # not nan
-        panel.axhspan(mean - sem, mean + sem, color=MUTED, alpha=0.12, linewidth=0, zorder=0)
-
-
-def _x_axis(panel: Axes, points: list[CurvePoint], sweep: str) -> None:
+def _x_axis(panel: Axes, points: list[CurvePoint], sweep: Sweep) -> None:
     """A log axis whose ticks are the points themselves."""
     panel.set_xscale("log")
-    names = {p.x: _count(p.x) for p in points}
-    if sweep == "width":
-        names = {p.x: f"{p.x}\n{_count(p.parameters)}" for p in points}
-    panel.xaxis.set_major_locator(FixedLocator(list(names)))
-    panel.xaxis.set_major_formatter(FuncFormatter(lambda v, _: names.get(round(v), "")))
+    names = [_count(p.x) for p in points]
+    if sweep.name == "width":
+        names = [f"{p.x}\n{_count(p.parameters)}" for p in points]
+    panel.set_xticks([p.x for p in points], names)
     panel.xaxis.set_minor_locator(NullLocator())
     if len(points) == 1:
         panel.set_xlim(points[0].x / 2, points[0].x * 2)

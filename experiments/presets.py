@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from experiments.paper_mixture import PAPER_MIXTURE
-from experiments.study import StoreConfig, Study, SuiteConfig
+from experiments.study import StoreConfig, Study, SuiteConfig, TransferConfig
 from hma_jax.config import (
     ConfigError,
     EvalConfig,
@@ -23,7 +23,7 @@ SMOKE = Study(
     tokenizer_train=TokenizerTrainConfig(steps=3, batch=4),
     model=ModelConfig(
         width=16, layers=2, heads=2, frames=4, tokens=16, action_tokens=2, factor_vocab=16,
-        mup=MupConfig(base_width=16),
+        action_heads=False, mup=MupConfig(base_width=16),
     ),
     train=TrainConfig(steps=3, batch=4, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=1),
                       masking=MaskingConfig(prompt_frames=2)),
@@ -31,6 +31,8 @@ SMOKE = Study(
     dataset_counts=(2, 3),
     trajectory_counts=(2, 4),
     widths=(8, 16),
+    ablation_seeds=(0, 1),
+    transfer=TransferConfig(rates=3, widths=(8, 16, 32), datasets=1),
     flops_per_second=2e9,
 )
 
@@ -42,7 +44,7 @@ CPU = Study(
     tokenizer_train=TokenizerTrainConfig(steps=2000, batch=32),
     model=ModelConfig(
         width=64, layers=2, heads=2, frames=12, tokens=16, action_tokens=1, factor_vocab=64,
-        mup=MupConfig(base_width=64), remat=False,
+        action_heads=False, mup=MupConfig(base_width=64), remat=False,
         # Twelve thousand windows must do where the release has millions: residual branches and
         # stems that do not start near zero, and the chunk that leads to a frame given with it.
         trunk_gain=0.5, stem_gain=1.0, action_alignment="causal",
@@ -56,6 +58,7 @@ CPU = Study(
     dataset_counts=(5, 10, 20, 40),
     trajectory_counts=(4, 8, 16, 480),
     widths=(24, 32, 64, 96),
+    transfer=TransferConfig(datasets=10, steps=400),
     flops_per_second=2.5e10,
 )
 
@@ -66,7 +69,7 @@ ACCELERATOR = Study(
     tokenizer_train=TokenizerTrainConfig(steps=10_000, batch=128, learning_rate=5e-4),
     model=ModelConfig(
         width=256, layers=12, heads=8, frames=12, tokens=64, action_tokens=16, factor_vocab=256,
-        compute_dtype="bfloat16",
+        action_heads=False, compute_dtype="bfloat16",
     ),
     train=TrainConfig(
         steps=20_000, batch=64,
@@ -77,6 +80,7 @@ ACCELERATOR = Study(
     trajectory_counts=(10, 30, 100, 300, 1000),
     widths=(64, 128, 256, 512),
     seeds=(0, 1, 2),
+    transfer=TransferConfig(steps=4000),
     flops_per_second=1e14,
 )
 
@@ -86,13 +90,14 @@ PAPER = Study(
     tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=1024,
                               encoder_blocks=3, decoder_blocks=6),
     tokenizer_train=TokenizerTrainConfig(steps=200_000, batch=64, learning_rate=1e-4),
-    model=ModelConfig(compute_dtype="bfloat16"),
+    model=ModelConfig(action_heads=False, compute_dtype="bfloat16"),
     train=TrainConfig(steps=60_000, batch=64),
     eval=EvalConfig(windows_per_dataset=500),
     store=StoreConfig(val_fraction=0.01, max_val=500),
     dataset_counts=(5, 10, 20, 30, 40),
     trajectory_counts=(10, 100, 1_000, 10_000, 100_000, 1_000_000),
     widths=(64, 128, 256, 512, 768, 1024),
+    transfer=TransferConfig(widths=(64, 256, 1024), steps=6000),
     tau=3.0,
     flops_per_second=8e14,  # eight accelerators at 100 TFLOP/s
 )

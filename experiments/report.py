@@ -6,39 +6,31 @@ CSV; only frames and run records are read from the trials' directories.
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from experiments.ledger import FINISHED
+from experiments.optima import Optimum
+from experiments.plot_style import drawn_metrics
 from experiments.provenance import Provenance
+from experiments.report_pieces import card, frames, picture, pm, section, table
 from experiments.report_style import CSS
-from experiments.rows import OVERALL, CurvePoint, Row, curve, load_result
+from experiments.report_sweeps import GAINS, TITLES, describe
+from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve, load_result
 from experiments.runner import State
-from experiments.sweep import Sweep, reference_trial, unique_trials
-from experiments.trial import trial_id
+from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
+from experiments.trial import Trial, trial_id
 from experiments.workspace import Record, Workspace
 from hma_jax.config import to_json
 
 SHOWN_STRIPS = 6
 """Datasets whose frames are visible at once; the others unfold."""
-
-QUESTIONS = {
-    "datasets": "Does training on more robots help or hurt those already there? All points are judged "
-    "on the smallest set of datasets and see the same number of windows in training.",
-    "trajectories": "What does more data per robot buy? Subsets are nested; the number of optimiser "
-    "steps is the same everywhere.",
-    "width": "What does a wider model buy? The learning rate is set once, at the base width, and "
-    "carried over by muP.",
-}
 
 
 def write_report(
@@ -46,31 +38,31 @@ def write_report(
     record: Record,
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
+    optima: Sequence[Optimum],
     states: dict[str, State],
     provenance: Provenance,
 ) -> None:
     """Writes workspace.report from `rows` and the figures already drawn."""
-    study = record.study
-    reference = trial_id(reference_trial(study, study.seeds[0]), provenance)
-    finished = states.get(reference, State("missing")).event == FINISHED
-    result = load_result(workspace.trials, reference) if finished else None
-    prompt = study.eval.prompt_frames
+    home = _home(sweeps)
+    reference = trial_id(_reference(home), provenance) if home else ""
+    finished = [id for id, state in states.items() if state.event == FINISHED]
+    shown = reference in finished
+    witness = reference if shown else next(iter(finished), None)
+    result = load_result(workspace.trials, witness) if witness else None
     body = [
-        _headline(workspace, record, sweeps, rows, states, result),
-        _section("Scaling curves", _picture(workspace.figures / "scaling.png", "Scaling curves"), *(
-            _axis(sweep, rows) for sweep in sweeps
-        )),
-        _section(
-            "True and predicted frames", _strips(workspace.trials / reference / "samples.npz", prompt)
-        ) if finished else "",
-        _section("Reference trial by dataset", _dataset_table(rows, sweeps, workspace)) if finished else "",
-        _section("Trials", _trial_table(workspace, sweeps, states, provenance)),
-        _section("How to repeat it", _origin(workspace, record, provenance, result)),
+        _headline(workspace, record, sweeps, rows, states, home, result),
+        *_curves(workspace, sweeps, rows, optima),
+        section("True and predicted frames", _strips(
+            workspace.trials / reference / "samples.npz", record.study.eval.prompt_frames
+        )) if shown else "",
+        section("Reference trial by dataset", _dataset_table(rows, home, workspace)) if shown else "",
+        section("Trials", _trial_table(workspace, sweeps, states, provenance)),
+        section("How to repeat it", _origin(workspace, record, provenance, result)),
     ]  # fmt: skip
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>HMA-JAX scaling study: {html.escape(study.name)}</title><style>{CSS}</style></head>\n"
+        f"<title>HMA-JAX study: {html.escape(record.study.name)}</title><style>{CSS}</style></head>\n"
         f"<body><main>{''.join(body)}</main></body></html>\n"
     )
     aside = workspace.report.with_suffix(".tmp")
@@ -81,36 +73,79 @@ def write_report(
 # --- Parts -----------------------------------------------------------------------------------
 
 
+def _home(sweeps: Sequence[Sweep]) -> Sweep | None:
+    """The sweep by which the reference trial is shown: the widest scope on which it stands."""
+    standing = [s for s in sweeps if s.reference_x is not None]
+    return max(standing, key=lambda s: len(s.scope), default=None)
+
+
+def _reference(home: Sweep) -> Trial:
+    return next(p.trial for p in home.points if p.x == home.reference_x)
+
+
 def _headline(
     workspace: Workspace,
     record: Record,
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     states: dict[str, State],
+    home: Sweep | None,
     result: dict[str, Any] | None,
 ) -> str:
     study = record.study
-    whole = next((s.name for s in sweeps if s.scope == study.dataset_names()), sweeps[0].name)
-    cards = [
-        _card("perplexity, reference", _last(curve(rows, whole, "perplexity")), "s.e. over windows and seeds"),
-        _card("perplexity, untrained", _last(curve(rows, whole, "perplexity", "untrained")),
-              f"vocabulary size is {study.model.vocab_size:,}"),
-        _card("ΔPSNR, reference", _last(curve(rows, whole, "delta_psnr")), "dB, last frame: true minus random actions"),
-        _card("ΔPSNR, shuffled actions", _last(curve(rows, whole, "delta_psnr", "control")),
-              "dB, must vanish within its error"),
-        _card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"),
-    ]  # fmt: skip
-    when = result["run"]["finished"] if result else "reference trial not finished"
+    metrics = drawn_metrics(rows, [s.name for s in sweeps])
+    cards = []
+    if home and "perplexity" in metrics:
+        cards += [
+            card("perplexity, reference", _at_reference(rows, home, "perplexity"),
+                 "s.e. over windows and seeds"),
+            card("perplexity, untrained", _at_reference(rows, home, "perplexity", UNTRAINED),
+                 f"vocabulary size is {study.model.vocab_size:,}"),
+        ]  # fmt: skip
+    if home and "delta_psnr" in metrics:
+        cards += [
+            card("ΔPSNR, reference", _at_reference(rows, home, "delta_psnr"),
+                 "dB, last frame: true minus random actions"),
+            card("ΔPSNR, shuffled actions", _at_reference(rows, home, "delta_psnr", CONTROL),
+                 "dB, must vanish within its error"),
+        ]  # fmt: skip
+    cards.append(
+        card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames")
+    )
+    when = result["run"]["finished"] if result else "no trial finished"
     unfinished = sum(state.event != FINISHED for state in states.values())
     warning = f'<p class="warning">{unfinished} trial(s) have no result; see the table of trials.</p>'
+    *others, final = [GAINS[s.name] for s in sweeps]
+    gains = f"{', '.join(others)} and {final}" if others else final
     return (
-        f"<header><h1>HMA scaling study <em>{html.escape(study.name)}</em></h1>"
-        f"<p class=lead>What do more robots, more data and more width buy an action-conditioned video "
-        f"model? {len(study.dataset_names())} dataset(s), {study.train.steps:,} steps of "
-        f"{study.train.batch} windows per trial, {len(study.seeds)} seed(s).</p>"
+        f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
+        f"<p class=lead>What an action-conditioned video model over many robots gains from {gains}: "
+        f"{max(len(p.trial.datasets) for s in sweeps for p in s.points)} dataset(s), "
+        f"{all_steps(sweeps)} steps of {study.train.batch} windows per trial.</p>"
         f"<p class=meta>{html.escape(when)}</p></header>"
-        f'<div class=cards>{"".join(cards)}</div>{warning if unfinished else ""}'
+        f"<div class=cards>{''.join(cards)}</div>{warning if unfinished else ''}"
     )
+
+
+def _at_reference(rows: Sequence[Row], home: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
+    """The curve's point where the reference trial stands."""
+    return next((p for p in curve(rows, home.name, metric, role) if p.x == home.reference_x), None)
+
+
+def _curves(
+    workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row], optima: Sequence[Optimum]
+) -> list[str]:
+    """A section for the scaling curves, which share a figure, and one for each other sweep."""
+    sections = []
+    scaling = [s for s in sweeps if s.scaling]
+    if scaling:
+        overview = picture(workspace.figures / "scaling.png", "Scaling curves")
+        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima) for s in scaling)))
+    for sweep in sweeps:
+        if not sweep.scaling:
+            figure = picture(workspace.figures / f"{sweep.name}.png", TITLES[sweep.name])
+            sections.append(section(TITLES[sweep.name], figure, describe(sweep, rows, optima)))
+    return sections
 
 
 def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
@@ -118,29 +153,7 @@ def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
     if not path.exists():
         return None
     quality = json.loads(path.read_text())
-    return CurvePoint(0, quality["mean"], quality["sem"], (), 0)
-
-
-def _axis(sweep: Sweep, rows: Sequence[Row]) -> str:
-    """The numbers of one curve, and its change from end to end in standard errors."""
-    perplexity, delta = curve(rows, sweep.name, "perplexity"), curve(rows, sweep.name, "delta_psnr")
-    table = _table(
-        [sweep.axis, "parameters", "perplexity", "ΔPSNR (dB)", "seeds"],
-        [
-            [f"{p.x:,}", f"{p.parameters:,}", _pm(p), _pm(d), str(len(p.seeds))]
-            for p, d in zip(perplexity, delta, strict=True)
-        ],
-    )
-    trend = ""
-    if len(perplexity) > 1:
-        trend = (
-            f"<p>From {perplexity[0].x:,} to {perplexity[-1].x:,}: perplexity "
-            f"{_change(perplexity)}, ΔPSNR {_change(delta)}.</p>"
-        )
-    return (
-        f"<h3>{html.escape(sweep.name.capitalize())}</h3><p>{html.escape(QUESTIONS.get(sweep.name, ''))} "
-        f"Averaged over {len(sweep.scope)} dataset(s).</p>{table}{trend}"
-    )
+    return CurvePoint(0, quality["mean"], quality["sem"], math.nan, {}, 0)
 
 
 def _strips(path: Path, prompt: int) -> str:
@@ -150,8 +163,12 @@ def _strips(path: Path, prompt: int) -> str:
         strips = [
             f"<figure class=strip><figcaption>{html.escape(name)}</figcaption>"
             + "".join(
-                f"<div><span>{label}</span>{_frames(samples[f'{name}/{kind}'][0], prompt)}</div>"
-                for kind, label in (("true", "true"), ("predicted", "predicted"), ("random", "random actions"))
+                f"<div><span>{label}</span>{frames(samples[f'{name}/{kind}'][0], prompt)}</div>"
+                for kind, label in (
+                    ("true", "true"),
+                    ("predicted", "predicted"),
+                    ("random", "random actions"),
+                )
             )
             + "</figure>"
             for name in names
@@ -165,19 +182,18 @@ def _strips(path: Path, prompt: int) -> str:
     )
 
 
-def _dataset_table(rows: Sequence[Row], sweeps: Sequence[Sweep], workspace: Workspace) -> str:
+def _dataset_table(rows: Sequence[Row], sweep: Sweep, workspace: Workspace) -> str:
     """One line per dataset; data.json says how much of it there was."""
-    sweep = max(sweeps, key=lambda s: len(s.scope))
     data = json.loads(workspace.data_summary.read_text()) if workspace.data_summary.exists() else {}
-    x = next(p.x for p in sweep.points if p.role == "control")  # where the reference trial stands
+    head = {"perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)",
+            "psnr_copy": "copying (dB)", "ssim": "SSIM", "delta_psnr": "ΔPSNR (dB)"}  # fmt: skip
+    measured = {r.metric for r in rows if r.sweep == sweep.name}
+    metrics = [m for m in head if m in measured]
 
     def cell(name: str, metric: str) -> str:
-        at = [p for p in curve(rows, sweep.name, metric, scope=name) if p.x == x]
-        return _pm(at[0]) if at else "–"
+        at = [p for p in curve(rows, sweep.name, metric, scope=name) if p.x == sweep.reference_x]
+        return pm(at[0].mean, at[0].sem) if at else "–"
 
-    metrics = ("perplexity", "accuracy", "psnr", "psnr_copy", "ssim", "delta_psnr")
-    head = ["dataset", "episodes", "too short", "skipped", "windows", "perplexity", "accuracy", "PSNR (dB)",
-            "copying (dB)", "SSIM", "ΔPSNR (dB)"]  # fmt: skip
     lines = []
     for name in (*sweep.scope, OVERALL):
         facts = data.get(name, {})
@@ -185,15 +201,16 @@ def _dataset_table(rows: Sequence[Row], sweeps: Sequence[Sweep], workspace: Work
         lines.append([html.escape(name), *counts, *(cell(name, metric) for metric in metrics)])
     return (
         "<p>PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR "
-        "of repeating the last given frame. Errors are standard errors.</p>" + _table(head, lines)
+        "of repeating the last given frame. Errors are standard errors.</p>"
+        + table(["dataset", "episodes", "too short", "skipped", "windows", *map(head.get, metrics)], lines)
     )
 
 
 def _trial_table(
     workspace: Workspace, sweeps: Sequence[Sweep], states: dict[str, State], provenance: Provenance
 ) -> str:
-    lines = []
-    for id, trial in unique_trials(sweeps, provenance).items():
+    lines, names = [], titles(sweeps, provenance)
+    for id, name in names.items():
         state = states[id]
         cells = ["–", "–", "–", "–"]
         if state.event == FINISHED:
@@ -203,10 +220,10 @@ def _trial_table(
                      f"{losses[-1]:.3f}"]  # fmt: skip
         message = html.escape(state.message)
         status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
-        lines.append([f"<code>{id}</code>", html.escape(trial.title), status, *cells])
-    done = sum(states[id].event == FINISHED for id in unique_trials(sweeps, provenance))
+        lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
+    done = sum(states[id].event == FINISHED for id in names)
     head = ["id", "trial", "status", "parameters", "train FLOPs", "time", "last loss"]
-    return f"<p>{done} of {len(lines)} finished.</p>" + _table(head, lines, text=3)
+    return f"<p>{done} of {len(lines)} finished.</p>" + table(head, lines, text=3)
 
 
 def _origin(
@@ -215,8 +232,8 @@ def _origin(
     machine = result["run"]["machine"] if result else {}
     facts = {
         "command": record.command,
-        "data": ", ".join(record.data) or f"embedded suite, scale {record.study.suite.scale:g}, "
-        f"seed {record.study.suite.seed}",
+        "data": ", ".join(record.data)
+        or f"embedded suite, scale {record.study.suite.scale:g}, seed {record.study.suite.seed}",
         "token store": provenance.store,
         "evaluation manifest": provenance.manifest,
         "tokenizer": provenance.tokenizer,
@@ -232,78 +249,3 @@ def _origin(
     )
     config = html.escape(to_json(record.study))
     return f"<dl>{items}</dl><details><summary>Configuration</summary><pre>{config}</pre></details>"
-
-
-# --- Pieces ----------------------------------------------------------------------------------
-
-
-def _section(title: str, *parts: str) -> str:
-    return f"<section><h2>{html.escape(title)}</h2>{''.join(parts)}</section>"
-
-
-def _card(label: str, point: CurvePoint | None, note: str) -> str:
-    value = _pm(point) if point else "–"
-    return f"<div class=card><small>{html.escape(label)}</small><b>{value}</b><small>{html.escape(note)}</small></div>"
-
-
-def _table(head: Sequence[str], lines: Iterable[Sequence[str]], text: int = 1) -> str:
-    """Cells are HTML already, headings are not. The first `text` columns are words, the rest numbers."""
-
-    def row(tag: str, cells: Sequence[str]) -> str:
-        kinds = [" class=text" if i < text else "" for i in range(len(cells))]
-        return "<tr>" + "".join(f"<{tag}{k}>{c}</{tag}>" for k, c in zip(kinds, cells, strict=True)) + "</tr>"
-
-    heading = row("th", [html.escape(h) for h in head])
-    body = "".join(row("td", line) for line in lines)
-    return f"<div class=scroll><table><thead>{heading}</thead><tbody>{body}</tbody></table></div>"
-
-
-def _pm(p: CurvePoint) -> str:
-    """Mean ± standard error, with the digits that the error leaves meaningful."""
-    if math.isnan(p.sem) or p.sem <= 0:
-        return f"{p.mean:.4g}"
-    return f"{_number(p.mean, p.sem)} <span class=sem>± {_number(p.sem, p.sem)}</span>"
-
-
-def _change(points: Sequence[CurvePoint]) -> str:
-    """From the first to the last point, and how many standard errors lie between them."""
-    first, last = points[0], points[-1]
-    error = math.hypot(first.sem, last.sem)
-    if not error > 0:  # also nan: a single window
-        return f"{first.mean:.3g} → {last.mean:.3g}"
-    size = abs(last.mean - first.mean) / error
-    return f"{_number(first.mean, error)} → {_number(last.mean, error)} ({size:.1f} standard errors)"
-
-
-def _number(value: float, error: float) -> str:
-    """`value` to two digits of `error`."""
-    digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
-    return f"{value:.{digits}f}".replace("-", "\u2212")
-
-
-def _last(points: Sequence[CurvePoint]) -> CurvePoint | None:
-    return points[-1] if points else None
-
-
-def _picture(path: Path, title: str) -> str:
-    if not path.exists():
-        return ""
-    return f'<img class=plot alt="{html.escape(title)}" src="{_data_uri(path.read_bytes())}">'
-
-
-def _frames(clip: np.ndarray, prompt: int) -> str:
-    """One row of frames [T, height, width, 3] as an image; a wider gap follows the prompt."""
-    count, height, width, _ = clip.shape
-    gap, wide = max(width // 16, 1), max(width // 4, 2)
-    starts = [t * (width + gap) + (wide if t >= prompt else 0) for t in range(count)]
-    row = np.zeros((height, starts[-1] + width, 4), np.uint8)
-    for start, frame in zip(starts, clip, strict=True):
-        row[:, start : start + width, :3] = frame
-        row[:, start : start + width, 3] = 255
-    buffer = io.BytesIO()
-    Image.fromarray(row).save(buffer, format="PNG", optimize=True)
-    return f'<img alt="" src="{_data_uri(buffer.getvalue())}">'
-
-
-def _data_uri(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()

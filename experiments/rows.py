@@ -20,30 +20,39 @@ from typing import Any
 from experiments.ledger import FINISHED
 from experiments.provenance import Provenance
 from experiments.runner import State
-from experiments.sweep import Point, Sweep
+from experiments.sweep import POINT, Point, Sweep
 from experiments.trial import trial_id
 from hma_jax.config import ConfigError
 
 OVERALL = "overall"
 """The scope that averages over all datasets of a sweep, each counting equally."""
 
-CURVES = ("perplexity", "delta_psnr")
+UNTRAINED = "untrained"
+"""The role of the reference trial before its first step."""
+
+TRAINING, LOSS = "training", "loss"
+"""Scope and metric of the objective on the trial's own mixture, averaged over its last steps."""
+LAST = 0.1
+"""The part of a run's steps that these are."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One number with its standard error over `n` windows, and where it comes from.
+    """One number with its standard error over `n` windows (the training loss: steps), and where it
+    comes from.
 
     A trial without a result has one row per sweep, with `metric` empty.
     """
 
     sweep: str
-    x: int
-    role: str  # "point", "control" (shuffled actions) or "untrained"
+    x: float
+    label: str  # the name of x, on an axis of names
+    role: str  # one of `sweep`, or UNTRAINED
+    series: str  # the curve, in a sweep of several
     seed: int
     trial: str
     status: str  # a state of `ledger`
-    scope: str  # OVERALL or a dataset
+    scope: str  # OVERALL, a dataset or TRAINING
     metric: str
     mean: float
     sem: float
@@ -82,11 +91,13 @@ def collect(
 def _rows(
     sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, provenance: Provenance
 ) -> list[Row]:
+    from hma_jax.evaluation.metrics import mean_and_sem
     from hma_jax.evaluation.protocol import Evaluation
 
     def row(role: str, scope: str, metric: str, mean: float, sem: float, n: int) -> Row:
         return Row(
-            sweep=sweep.name, x=point.x, role=role, seed=point.trial.train.seed, trial=id, status=state,
+            sweep=sweep.name, x=point.x, label=sweep.label(point.x), role=role, series=point.series,
+            seed=point.trial.train.seed, trial=id, status=state,
             scope=scope, metric=metric, mean=mean, sem=sem, n=n,
             parameters=result["parameters"] if result else 0,
             train_flops=result["train_flops"] if result else 0.0,
@@ -97,8 +108,10 @@ def _rows(
         return [row(point.role, "", "", math.nan, math.nan, 0)]
     parts = [(point.role, Evaluation.from_dict(result["evaluation"]))]
     if result["untrained"]:
-        parts.append(("untrained", Evaluation.from_dict(result["untrained"])))
-    rows = []
+        parts.append((UNTRAINED, Evaluation.from_dict(result["untrained"])))
+    last = result["losses"][-max(round(LAST * len(result["losses"])), 1) :]
+    loss = mean_and_sem(last)
+    rows = [row(point.role, TRAINING, LOSS, loss.mean, loss.sem, loss.n)]
     for role, evaluation in parts:
         judged = [name for name in sweep.scope if name in evaluation.datasets]  # those with windows
         scopes = {OVERALL: evaluation.over(judged)}
@@ -108,44 +121,56 @@ def _rows(
     return rows
 
 
-def write_csv(path: Path, rows: Iterable[Row]) -> None:
+def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
+    """A line for each of `rows`, dataclasses of one `kind`."""
     aside = path.with_suffix(".csv.tmp")
     with open(aside, "w", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(Row)], lineterminator="\n")
+        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(kind)], lineterminator="\n")
         writer.writeheader()
         writer.writerows(dataclasses.asdict(row) for row in rows)
     os.replace(aside, path)
 
 
 def read_csv(path: Path) -> list[Row]:
-    kinds = {"x": int, "seed": int, "n": int, "parameters": int}
+    kinds = {"x": _number, "seed": int, "n": int, "parameters": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
     with open(path, newline="") as file:
         return [Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}) for record in csv.DictReader(file)]
 
 
+def _number(text: str) -> float:
+    """An int where it was one."""
+    return int(text) if text.isdigit() else float(text)
+
+
 @dataclass(frozen=True)
 class CurvePoint:
-    """The seeds of one x together. `sem` joins the spread over seeds and over windows."""
+    """The seeds of one x together.
 
-    x: int
+    `sem` joins the spread over seeds and over windows. `seed_sem` is the former alone, nan for a
+    single seed: the error of a comparison on the same windows.
+    """
+
+    x: float
     mean: float
     sem: float
-    seeds: tuple[float, ...]
+    seed_sem: float
+    seeds: dict[int, float]  # the mean of each
     parameters: int
+    label: str = ""
 
 
 def curve(
-    rows: Iterable[Row], sweep: str, metric: str, role: str = "point", scope: str = OVERALL
+    rows: Iterable[Row], sweep: str, metric: str, role: str = POINT, scope: str = OVERALL, series: str = ""
 ) -> list[CurvePoint]:
-    """The points of a curve by increasing x.
+    """The points of a curve by increasing x; none where no trial has the metric.
 
     sem^2 = variance over seeds / seeds + mean of the windows' sem^2: all seeds are judged on the
     same windows, so that the second part does not shrink with their number.
     """
-    groups: dict[int, list[Row]] = defaultdict(list)
+    groups: dict[float, list[Row]] = defaultdict(list)
     for r in rows:
-        if (r.sweep, r.metric, r.role, r.scope) == (sweep, metric, role, scope):
+        if (r.sweep, r.metric, r.role, r.scope, r.series) == (sweep, metric, role, scope, series):
             groups[r.x].append(r)
     points = []
     for x, group in sorted(groups.items()):
@@ -153,11 +178,40 @@ def curve(
         mean = sum(means) / len(means)
         spread = sum((m - mean) ** 2 for m in means) / max(len(means) - 1, 1) / len(means)
         windows = sum(r.sem**2 for r in group) / len(group)
-        points.append(CurvePoint(x, mean, math.sqrt(spread + windows), tuple(means), group[0].parameters))
+        points.append(
+            CurvePoint(
+                x, mean, sem=math.sqrt(spread + windows),
+                seed_sem=math.sqrt(spread) if len(group) > 1 else math.nan,
+                seeds={r.seed: r.mean for r in group}, parameters=group[0].parameters, label=group[0].label,
+            )
+        )  # fmt: skip
     return points
 
 
+def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
+    """a minus b over the seeds that both have, and its standard error over seeds (nan for one).
+
+    Paired: a seed draws the same windows and, where parameters agree, the same initial values.
+    """
+    pairs = [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
+    if not pairs:
+        return math.nan, math.nan
+    mean = sum(pairs) / len(pairs)
+    if len(pairs) == 1:
+        return mean, math.nan
+    return mean, math.sqrt(sum((d - mean) ** 2 for d in pairs) / (len(pairs) - 1) / len(pairs))
+
+
+def all_series(rows: Iterable[Row], sweep: str) -> dict[str, list[str]]:
+    """{role: its series}, of a sweep with several curves, in the order of the rows."""
+    found: dict[str, list[str]] = {}
+    for r in rows:
+        if r.sweep == sweep and r.series and r.series not in found.setdefault(r.role, []):
+            found[r.role].append(r.series)
+    return found
+
+
 def tally(rows: Iterable[Row], sweep: str) -> tuple[int, int]:
-    """(finished, all) trials of a sweep's curve and control."""
-    status = {(r.trial, r.x): r.status for r in rows if r.sweep == sweep and r.role != "untrained"}
+    """(finished, all) trials of a sweep, its control among them."""
+    status = {(r.trial, r.x): r.status for r in rows if r.sweep == sweep and r.role != UNTRAINED}
     return sum(s == FINISHED for s in status.values()), len(status)

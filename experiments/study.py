@@ -1,8 +1,8 @@
 """What a study fixes: data, tokenizer, base model, budget, protocol and the points of each axis.
 
 Owns the `Study` record and how it is adapted (user data, command line overrides). Named
-instances are in `presets`; which trials follow from a study is in `scale_datasets`,
-`scale_trajectories` and `scale_width`. Nothing here imports JAX.
+instances are in `presets`; which trials follow from a study is in the modules of the axes (see
+`sweep`). Nothing here imports JAX.
 """
 
 from __future__ import annotations
@@ -48,9 +48,39 @@ class StoreConfig:
 
 
 @dataclass(frozen=True)
+class TransferConfig:
+    """The grid of the learning-rate sweep (`transfer_lr`), on a smaller trial if so declared."""
+
+    rates: int = 5  # per width; an odd number, so that the study's own rate is in the middle
+    factor: float = 2.0  # between one rate and the next
+    widths: tuple[int, ...] = ()  # (): those of the study
+    datasets: int | None = None  # only the first so many; None: all
+    steps: int | None = None  # None: as many as every other trial
+
+    def __post_init__(self):
+        require(
+            self.rates >= 3 and self.rates % 2 == 1,
+            f"transfer.rates must be odd and at least 3, got {self.rates}",
+        )
+        require(self.factor > 1, f"transfer.factor must be larger than 1, got {self.factor}")
+        require_increasing("transfer.widths", self.widths, at_least=1)
+        for name in ("datasets", "steps"):
+            value = getattr(self, name)
+            require(value is None or value >= 1, f"transfer.{name} must be at least 1, got {value}")
+
+
+def require_increasing(name: str, points: tuple[int, ...], at_least: int) -> None:
+    """Raises ConfigError unless `points` increase from `at_least`."""
+    require(
+        list(points) == sorted(set(points)) and all(p >= at_least for p in points),
+        f"{name} must increase and be at least {at_least}, got {points}",
+    )
+
+
+@dataclass(frozen=True)
 class Study:
-    """One scaling study. The reference trial, which all three axes share, uses all datasets,
-    the largest trajectory count and the base model."""
+    """One scaling study. The reference trial, which most axes share, uses all datasets, the
+    largest trajectory count and the base model."""
 
     name: str
     model: ModelConfig
@@ -66,16 +96,15 @@ class Study:
     datasets: tuple[str, ...] = ()  # in the order they are added; () takes the suite's own order
     tau: float = 3.0  # temperature of the mixture
     seeds: tuple[int, ...] = (0,)
+    ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
+    transfer: TransferConfig = field(default_factory=TransferConfig)
     flops_per_second: float = 1e13  # sustained; only for the cost estimates of --dry-run
 
     def __post_init__(self):
-        for axis in ("dataset_counts", "trajectory_counts", "widths", "seeds"):
+        for axis in ("dataset_counts", "trajectory_counts", "widths", "seeds", "ablation_seeds"):
             points = getattr(self, axis)
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
-            require(
-                list(points) == sorted(set(points)) and (axis == "seeds" or points[0] >= 1),
-                f"{axis} must increase and be positive, got {points}",
-            )
+            require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
         require(
             self.model.width in self.widths,
             f"widths {self.widths} must contain model.width {self.model.width}, the width of the "

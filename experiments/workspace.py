@@ -58,6 +58,11 @@ class Workspace:
         return self.root / "results.csv"
 
     @property
+    def optima(self) -> Path:
+        """Best learning rates per width, where they were swept."""
+        return self.root / "optima.csv"
+
+    @property
     def figures(self) -> Path:
         return self.root / "figures"
 

@@ -3,17 +3,20 @@
 import json
 import math
 import zlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from experiments.commands import AXES
+from experiments.commands import AXES, SCALING
 from experiments.ledger import Ledger
 from experiments.presets import SMOKE
 from experiments.provenance import Provenance
-from experiments.study import Study
-from experiments.sweep import unique_trials
+from experiments.rows import Row, collect
+from experiments.runner import read_states
+from experiments.study import Study, TransferConfig
+from experiments.sweep import Sweep, titles, unique_trials
 from experiments.trial import Trial, write_samples
 from experiments.workspace import Record, Workspace
 
@@ -25,48 +28,78 @@ STUDY = replace(
     trajectory_counts=(2, 4, 8),
     widths=(8, 16),
     seeds=(0, 1),
+    ablation_seeds=(0, 1, 2),
+    transfer=TransferConfig(widths=(8, 16, 32)),
 )
 
 
-def finished_study(root: Path, study: Study = STUDY, broken: dict[str, str] | None = None) -> Workspace:
+def finished_study(
+    root: Path,
+    study: Study = STUDY,
+    broken: dict[str, str] | None = None,
+    axes: Sequence[str] = SCALING,
+    without: Sequence[str] = (),
+) -> Workspace:
     """A workspace with a result for every trial, but a failure for titles that contain a key of
-    `broken` (its value is the state). Ready for `commands.draw`."""
+    `broken` (its value is the state). Ready for `commands.draw`. Metrics in `without` are left
+    out, as by a model that has none."""
     workspace = Workspace(root)
     ledger = Ledger(workspace.ledger)
-    for id, trial in unique_trials([plan(study) for plan in AXES.values()], PROVENANCE).items():
+    sweeps = [AXES[axis](study) for axis in axes]
+    names = titles(sweeps, PROVENANCE)
+    for id, trial in unique_trials(sweeps, PROVENANCE).items():
         directory = workspace.trials / id
         directory.mkdir(parents=True)
-        state = next((s for words, s in (broken or {}).items() if words in trial.title), None)
+        state = next((s for words, s in (broken or {}).items() if words in names[id]), None)
         if state:
             ledger.append(id, state, message="the loss is <nan> at step 2")
             continue
         ledger.append(id, "finished")
-        (directory / "result.json").write_text(json.dumps(result_of(trial)))
+        (directory / "result.json").write_text(json.dumps(result_of(trial, without)))
         write_samples(directory / "samples.npz", samples_of(trial))
     return workspace
 
 
-def record_of(study: Study = STUDY) -> Record:
-    return Record(study, axes=tuple(AXES), command="hma study", provenance=PROVENANCE)
+def record_of(study: Study = STUDY, axes: Sequence[str] = SCALING) -> Record:
+    return Record(study, axes=tuple(axes), command="hma study", provenance=PROVENANCE)
 
 
-def result_of(trial: Trial) -> dict:
-    """Perplexity that falls with data and width; no control without true actions."""
-    perplexity = 200 / math.sqrt(trial.max_trajectories * trial.model.width) + trial.train.seed
-    delta = 0.0 if trial.shuffle_actions else 0.1 * trial.model.width
-    stats = {"perplexity": perplexity, "delta_psnr": delta, "psnr": 20.0, "psnr_copy": 18.0, "ssim": 0.8,
-             "accuracy": 0.3}  # fmt: skip
+def rows_of(workspace: Workspace, sweeps: Sequence[Sweep]) -> list[Row]:
+    """The rows that `commands.draw` would draw, without drawing."""
+    ids = list(unique_trials(sweeps, PROVENANCE))
+    states = read_states(ids, workspace.trials, Ledger(workspace.ledger))
+    return collect(sweeps, PROVENANCE, workspace.trials, states)
+
+
+def best_rate(trial: Trial) -> float:
+    """Where the fake loss is lowest: fixed under muP, falling with width without it."""
+    rate = STUDY.train.optimizer.learning_rate
+    return rate if trial.model.mup.enabled else rate * trial.model.mup.base_width / trial.model.width
+
+
+def result_of(trial: Trial, without: Sequence[str] = ()) -> dict:
+    """Perplexity that falls with data, width and conditioning on actions; no control without true
+    actions."""
+    setting, model = trial.train.masking.setting, trial.model
+    blind = trial.shuffle_actions or setting == "passive"
+    handicap = {"passive": 2.0, "full": 1.0}.get(setting, 0.0)
+    handicap += {"concat": 0.5, "add": 0.8}.get(model.conditioning, 0.0)
+    off = math.log2(trial.train.optimizer.learning_rate / best_rate(trial))
+    perplexity = 200 / math.sqrt(trial.max_trajectories * model.width) + trial.train.seed + handicap + off**2
+    delta = 0.0 if blind else 0.1 * model.width
+    stats = {"perplexity": perplexity, "cross_entropy": math.log(perplexity), "delta_psnr": delta,
+             "psnr": 20.0, "psnr_copy": 18.0, "ssim": 0.8, "accuracy": 0.3}  # fmt: skip
     evaluation = {
-        name: {m: {"mean": v + i, "sem": 0.2, "n": 10} for m, v in stats.items()}
+        name: {m: {"mean": v + i, "sem": 0.2, "n": 10} for m, v in stats.items() if m not in without}
         for i, name in enumerate(trial.evaluated)
     }
-    vocabulary = {n: {"perplexity": {"mean": 256.0, "sem": 0.0, "n": 2}} for n in trial.evaluated}
+    first = {m: {"mean": 256.0, "sem": 0.0, "n": 2} for m in ("perplexity", "psnr") if m not in without}
     return {
         "evaluation": evaluation,
-        "untrained": vocabulary if trial.measure_untrained else None,
-        "losses": [5.0, 4.0],
-        "parameters": 100 * trial.model.width**2,
-        "train_flops": 1e9 * trial.model.width,
+        "untrained": dict.fromkeys(trial.evaluated, first) if trial.measure_untrained else None,
+        "losses": [5.0] * 18 + [4.0 + off**2 / 10, 3.0 + off**2 / 10],
+        "parameters": 100 * model.width**2,
+        "train_flops": 1e9 * model.width,
         "run": {
             "seconds": 3.0, "finished": "2025-01-01 12:00:00 +0000",
             "machine": {"processor": "abacus", "cores": 2, "devices": ["1 x cpu"], "commit": "abc",

@@ -6,20 +6,11 @@ import re
 import pytest
 
 from experiments.commands import draw
-from experiments.ledger import Ledger
-from experiments.rows import OVERALL, collect, curve, read_csv, tally, write_csv
-from experiments.runner import read_states
+from experiments.rows import OVERALL, Row, curve, read_csv, tally, write_csv
 from experiments.scale_datasets import plan as plan_datasets
 from experiments.scale_width import plan as plan_width
-from experiments.sweep import unique_trials
 from hma_jax.config import ConfigError
-from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
-
-
-def rows_of(workspace, sweeps):
-    ids = list(unique_trials(sweeps, PROVENANCE))
-    states = read_states(ids, workspace.trials, Ledger(workspace.ledger))
-    return collect(sweeps, PROVENANCE, workspace.trials, states)
+from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +34,9 @@ def test_rows_carry_hashes_and_average_over_the_scope(drawn):
 
 def test_csv_reads_back_what_was_written(drawn, tmp_path):
     rows = rows_of(drawn, [plan_width(STUDY)])
-    write_csv(tmp_path / "a.csv", rows)
+    write_csv(tmp_path / "a.csv", Row, rows)
     again = read_csv(tmp_path / "a.csv")
-    write_csv(tmp_path / "b.csv", again)
+    write_csv(tmp_path / "b.csv", Row, again)
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
     assert [r for r in again if r.metric] == [r for r in rows if r.metric]
 
@@ -55,7 +46,7 @@ def test_curve_joins_seeds_and_windows(drawn):
     assert [p.x for p in points] == [8, 16]
     assert len(points[0].seeds) == 1 and len(points[1].seeds) == 2  # one seed of width 8 diverged
     both = points[1]
-    assert both.mean == pytest.approx(sum(both.seeds) / 2)
+    assert both.mean == pytest.approx(sum(both.seeds.values()) / 2)
     spread = (both.seeds[0] - both.seeds[1]) ** 2 / 4
     assert both.sem == pytest.approx(math.sqrt(spread + 0.04 / 3))
 

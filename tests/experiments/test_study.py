@@ -97,6 +97,7 @@ def test_override_sets_nested_fields_and_lists():
         ("store.corrupt=ignore", "store.corrupt: 'ignore'.*raise, skip"),
         ("model.frames=null", "model.frames: expected int, got None"),
         ("widths=4,8.5", "widths: expected int, got 8.5"),
+        ("ablation_seeds=2,1", "ablation_seeds must increase"),
     ],
 )
 def test_wrong_override_names_the_field(setting, message):

@@ -1,0 +1,103 @@
+"""Where each of several curves is lowest, and what it costs to take another's best point.
+
+For learning rates: how far off the rate that is best at the base width is at the others. Only
+points of the grid are compared: an optimum between them is not interpolated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from experiments.ledger import DIVERGED, FINISHED
+from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference
+from experiments.sweep import Sweep
+
+LOSSES = {"cross_entropy": OVERALL, LOSS: TRAINING}
+"""What optima are taken of, with scopes: nats per held-out token, and the training objective."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best point of one curve by one loss."""
+
+    sweep: str
+    metric: str
+    role: str
+    series: str
+    x: float
+    edge: str  # "edge": the best is at an end of what was tried, so that it may lie beyond; or ""
+    loss: float
+    seed_sem: float  # over seeds, nan for one
+    transferred_x: float  # the best x of the base series in the same role; nan without one
+    penalty: float  # loss there minus `loss`; inf if it diverged, nan if it has no result
+    penalty_seed_sem: float
+
+
+def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
+    """One for every curve with a finished trial, of sweeps that have a base series."""
+    found = []
+    for sweep in sweeps:
+        if not sweep.base:
+            continue
+        for metric, scope in LOSSES.items():
+            for role, series in all_series(rows, sweep.name).items():
+                curves = {s: curve(rows, sweep.name, metric, role, scope, s) for s in series}
+                best = {
+                    s: lowest(points, diverged(rows, sweep.name, role, s)) for s, points in curves.items()
+                }
+                base = best.get(sweep.base)
+                found += [
+                    _optimum(rows, sweep.name, metric, role, s, curves[s], point, base)
+                    for s, point in best.items()
+                    if point
+                ]
+    return found
+
+
+def diverged(rows: Iterable[Row], sweep: str, role: str, series: str) -> set[float]:
+    """The x of a curve at which a seed diverged: no candidates, whatever the other seeds did."""
+    return {r.x for r in _of(rows, sweep, role, series) if r.status == DIVERGED}
+
+
+def ends(rows: Iterable[Row], sweep: str, role: str, series: str) -> set[float]:
+    """The first and last x of a curve that have been tried: finished or diverged."""
+    tried = sorted(r.x for r in _of(rows, sweep, role, series) if r.status in (FINISHED, DIVERGED))
+    return set(tried[:1] + tried[-1:])
+
+
+def lowest(points: Sequence[CurvePoint], excluded: set[float]) -> CurvePoint | None:
+    """The best point of a curve, if any has a finite mean and is not `excluded`."""
+    candidates = [p for p in points if p.x not in excluded and math.isfinite(p.mean)]
+    return min(candidates, key=lambda p: p.mean, default=None)
+
+
+def _optimum(
+    rows: Sequence[Row],
+    sweep: str,
+    metric: str,
+    role: str,
+    series: str,
+    points: Sequence[CurvePoint],
+    best: CurvePoint,
+    base: CurvePoint | None,
+) -> Optimum:
+    transferred, penalty, error = math.nan, math.nan, math.nan
+    if base:
+        transferred = base.x
+        there = next((p for p in points if p.x == base.x), None)
+        if base.x in diverged(rows, sweep, role, series):
+            penalty = math.inf
+        elif there:
+            penalty, error = difference(there, best)
+    return Optimum(
+        sweep, metric, role, series, best.x,
+        edge="edge" if best.x in ends(rows, sweep, role, series) else "",
+        loss=best.mean, seed_sem=best.seed_sem,
+        transferred_x=transferred, penalty=penalty, penalty_seed_sem=error,
+    )  # fmt: skip
+
+
+def _of(rows: Iterable[Row], sweep: str, role: str, series: str) -> list[Row]:
+    return [r for r in rows if (r.sweep, r.role, r.series) == (sweep, role, series)]
