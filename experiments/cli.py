@@ -26,7 +26,7 @@ from hma_jax.config import ConfigError, MeshConfig
 from hma_jax.host_memory import keep_freed_memory
 
 Preset = Literal["smoke", "cpu", "accelerator", "paper"]
-Axis = Literal["datasets", "trajectories", "width"]
+Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,10 @@ def study(where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
 
 @app.command(name="sweep")
 def sweep(axis: Positional[Axis], where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
-    """Run one axis of a study: datasets, trajectories or width.
+    """Run one axis: datasets, trajectories, width; settings, conditioning; or lr.
 
-    Shares data and the reference trial with the other axes of the same --out.
+    The first three are those of `hma study`, the next two its ablations; lr is the transfer of
+    learning rates between widths. Shares data and trials with other axes of the same --out.
     """
     _run(where, how, (axis,))
 

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from experiments import scale_datasets, scale_trajectories, scale_width
+from experiments import (
+    ablate_conditioning,
+    ablate_settings,
+    scale_datasets,
+    scale_trajectories,
+    scale_width,
+    transfer_lr,
+)
 from experiments.atomic import write_atomically
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
@@ -35,6 +42,9 @@ AXES = {
     "datasets": scale_datasets.plan,
     "trajectories": scale_trajectories.plan,
     "width": scale_width.plan,
+    "settings": ablate_settings.plan,
+    "conditioning": ablate_conditioning.plan,
+    "lr": transfer_lr.plan,
 }
 SCALING = ("datasets", "trajectories", "width")
 """What `hma study` runs."""

@@ -74,12 +74,21 @@ def test_paper_plan_prints_the_papers_sizes(capsys):
         assert any(width in words and size in words for words in lines)
 
 
-def test_sweep_modules_run_as_programs():
+@pytest.mark.parametrize(
+    ("module", "shown"),
+    [
+        ("scale_width", "control"),
+        ("ablate_settings", "full dynamics, seed 1"),
+        ("ablate_conditioning", "cross_attention, seed 0"),
+        ("transfer_lr", "learning rate 0.002, no muP"),
+    ],
+)
+def test_sweep_modules_run_as_programs(module, shown):
     done = subprocess.run(
-        [sys.executable, "-m", "experiments.scale_width", "--preset", "smoke", "--dry-run"],
+        [sys.executable, "-m", f"experiments.{module}", "--preset", "smoke", "--dry-run"],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
-    assert done.returncode == 0 and "control" in done.stdout, done.stderr
+    assert done.returncode == 0 and shown in done.stdout, done.stderr
 
 
 def test_experiments_do_not_import_in_a_circle():
@@ -103,6 +112,12 @@ def imports_of(path):
     return {name.split(".")[1] for name in names if name.startswith("experiments.")}
 
 
+def test_a_study_is_the_scaling_axes_only(capsys):
+    assert main(["study", "--preset", "smoke", "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "5 trials" in said and "passive" not in said
+
+
 def test_report_is_drawn_again_from_disk(tmp_path, capsys):
     workspace = finished_study(tmp_path)
     save_record(workspace, record_of())
@@ -115,11 +130,9 @@ def instant_trials(monkeypatch):
     """Nothing is prepared; trials have fake results, but those of width 8 fail."""
 
     def run_missing(jobs, trials, ledger, **_):
-        finished_study(trials.parent, load_study(trials.parent), broken={"width 8 ": "failed"})
+        record = load_record(Workspace(trials.parent))
+        finished_study(trials.parent, record.study, broken={"width 8 ": "failed"}, axes=record.axes)
         return read_states([job.id for job in jobs], trials, Ledger(ledger.path))
-
-    def load_study(root):
-        return load_record(Workspace(root)).study
 
     monkeypatch.setattr(pipeline, "prepare", lambda *_: PROVENANCE)
     monkeypatch.setattr(commands, "run_missing", run_missing)
@@ -131,6 +144,12 @@ def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp
     assert "1 of 5 trials have no result" in said.err and "width 8" in said.err and "--retry-failed" in said.err
     assert "failed" in (tmp_path / "results.csv").read_text()
     assert (tmp_path / "report.html").exists()
+
+
+def test_an_ablation_ends_in_its_own_page(instant_trials, tmp_path, capsys):
+    assert main(["sweep", "settings", "--preset", "smoke", "--out", str(tmp_path)]) == 0
+    assert [p.name for p in (tmp_path / "figures").iterdir()] == ["settings.png"]
+    assert "Ablation: dynamics setting" in (tmp_path / "report.html").read_text()
 
 
 def test_axes_of_one_study_share_a_report(instant_trials, tmp_path):

@@ -1,0 +1,138 @@
+"""The ablations: one thing changes at a time, the default is the reference, errors are over seeds."""
+
+import math
+from dataclasses import replace
+from typing import get_args
+
+import pytest
+
+from experiments import ablate_conditioning, ablate_settings, scale_width
+from experiments.commands import draw
+from experiments.presets import CPU, PRESETS, SMOKE
+from experiments.rows import curve, difference, read_csv
+from experiments.sweep import CONTROL, POINT, reference_trial, titles, unique_trials
+from experiments.trial import trial_id
+from hma_jax.config import Conditioning, ConfigError, diff
+from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
+
+
+def changes(sweep, study) -> dict[str, set[str]]:
+    """{name: configuration fields in which its trials differ from the reference}."""
+    found = {}
+    for point in sweep.points:
+        if point.role == POINT:
+            lines = diff(reference_trial(study, point.trial.train.seed), point.trial)
+            fields = {line.split(":")[0] for line in lines} - {"measure_untrained"}
+            found.setdefault(sweep.label(point.x), set()).update(fields)
+    return found
+
+
+def test_settings_change_the_setting_and_heads_only_where_actions_are_predicted():
+    sweep = ablate_settings.plan(CPU)
+    assert changes(sweep, CPU) == {
+        "passive": {"train.masking.setting"},
+        "full dynamics": {"train.masking.setting", "model.action_heads"},
+        "forward dynamics": set(),
+    }
+    trials = [p.trial for p in sweep.points if p.role == POINT]
+    heads = {t.train.masking.setting: t.model.action_heads for t in trials}
+    assert heads == {"passive": False, "full": True, "forward": False}
+
+
+@pytest.mark.parametrize(("base", "other"), [("released", "causal"), ("causal", "released")])
+def test_every_conditioning_and_the_other_alignment(base, other):
+    study = replace(SMOKE, model=replace(SMOKE.model, action_alignment=base))
+    found = changes(ablate_conditioning.plan(study), study)
+    assert set(get_args(Conditioning)) < set(found) and len(found) == 6
+    assert found.pop("concat+modulate") == set()
+    assert found.pop(f"concat+modulate, {other} alignment") == {"model.action_alignment"}
+    assert set(map(frozenset, found.values())) == {frozenset({"model.conditioning"})}
+
+
+def test_the_default_is_where_the_study_is():
+    study = replace(SMOKE, model=replace(SMOKE.model, conditioning="add"))
+    sweep = ablate_conditioning.plan(study)
+    assert sweep.label(sweep.reference_x) == "add"
+    passive = replace(SMOKE.train.masking, setting="passive")
+    study = replace(SMOKE, train=replace(SMOKE.train, masking=passive))
+    sweep = ablate_settings.plan(study)
+    assert sweep.label(sweep.reference_x) == "passive"
+    with pytest.raises(ConfigError, match="train.masking.setting is 'policy'"):
+        masking = replace(passive, setting="policy")
+        ablate_settings.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
+
+
+@pytest.mark.parametrize("study", PRESETS.values(), ids=PRESETS)
+def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(study):
+    settings, conditioning = ablate_settings.plan(study), ablate_conditioning.plan(study)
+    assert {p.trial.train.seed for p in settings.points} == set(study.ablation_seeds)
+    seeds = len(study.ablation_seeds)
+    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (3 + 6 - 1) * seeds + 1
+    width = unique_trials([scale_width.plan(study)], PROVENANCE)
+    shared = [p for p in settings.points if p.x == settings.reference_x and p.trial.train.seed in study.seeds]
+    assert {p.role for p in shared} == {POINT, CONTROL}
+    assert all(trial_id(p.trial, PROVENANCE) in width for p in shared)
+
+
+def test_published_presets_have_error_bars():
+    assert all(len(PRESETS[name].ablation_seeds) >= 3 for name in ("cpu", "accelerator", "paper"))
+
+
+def test_titles_tell_trials_apart():
+    sweeps = [ablate_settings.plan(STUDY), ablate_conditioning.plan(STUDY)]
+    lines = titles(sweeps, PROVENANCE)
+    assert len(set(lines.values())) == len(lines) == len(unique_trials(sweeps, PROVENANCE))
+    assert any(line.endswith("seed 1 · passive") for line in lines.values())
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Both ablations, in which one seed of the passive model failed."""
+    axes = ("settings", "conditioning")
+    workspace = finished_study(
+        tmp_path_factory.mktemp("study"), axes=axes, broken={"seed 1 · passive": "failed"}
+    )
+    draw(workspace, record_of(axes=axes))
+    return workspace
+
+
+def test_rows_carry_the_name_of_their_place(drawn):
+    rows = read_csv(drawn.results)
+    names = {(r.x, r.label) for r in rows if r.sweep == "settings"}
+    assert names == {(0, "passive"), (1, "full dynamics"), (2, "forward dynamics")}
+
+
+def test_errors_are_over_seeds_and_differences_are_paired(drawn):
+    passive, full, forward = curve(read_csv(drawn.results), "settings", "perplexity")
+    assert forward.seed_sem == pytest.approx(math.sqrt(1 / 3))  # seeds 0, 1, 2 shift the fake by as much
+    assert forward.sem > forward.seed_sem  # the other one has the windows in it
+    assert difference(full, forward) == (pytest.approx(1.0), pytest.approx(0.0, abs=1e-9))
+    assert set(passive.seeds) == {0, 2}
+    assert difference(passive, forward)[0] == pytest.approx(2.0)  # without seed 1, which passive lacks
+    assert math.isnan(difference(passive, replace(forward, seeds={0: 1.0}))[1])
+
+
+def test_page_names_variants_and_marks_the_default(drawn):
+    page = drawn.report.read_text()
+    for text in ("passive", "<b>forward dynamics</b>", "<b>concat+modulate</b>", "causal alignment",
+                 "<td>+1", "default, shuffled actions", "Reference trial by dataset", "1 trial(s) have no result"):  # fmt: skip
+        assert text in page, text
+    assert "Scaling curves" not in page and not (drawn.figures / "scaling.png").exists()
+    assert page.count("data:image/png;base64,") == 2 + 3 * 3  # two figures, three strips of three datasets
+
+
+def test_page_of_a_model_without_perplexity(tmp_path):
+    axes = ("width", "settings", "lr")
+    workspace = finished_study(tmp_path, axes=axes, without=("perplexity", "cross_entropy"))
+    draw(workspace, record_of(axes=axes))
+    page = workspace.report.read_text()
+    shown = page.split("<details><summary>Configuration")[0]
+    assert "ΔPSNR" in shown and "perplexity" not in shown
+    assert {p.name for p in workspace.figures.iterdir()} == {"scaling.png", *(f"{a}.png" for a in axes)}
+
+
+def test_page_of_ablations_without_any_finished_trial(tmp_path):
+    axes = ("settings", "conditioning", "lr")
+    workspace = finished_study(tmp_path, axes=axes, broken={"": "failed"})
+    draw(workspace, record_of(axes=axes))
+    assert "no trial finished" in workspace.report.read_text() and not workspace.optima.exists()

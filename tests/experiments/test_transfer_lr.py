@@ -1,0 +1,135 @@
+"""The transfer of learning rates: a fair comparison, and optima that say when they cannot be trusted."""
+
+import csv
+import math
+from dataclasses import replace
+
+import pytest
+
+from experiments import transfer_lr
+from experiments.commands import draw
+from experiments.optima import find_optima
+from experiments.presets import CPU, PRESETS, SMOKE
+from experiments.rows import LOSS, TRAINING, curve, read_csv
+from experiments.study import TransferConfig, override
+from experiments.sweep import POINT, STANDARD, unique_trials
+from hma_jax.config import ConfigError, diff
+from hma_jax.model.attention import attention_scale
+from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
+
+RATE = STUDY.train.optimizer.learning_rate
+
+
+def rows_with(root, broken=None, study=STUDY):
+    return rows_of(finished_study(root, study, broken, axes=("lr",)), [transfer_lr.plan(study)])
+
+
+def optima_of(rows, metric="cross_entropy"):
+    """{(role, series): optimum}"""
+    found = find_optima(rows, [transfer_lr.plan(STUDY)])
+    return {(o.role, o.series): o for o in found if o.metric == metric}
+
+
+@pytest.mark.parametrize("study", PRESETS.values(), ids=PRESETS)
+def test_both_parametrisations_are_one_function_at_the_base_width(study):
+    sweep = transfer_lr.plan(study)
+    mup, standard = (
+        {(p.series, p.x, p.trial.train.seed): p.trial for p in sweep.points if p.role == role}
+        for role in (POINT, STANDARD)
+    )
+    assert mup.keys() == standard.keys()
+    for place, trial in mup.items():
+        same = place[0] == sweep.base
+        assert diff(trial, standard[place]) == ([] if same else ["model.mup.enabled: True -> False"])
+    grid = study.transfer
+    widths = len(grid.widths or study.widths)
+    assert len(unique_trials([sweep], PROVENANCE)) == (2 * widths - 1) * grid.rates * len(study.seeds)
+    # Sharing the trials is right only if switching muP off changes nothing there.
+    trial = next(t for (series, *_), t in mup.items() if series == sweep.base)
+    off = replace(trial.model, mup=replace(trial.model.mup, enabled=False))
+    assert trial.model.width_multiplier == off.width_multiplier == 1.0
+    assert attention_scale(trial.model) == pytest.approx(attention_scale(off), rel=1e-12)
+
+
+def test_rates_surround_that_of_the_study():
+    rates = sorted({p.x for p in transfer_lr.plan(CPU).points})
+    assert rates == pytest.approx([1e-3, 2e-3, 4e-3, 8e-3, 16e-3])
+    assert rates[2] == CPU.train.optimizer.learning_rate
+
+
+def test_the_smaller_trial_is_as_declared():
+    trial = transfer_lr.plan(CPU).points[0].trial
+    assert trial.train.steps == CPU.transfer.steps < CPU.train.steps
+    assert trial.datasets == trial.evaluated == CPU.dataset_names()[: CPU.transfer.datasets]
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("transfer.rates=4", "must be odd"),
+        ("transfer.factor=1", "larger than 1"),
+        ("transfer.widths=16,8", "must increase"),
+        ("transfer.steps=0", "transfer.steps must be at least 1"),
+        ("transfer.widths=8,16", "at least three"),
+        ("transfer.widths=8,32,64", "base_width 16 among them"),
+    ],
+)
+def test_a_grid_that_cannot_work_is_refused(setting, message):
+    with pytest.raises(ConfigError, match=message):
+        transfer_lr.plan(override(SMOKE, [setting]))
+
+
+def test_optima_line_up_with_mup_and_cost_nothing(tmp_path):
+    rows = rows_with(tmp_path)
+    optima = optima_of(rows)
+    for series in ("width 8", "width 16", "width 32"):
+        found = optima[POINT, series]
+        assert (found.x, found.penalty, found.edge) == (RATE, 0.0, "")
+    wide = optima[STANDARD, "width 32"]
+    assert wide.x == RATE / 2 and wide.transferred_x == RATE and wide.penalty > 0.05
+    assert optima[STANDARD, "width 16"].penalty == 0.0  # its own optimum
+    training = optima_of(rows, LOSS)
+    assert training[STANDARD, "width 8"].penalty == pytest.approx(0.1)
+
+
+def test_an_optimum_at_the_end_of_the_grid_is_marked(tmp_path):
+    study = replace(STUDY, transfer=TransferConfig(rates=3, widths=(8, 16, 32)))
+    workspace = finished_study(tmp_path, study, axes=("lr",))
+    draw(workspace, record_of(study, axes=("lr",)))
+    optima = optima_of(read_csv(workspace.results))
+    assert optima[STANDARD, "width 32"].edge == optima[STANDARD, "width 8"].edge == "edge"
+    assert optima[POINT, "width 32"].edge == ""
+    with open(workspace.optima, newline="") as file:
+        marked = {(line["role"], line["series"]) for line in csv.DictReader(file) if line["edge"]}
+    assert marked == {("standard", "width 8"), ("standard", "width 32")}
+    assert "0.0005 <span class=failed>edge</span>" in workspace.report.read_text()
+
+
+def test_divergence_bounds_the_grid_and_costs_everything(tmp_path):
+    """One seed that diverges is enough to rule a rate out, and a diverged neighbour is no edge."""
+    broken = {"width 32 · seed 1 · learning rate 0.001, no muP": "diverged",
+              "width 8 · seed 0 · learning rate 0.004, no muP": "diverged"}  # fmt: skip
+    workspace = finished_study(tmp_path, broken=broken, axes=("lr",))
+    draw(workspace, record_of(axes=("lr",)))
+    optima = optima_of(read_csv(workspace.results))
+    assert math.isinf(optima[STANDARD, "width 32"].penalty)
+    assert optima[STANDARD, "width 8"].x == 2 * RATE and optima[STANDARD, "width 8"].edge == ""
+    assert "<td>diverged</td>" in workspace.report.read_text()
+
+
+def test_a_rate_that_was_not_tried_leaves_an_edge(tmp_path):
+    broken = {f"width 8 · seed {s} · learning rate 0.004, no muP": "failed" for s in (0, 1)}
+    assert optima_of(rows_with(tmp_path, broken))[STANDARD, "width 8"].edge == "edge"
+
+
+def test_no_base_width_no_penalty(tmp_path):
+    optima = optima_of(rows_with(tmp_path, {"width 16": "failed"}))
+    assert (POINT, "width 8") in optima and (POINT, "width 16") not in optima
+    assert all(math.isnan(o.penalty) for o in optima.values())
+
+
+def test_final_loss_is_the_mean_of_the_last_tenth(tmp_path):
+    rows = rows_with(tmp_path)
+    points = curve(rows, "lr", LOSS, POINT, TRAINING, "width 8")
+    assert [p.x for p in points] == pytest.approx([RATE / 4, RATE / 2, RATE, 2 * RATE, 4 * RATE])
+    assert points[2].mean == pytest.approx(3.5)  # of 20 steps the last two, 4 and 3
