@@ -121,15 +121,18 @@ def diff(old: Any, new: Any, path: str = "") -> list[str]:
 
 @dataclass(frozen=True)
 class TokenizerConfig:
-    """The small convolutional tokenizer with lookup-free quantisation (`tokenizers.lfq`).
+    """The small convolutional tokenizer, with lookup-free quantisation or without.
 
-    An image of `image_size` x `image_size` becomes (image_size / downsample)^2 tokens of
-    `bits` binary channels, split evenly into `factors` vocabulary factors.
+    An image of `image_size` x `image_size` becomes (image_size / downsample)^2 tokens. Quantised
+    (`tokenizers.lfq`), a token is an id of `bits` binary channels, split evenly into `factors`
+    vocabulary factors. Otherwise (`tokenizers.continuous`) it is a vector of `bits` real
+    channels; `factors`, the entropy and the commitment then mean nothing.
     """
 
     image_size: int = 32
     downsample: int = 8
-    bits: int = 16
+    quantise: bool = True
+    bits: int = 16  # channels per token: C of the continuous variant
     factors: int = 2
     channels: int = 256
     encoder_blocks: int = 1
@@ -137,6 +140,9 @@ class TokenizerConfig:
     entropy_weight: float = 0.0
     entropy_temperature: float = 1.0  # of the soft code assignment that the entropy is taken of
     commitment_weight: float = 0.0
+    # Without quantisation: noise on the latents while training, its standard deviation in the
+    # range -1..1 of the encoder. It makes the decoder bear the errors of a generative model.
+    latent_noise: float = 0.1
 
     def __post_init__(self):
         d = self.downsample
@@ -145,8 +151,18 @@ class TokenizerConfig:
             self.image_size % d == 0,
             f"tokenizer.image_size {self.image_size} is not a multiple of downsample {d}",
         )
+        require(self.bits >= 1, f"tokenizer.bits must be at least 1, got {self.bits}")
+        if self.quantise:
+            self._check_factors()
+        require(self.channels >= 1, "tokenizer.channels must be at least 1")
+        counts, weights = ("encoder_blocks", "decoder_blocks"), ("entropy_weight", "commitment_weight")
+        for name in (*counts, *weights, "latent_noise"):
+            require(getattr(self, name) >= 0, f"tokenizer.{name} must not be negative")
+        require(self.entropy_temperature > 0, "tokenizer.entropy_temperature must be positive")
+
+    def _check_factors(self) -> None:
         require(
-            self.factors >= 1 and self.bits >= 1 and self.bits % self.factors == 0,
+            self.factors >= 1 and self.bits % self.factors == 0,
             f"tokenizer.bits {self.bits} do not split into {self.factors} equal factors",
         )
         require(self.bits <= 24, f"tokenizer.bits must be at most 24, got {self.bits}")
@@ -155,10 +171,6 @@ class TokenizerConfig:
             f"tokenizer.factors {self.factors}: a factor of {self.bits // self.factors} bits is too wide "
             "for the entropy loss (at most 12); use more factors",
         )
-        require(self.channels >= 1, "tokenizer.channels must be at least 1")
-        for name in ("encoder_blocks", "decoder_blocks", "entropy_weight", "commitment_weight"):
-            require(getattr(self, name) >= 0, f"tokenizer.{name} must not be negative")
-        require(self.entropy_temperature > 0, "tokenizer.entropy_temperature must be positive")
 
     @property
     def grid(self) -> int:
@@ -171,13 +183,19 @@ class TokenizerConfig:
         return self.grid**2
 
     @property
+    def token_channels(self) -> int:
+        """C: values per token; 0 where tokens are ids."""
+        return 0 if self.quantise else self.bits
+
+    @property
     def factor_vocab(self) -> int:
-        """V: entries per factor."""
-        return 2 ** (self.bits // self.factors)
+        """V: entries per factor; 0 where tokens are latents."""
+        return 2 ** (self.bits // self.factors) if self.quantise else 0
 
     @property
     def vocab_size(self) -> int:
-        return 2**self.bits
+        """V^Q; 0 where tokens are latents."""
+        return 2**self.bits if self.quantise else 0
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,8 @@ from hma_jax.params import Params
 class Decoder(Protocol):
     """The half of a tokenizer that evaluation needs."""
 
-    def decode(self, ids: np.ndarray) -> np.ndarray:
-        """ids [B, S] -> uint8 [B, height, width, 3]."""
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """Ids [B, S] or latents [B, S, C] -> uint8 [B, height, width, 3]."""
         ...
 
 

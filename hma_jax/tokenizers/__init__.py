@@ -1,1 +1,2 @@
-"""Tokenizers: frames to discrete ids and back, behind one interface (`base.Tokenizer`)."""
+"""Tokenizers: frames to discrete ids or latent vectors and back, behind one interface
+(`base.Tokenizer`)."""

@@ -1,7 +1,7 @@
 """What every tokenizer offers, and how images are fed through one in equal pieces.
 
-Code outside this package depends on `Tokenizer` alone: any model that turns frames into ids
-and back can stand behind it.
+Code outside this package depends on `Tokenizer` alone: any model that turns frames into ids or
+latent vectors and back can stand behind it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ PIECE = 64
 
 
 class Tokenizer(Protocol):
-    """Images to S token ids each, and back.
+    """Images to S tokens each, and back.
 
-    Ids run over a square grid row by row. An id is sum_q digit_q V^q: factor 0 in the low
-    digits. Both directions are deterministic, and an image's result does not depend on the
-    others of its batch: tokens made in one job equal those made in another.
+    A token is an id, int32, or a vector of C latent channels, float32 of about unit standard
+    deviation. Tokens run over a square grid row by row. An id is sum_q digit_q V^q: factor 0 in
+    the low digits. Both directions are deterministic, and an image's result does not depend on
+    the others of its batch: tokens made in one job equal those made in another.
     """
 
     @property
@@ -40,38 +41,43 @@ class Tokenizer(Protocol):
         ...
 
     @property
+    def channels(self) -> int:
+        """C; 0: tokens are ids."""
+        ...
+
+    @property
     def vocab_size(self) -> int:
-        """V^Q."""
+        """V^Q; 0: tokens are latents."""
         ...
 
     @property
     def factors(self) -> int:
-        """Q."""
+        """Q; 0: tokens are latents."""
         ...
 
     @property
     def factor_vocab(self) -> int:
-        """V."""
+        """V; 0: tokens are latents."""
         ...
 
     @property
     def identity(self) -> str:
-        """Hash of configuration and weights: equal means the same ids for the same images."""
+        """Hash of configuration and weights: equal means the same tokens for the same images."""
         ...
 
     @property
     def params(self) -> Params: ...
 
     def encode(self, images: np.ndarray) -> np.ndarray:
-        """uint8 [B, image_size, image_size, 3] -> int32 [B, S]."""
+        """uint8 [B, image_size, image_size, 3] -> int32 [B, S] or float32 [B, S, C]."""
         ...
 
-    def decode(self, ids: np.ndarray) -> np.ndarray:
-        """Ids [B, S] -> uint8 [B, image_size, image_size, 3]."""
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """What `encode` makes -> uint8 [B, image_size, image_size, 3]."""
         ...
 
-    def decode_fn(self, params: Params, ids: jax.Array) -> jax.Array:
-        """Pure, for use inside a jit: ids [B, S] -> float32 [B, ...] in 0..255."""
+    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure, for use inside a jit: what `encode` makes -> float32 [B, ...] in 0..255."""
         ...
 
 

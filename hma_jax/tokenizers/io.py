@@ -1,5 +1,6 @@
-"""Tokenizers on disk: `tokenizer.json` (kind, configuration, identity) and `weights.npz`.
+"""Tokenizers on disk: `tokenizer.json` and `weights.npz`.
 
+The JSON holds kind, configuration, identity and, of a continuous one, the scale of its latents.
 The JSON file is written last, so a directory holds a whole tokenizer or none.
 """
 
@@ -18,17 +19,21 @@ from flax import nnx
 
 from hma_jax.config import ConfigError, TokenizerConfig, diff, from_dict, require, to_dict
 from hma_jax.params import Params, path_name
+from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
 from hma_jax.tokenizers.base import Tokenizer
+from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
+SCALE = "latent_std"
+KINDS = (LfqTokenizer.kind, ContinuousTokenizer.kind)
 UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
 """What numpy raises for a damaged archive: RuntimeError when a flipped bit claims encryption or an
 unknown compression, EOFError for an empty file."""
 
 
-def save_tokenizer(tokenizer: LfqTokenizer, directory: Path) -> None:
+def save_tokenizer(tokenizer: AutoencoderTokenizer, directory: Path) -> None:
     """Writes into `directory`, replacing a tokenizer that is there. Raises ConfigError if it cannot."""
     directory = Path(directory)
     description = {
@@ -36,6 +41,8 @@ def save_tokenizer(tokenizer: LfqTokenizer, directory: Path) -> None:
         "config": to_dict(tokenizer.config),
         "identity": tokenizer.identity,
     }
+    if isinstance(tokenizer, ContinuousTokenizer):
+        description[SCALE] = tokenizer.latent_std
     arrays = {path_name(p): np.asarray(x) for p, x in jax.tree.leaves_with_path(tokenizer.params)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -61,11 +68,6 @@ def load_tokenizer(directory: Path, expect: TokenizerConfig | None = None) -> To
     """
     directory = Path(directory)
     description = _read_description(directory)
-    kind = description["kind"]
-    require(
-        kind == LfqTokenizer.kind,
-        f"{directory / DESCRIPTION}: unknown tokenizer kind {kind!r}; known: {LfqTokenizer.kind}",
-    )
     config = from_dict(TokenizerConfig, description["config"], where=f"{directory / DESCRIPTION}: config")
     if expect is not None and config != expect:
         raise ConfigError(
@@ -74,9 +76,12 @@ def load_tokenizer(directory: Path, expect: TokenizerConfig | None = None) -> To
         )
     weights = _read_weights(directory)
     try:
-        tokenizer = LfqTokenizer(config, weights)
+        if description["kind"] == LfqTokenizer.kind:
+            tokenizer: AutoencoderTokenizer = LfqTokenizer(config, weights)
+        else:
+            tokenizer = ContinuousTokenizer(config, weights, description[SCALE])
     except ConfigError as error:
-        raise ConfigError(f"{directory / WEIGHTS}: {error}; train or copy the tokenizer again") from error
+        raise ConfigError(f"{directory}: {error}; train or copy the tokenizer again") from error
     require(
         tokenizer.identity == description["identity"],
         f"{directory / WEIGHTS} is not the file {DESCRIPTION} describes (identity "
@@ -101,6 +106,12 @@ def _read_description(directory: Path) -> dict[str, Any]:
     )
     missing = {"kind", "config", "identity"} - set(description)
     require(not missing, f"{path}: missing field(s) {', '.join(sorted(missing))}")
+    kind, scale = description["kind"], description.get(SCALE)
+    require(kind in KINDS, f"{path}: unknown tokenizer kind {kind!r}; known: {', '.join(KINDS)}")
+    require(
+        kind != ContinuousTokenizer.kind or isinstance(scale, float),
+        f"{path}: {SCALE} should be a number, got {scale!r}; train or copy the tokenizer again",
+    )
     return description
 
 

@@ -1,4 +1,4 @@
-"""The convolutional encoder and decoder around the quantiser. NHWC, no batch statistics.
+"""The convolutional encoder and decoder around the latents. NHWC, no batch statistics.
 
 The encoder is one convolution with the stride of a token and 1x1 layers after it: a token
 depends on its own patch of the image alone. So a patch in which nothing moves keeps its token,
@@ -78,12 +78,13 @@ class Encoder(nnx.Module):
         x = self.stem(rearrange(images, "b (h p) (w q) c -> b h w (p q c)", p=self.patch, q=self.patch))
         for block in self.blocks:
             x = block(x)
-        # Bounded: an unbounded latent far from zero would hardly ever change its sign.
+        # Bounded: an unbounded latent far from zero would hardly ever change its sign, and one that
+        # is not quantised would outgrow the noise it is trained with.
         return rearrange(jnp.tanh(self.head(self.norm(x))), "b h w c -> b (h w) c")
 
 
 class Decoder(nnx.Module):
-    """Codes [B, S, bits] in {-1, +1} -> images [B, H, W, 3], about -1..1."""
+    """Latents [B, S, bits] in -1..1, or the codes -1 and +1 -> images [B, H, W, 3], about -1..1."""
 
     def __init__(self, config: TokenizerConfig):
         width = config.channels

@@ -16,8 +16,10 @@ import optax
 
 from hma_jax.config import TokenizerConfig, TokenizerTrainConfig, to_dict
 from hma_jax.params import Declared, Params
+from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
+from hma_jax.tokenizers.continuous import make_continuous
 from hma_jax.tokenizers.io import save_tokenizer
-from hma_jax.tokenizers.lfq import LfqTokenizer, declare_tokenizer
+from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.network import normalise
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
 from hma_jax.training.loop import LoopOptions, Progress, fit
@@ -33,7 +35,7 @@ def train_tokenizer(
     provenance: dict[str, Any] | None = None,
     options: LoopOptions = LoopOptions(),
     progress: Progress | None = None,
-) -> LfqTokenizer:
+) -> AutoencoderTokenizer:
     """Trains, or goes on training, in `run_dir`; saves the tokenizer there and returns it.
 
     `make_batches(start)` yields uint8 images [B, image_size, image_size, 3] from step `start`
@@ -54,7 +56,11 @@ def train_tokenizer(
         options=options,
         progress=progress,
     )
-    tokenizer = LfqTokenizer(config, result.state.params)
+    tokenizer: AutoencoderTokenizer
+    if config.quantise:
+        tokenizer = LfqTokenizer(config, result.state.params)
+    else:
+        tokenizer = make_continuous(config, result.state.params, make_batches(0))
     save_tokenizer(tokenizer, run_dir)
     return tokenizer
 
@@ -73,23 +79,30 @@ def make_optimizer(train: TokenizerTrainConfig, declared: Declared) -> optax.Gra
 
 
 def tokenizer_loss(
-    declared: Declared, params: Params, images: jax.Array, config: TokenizerConfig
+    declared: Declared, params: Params, images: jax.Array, config: TokenizerConfig, key: jax.Array
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """(loss, metrics) of images [B, H, W, 3] in 0..255: squared error plus the quantiser's terms."""
+    """(loss, metrics) of images [B, H, W, 3] in 0..255: squared error of what comes back through
+    quantised or noisy latents, plus the quantiser's terms. `key` is for the noise."""
     model = declared.merge(params)
     target = normalise(images)
     z = model.encoder(target)
-    error = jnp.mean((model.decoder(quantize(z)) - target) ** 2)
+    if config.quantise:
+        passed, (penalty, terms) = quantize(z), _regularisers(z, config)
+    else:
+        passed = z + config.latent_noise * jax.random.normal(key, z.shape)
+        penalty, terms = 0.0, {"latent_std": jnp.std(z)}
+    error = jnp.mean((model.decoder(passed) - target) ** 2)
+    loss = error + penalty
+    psnr = -10.0 * jnp.log10(error / 4.0)  # of the mean error; images span -1..1
+    return loss, {"loss": loss, "psnr": psnr, **terms}
+
+
+def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """(weighted sum, terms) that keep the codes of latents [B, S, bits] decided and all in use."""
     uncertainty, diversity = entropies(z, config.factors, config.entropy_temperature)
     commit = commitment(z)
-    loss = error + config.entropy_weight * (uncertainty - diversity) + config.commitment_weight * commit
-    return loss, {
-        "loss": loss,
-        "psnr": -10.0 * jnp.log10(error / 4.0),  # of the mean error; images span -1..1
-        "uncertainty": uncertainty,
-        "diversity": diversity,
-        "commitment": commit,
-    }
+    total = config.entropy_weight * (uncertainty - diversity) + config.commitment_weight * commit
+    return total, {"uncertainty": uncertainty, "diversity": diversity, "commitment": commit}
 
 
 def make_train_step(
@@ -99,7 +112,8 @@ def make_train_step(
     optimizer = make_optimizer(train, declared)
 
     def step(state: TrainState, images: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
-        gradient = jax.grad(lambda p: tokenizer_loss(declared, p, images, config), has_aux=True)
+        key = jax.random.fold_in(jax.random.key(train.seed), state.step)
+        gradient = jax.grad(lambda p: tokenizer_loss(declared, p, images, config, key), has_aux=True)
         grads, metrics = gradient(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)

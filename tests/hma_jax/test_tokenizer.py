@@ -1,4 +1,4 @@
-"""The tokenizer: what ids mean, what a token depends on, and that training teaches it something."""
+"""The tokenizers: what tokens mean, what they depend on, and that training teaches them something."""
 
 import itertools
 import shutil
@@ -15,8 +15,10 @@ from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.model.frames import compose, factorise
 from hma_jax.params import Declared, ParamSpec, normal
 from hma_jax.tokenizers import quantizer
+from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer, reconstruction_psnr
 from hma_jax.tokenizers.base import PIECE, in_pieces
-from hma_jax.tokenizers.lfq import LfqTokenizer, code_usage, declare_tokenizer, reconstruction_psnr
+from hma_jax.tokenizers.continuous import ContinuousTokenizer, make_continuous
+from hma_jax.tokenizers.lfq import LfqTokenizer, code_usage
 from hma_jax.tokenizers.quantizer import (
     commitment,
     ids_to_codes,
@@ -32,15 +34,32 @@ from hma_jax.training.loop import LoopOptions
 CONFIG = TokenizerConfig(
     image_size=16, downsample=4, bits=6, factors=2, channels=16, encoder_blocks=1, decoder_blocks=1
 )
+CONTINUOUS = replace(CONFIG, quantise=False)
+BOTH = {"lfq": CONFIG, "continuous": CONTINUOUS}
 TRAIN = TokenizerTrainConfig(steps=40, batch=8, learning_rate=1e-2, warmup_steps=2)
 
 entropies = jax.jit(quantizer.entropies, static_argnums=(1, 2))
 
 
-@pytest.fixture(scope="module")
-def tokenizer():
+def fresh(config: TokenizerConfig, seed: int = 0) -> AutoencoderTokenizer:
     """Untrained: random weights do for everything but quality."""
-    return LfqTokenizer(CONFIG, declare_tokenizer(CONFIG).init(0))
+    params = declare_tokenizer(config).init(seed)
+    return LfqTokenizer(config, params) if config.quantise else ContinuousTokenizer(config, params, 0.3)
+
+
+@pytest.fixture(scope="module", params=BOTH.values(), ids=BOTH)
+def tokenizer(request):
+    return fresh(request.param)
+
+
+@pytest.fixture(scope="module")
+def discrete():
+    return fresh(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def continuous():
+    return fresh(CONTINUOUS)
 
 
 def noise(count: int, seed: int = 0) -> np.ndarray:
@@ -135,24 +154,30 @@ def test_entropies_reach_their_bounds():
 
 
 def test_shapes_and_types_of_both_ways(tokenizer):
-    ids = tokenizer.encode(noise(3))
-    assert ids.shape == (3, tokenizer.tokens) == (3, 16) and ids.dtype == np.int32
-    assert ids.min() >= 0 and ids.max() < tokenizer.vocab_size == 64
-    assert len(np.unique(ids)) > 10
-    frames = tokenizer.decode(ids)
+    tokens = tokenizer.encode(noise(3))
+    if tokenizer.kind == "lfq":
+        assert tokens.shape == (3, tokenizer.tokens) == (3, 16) and tokens.dtype == np.int32
+        assert tokens.min() >= 0 and tokens.max() < tokenizer.vocab_size == 64
+        assert (tokenizer.channels, tokenizer.factors, tokenizer.factor_vocab) == (0, 2, 8)
+    else:
+        assert tokens.shape == (3, tokenizer.tokens, tokenizer.channels) == (3, 16, 6)
+        assert tokens.dtype == np.float32
+        assert (tokenizer.vocab_size, tokenizer.factors, tokenizer.factor_vocab) == (0, 0, 0)
+    assert len(np.unique(tokens)) > 10
+    frames = tokenizer.decode(tokens)
     assert frames.shape == (3, 16, 16, 3) and frames.dtype == np.uint8
 
 
 def test_tokens_do_not_depend_on_the_batch_they_came_in(tokenizer):
     """Else a dataset tokenised on another day, or in other batches, would be another dataset."""
     images = noise(2 * PIECE + 3)
-    ids = tokenizer.encode(images)
-    assert len(ids) == len(images)
-    assert np.array_equal(tokenizer.encode(images[::-1])[::-1], ids)
+    tokens = tokenizer.encode(images)
+    assert len(tokens) == len(images)
+    assert np.array_equal(tokenizer.encode(images[::-1])[::-1], tokens)
     for i in (0, PIECE - 1, PIECE, len(images) - 1):  # the last of these stood in a padded piece
-        assert np.array_equal(tokenizer.encode(images[i : i + 1])[0], ids[i])
-    frames = tokenizer.decode(ids)
-    assert np.array_equal(tokenizer.decode(ids[-5:]), frames[-5:])
+        assert np.array_equal(tokenizer.encode(images[i : i + 1])[0], tokens[i])
+    frames = tokenizer.decode(tokens)
+    assert np.array_equal(tokenizer.decode(tokens[-5:]), frames[-5:])
 
 
 @pytest.mark.parametrize("rows", [1, 4, 5, 8])
@@ -172,35 +197,96 @@ def test_networks_only_see_whole_pieces(rows):
 def test_a_token_sees_its_own_patch_only(tokenizer):
     """Row-major grid: a change inside patch (r, c) may change token 4 r + c and no other."""
     before = noise(8)
-    ids = tokenizer.encode(before)
+    tokens = tokenizer.encode(before)
     for token in range(16):
         row, column = 4 * (token // 4), 4 * (token % 4)
         after = before.copy()
         after[:, row : row + 4, column : column + 4] ^= 255
-        changed = (tokenizer.encode(after) != ids).any(axis=0)
+        changed = (tokenizer.encode(after) != tokens).reshape(8, 16, -1).any(axis=(0, 2))
         assert changed[token], "it does not even see its own patch"
         assert changed.sum() == 1
 
 
 def test_decoding_inside_a_jit_gives_the_same_frames(tokenizer):
-    ids = tokenizer.encode(noise(PIECE))
-    frames = np.asarray(jax.jit(tokenizer.decode_fn)(tokenizer.params, ids))
+    tokens = tokenizer.encode(noise(PIECE))
+    frames = np.asarray(jax.jit(tokenizer.decode_fn)(tokenizer.params, tokens))
     assert frames.dtype == np.float32 and frames.min() >= 0 and frames.max() <= 255
-    np.testing.assert_allclose(frames, tokenizer.decode(ids), atol=0.51)
+    np.testing.assert_allclose(frames, tokenizer.decode(tokens), atol=0.51)
 
 
-def test_what_cannot_be_encoded_or_decoded_is_refused(tokenizer):
-    images, ids = noise(2), np.zeros((2, 16), np.int32)
+def test_what_cannot_be_encoded_is_refused(tokenizer):
+    images = noise(2)
     for wrong in (images.astype(np.float32), images[0], images[:, :8], images[..., :1]):
         with pytest.raises(ConfigError, match=r"encodes uint8 images \[B, 16, 16, 3\], got"):
             tokenizer.encode(wrong)
     with pytest.raises(ConfigError, match="empty batch"):
         tokenizer.encode(images[:0])
+
+
+def test_ids_that_cannot_be_decoded_are_refused(discrete):
+    ids = np.zeros((2, 16), np.int32)
     with pytest.raises(ConfigError, match=r"decodes ids \[B, 16\], got \[2, 9\]"):
-        tokenizer.decode(ids[:, :9])
+        discrete.decode(ids[:, :9])
     for wrong in (-1, 64):
         with pytest.raises(ConfigError, match=r"must lie in \[0, 64\)"):
-            tokenizer.decode(ids + wrong)
+            discrete.decode(ids + wrong)
+
+
+def test_latents_that_cannot_be_decoded_are_refused(continuous):
+    latents = np.zeros((2, 16, 6), np.float32)
+    for wrong in (latents[..., :5], latents[:, :9], latents[0], latents.astype(np.int32)):
+        with pytest.raises(ConfigError, match=r"decodes latents, float \[B, 16, 6\], got"):
+            continuous.decode(wrong)
+    latents[1, 3, 2] = np.nan
+    with pytest.raises(ConfigError, match="not finite; did the model diverge"):
+        continuous.decode(latents)
+
+
+def test_half_precision_latents_decode_as_well(continuous):
+    """The token store keeps them so."""
+    latents = continuous.encode(noise(2))
+    exact, stored = continuous.decode(latents), continuous.decode(latents.astype(np.float16))
+    assert np.abs(exact.astype(int) - stored).max() <= 1
+
+
+def test_latents_have_unit_deviation_on_the_frames_they_were_measured_on():
+    batches = [scenes(8, seed) for seed in range(3)]
+    tokenizer = make_continuous(CONTINUOUS, declare_tokenizer(CONTINUOUS).init(0), iter(batches))
+    latents = np.concatenate([tokenizer.encode(images) for images in batches])
+    assert latents.std() == pytest.approx(1, abs=1e-5) and abs(tokenizer.latent_std - 1) > 0.1
+
+
+def test_scale_of_the_latents_is_undone_by_decoding(continuous):
+    other = ContinuousTokenizer(CONTINUOUS, continuous.params, 2 * continuous.latent_std)
+    latents = continuous.encode(noise(4))
+    np.testing.assert_allclose(other.encode(noise(4)), latents / 2, rtol=1e-6)
+    assert np.array_equal(other.decode(latents / 2), continuous.decode(latents))
+
+
+def test_latents_outside_the_encoders_range_are_taken_back_to_it(continuous):
+    edge = np.full((1, 16, 6), 1 / continuous.latent_std, np.float32)
+    assert np.array_equal(continuous.decode(5 * edge), continuous.decode(edge))
+    assert not np.array_equal(continuous.decode(0.5 * edge), continuous.decode(edge))
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
+def test_what_is_no_scale_is_refused(continuous, scale):
+    with pytest.raises(ConfigError, match="standard deviation of the latents must be positive"):
+        ContinuousTokenizer(CONTINUOUS, continuous.params, scale)
+
+
+def test_kind_must_be_that_of_the_configuration(discrete):
+    with pytest.raises(ConfigError, match="needs tokenizer.quantise=true"):
+        LfqTokenizer(CONTINUOUS, discrete.params)
+    with pytest.raises(ConfigError, match="needs tokenizer.quantise=false"):
+        ContinuousTokenizer(CONFIG, discrete.params, 1.0)
+
+
+def test_any_number_of_channels_makes_a_continuous_token():
+    assert TokenizerConfig(quantise=False, bits=37).token_channels == 37
+    for wrong in ({"bits": 0}, {"latent_noise": -0.1}):
+        with pytest.raises(ConfigError, match=f"tokenizer.{next(iter(wrong))}"):
+            TokenizerConfig(quantise=False, **wrong)
 
 
 def test_code_usage_counts_codes_of_each_factor():
@@ -227,7 +313,7 @@ def test_regularisers_reach_loss_and_encoder():
     @jax.jit
     def evaluate(params):
         def one(config):
-            loss = partial(tokenizer_loss, declared, images=images, config=config)
+            loss = partial(tokenizer_loss, declared, images=images, config=config, key=jax.random.key(0))
             (total, metrics), gradient = jax.value_and_grad(loss, has_aux=True)(params)
             return total, metrics, gradient["encoder"]["head"]["kernel"]
 
@@ -238,6 +324,21 @@ def test_regularisers_reach_loss_and_encoder():
     for term, (total, _, moved) in zip(expected, others, strict=True):
         assert term != 0 and float(total - plain) == pytest.approx(0.5 * term, abs=1e-6)
         assert not np.allclose(moved, at_rest)
+
+
+def test_noise_reaches_the_decoder_and_is_the_keys():
+    config = replace(CONTINUOUS, encoder_blocks=0, decoder_blocks=0)
+    declared = declare_tokenizer(config)
+    params, images = declared.init(0), jnp.asarray(scenes(4))
+
+    def losses(noise: float) -> list[float]:
+        """Of the same images under two keys."""
+        chosen = replace(config, latent_noise=noise)
+        loss = jax.jit(lambda params, key: tokenizer_loss(declared, params, images, chosen, key)[0])
+        return [float(loss(params, jax.random.key(seed))) for seed in (0, 1)]
+
+    silent, noisy = losses(0.0), losses(0.3)
+    assert silent[0] == silent[1] < min(noisy) and noisy[0] != noisy[1]
 
 
 def train(run_dir: Path, *, config=CONFIG, settings=TRAIN, last_step: int | None = None, **options):
@@ -252,12 +353,15 @@ def train(run_dir: Path, *, config=CONFIG, settings=TRAIN, last_step: int | None
     return train_tokenizer(config, settings, batches, run_dir, **options)
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
+@pytest.fixture(scope="module", params=BOTH.values(), ids=BOTH)
+def trained(request, tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("tokenizer")
     metrics = []
     tokenizer = train(
-        run_dir, provenance={"data": "a"}, progress=lambda step, steps, values: metrics.append(values)
+        run_dir,
+        config=request.param,
+        provenance={"data": "a"},
+        progress=lambda step, steps, values: metrics.append(values),
     )
     return tokenizer, metrics, run_dir
 
@@ -267,29 +371,29 @@ def test_training_raises_psnr_on_images_it_has_not_seen(trained):
     assert len(metrics) == TRAIN.steps
     assert np.mean([m["loss"] for m in metrics[-5:]]) < 0.5 * metrics[0]["loss"]
     held_out = scenes(32, seed=10_000)
-    fresh = LfqTokenizer(CONFIG, declare_tokenizer(CONFIG).init(TRAIN.seed))
-    assert reconstruction_psnr(tokenizer, held_out).mean > reconstruction_psnr(fresh, held_out).mean + 4
+    untrained = fresh(tokenizer.config, TRAIN.seed)
+    assert reconstruction_psnr(tokenizer, held_out).mean > reconstruction_psnr(untrained, held_out).mean + 4
 
 
 def test_same_seed_same_tokenizer_also_after_a_crash(trained, tmp_path):
+    config, options = trained[0].config, LoopOptions(checkpoint_every=10)
     with pytest.raises(OSError, match="the disk went away"):
-        train(tmp_path, last_step=25, options=LoopOptions(checkpoint_every=10))
-    resumed = train(tmp_path, options=LoopOptions(checkpoint_every=10))
-    assert resumed.identity == trained[0].identity
+        train(tmp_path, config=config, last_step=25, options=options)
+    assert train(tmp_path, config=config, options=options).identity == trained[0].identity
 
 
 def test_another_seed_is_another_tokenizer(trained, tmp_path):
-    other = train(tmp_path, settings=replace(TRAIN, seed=1))
+    other = train(tmp_path, config=trained[0].config, settings=replace(TRAIN, seed=1))
     assert other.identity != trained[0].identity
 
 
 def test_run_of_another_configuration_is_not_resumed(trained, tmp_path):
-    run_dir = shutil.copytree(trained[2], tmp_path / "run")
+    again = partial(train, shutil.copytree(trained[2], tmp_path / "run"), config=trained[0].config)
     with pytest.raises(CheckpointError, match=r"train.learning_rate: 0.01 -> 0.1"):
-        train(run_dir, settings=replace(TRAIN, learning_rate=0.1), provenance={"data": "a"})
+        again(settings=replace(TRAIN, learning_rate=0.1), provenance={"data": "a"})
     with pytest.raises(CheckpointError, match="provenance.data: 'a' -> 'b'"):
-        train(run_dir, provenance={"data": "b"})
-    assert train(run_dir, provenance={"data": "a"}).identity == trained[0].identity
+        again(provenance={"data": "b"})
+    assert again(provenance={"data": "a"}).identity == trained[0].identity
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3])

@@ -10,21 +10,26 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, TokenizerConfig
-from hma_jax.tokenizers.io import DESCRIPTION, WEIGHTS, load_tokenizer, save_tokenizer
-from hma_jax.tokenizers.lfq import LfqTokenizer, declare_tokenizer
+from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
+from hma_jax.tokenizers.continuous import ContinuousTokenizer
+from hma_jax.tokenizers.io import DESCRIPTION, SCALE, WEIGHTS, load_tokenizer, save_tokenizer
+from hma_jax.tokenizers.lfq import LfqTokenizer
 
 CONFIG = TokenizerConfig(
     image_size=8, downsample=4, bits=4, factors=2, channels=4, encoder_blocks=1, decoder_blocks=1
 )
+CONTINUOUS = replace(CONFIG, quantise=False)
+BOTH = {"lfq": CONFIG, "continuous": CONTINUOUS}
 
 
-def make(config: TokenizerConfig = CONFIG, seed: int = 0) -> LfqTokenizer:
-    return LfqTokenizer(config, declare_tokenizer(config).init(seed))
+def make(config=CONFIG, seed: int = 0, scale: float = 0.4, params=None) -> AutoencoderTokenizer:
+    params = declare_tokenizer(config).init(seed) if params is None else params
+    return LfqTokenizer(config, params) if config.quantise else ContinuousTokenizer(config, params, scale)
 
 
-@pytest.fixture(scope="module")
-def tokenizer():
-    return make()
+@pytest.fixture(scope="module", params=BOTH.values(), ids=BOTH)
+def tokenizer(request):
+    return make(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -50,24 +55,34 @@ def refusal(directory, **options) -> str:
 
 def test_what_was_saved_comes_back(tokenizer, saved):
     images = np.random.default_rng(0).integers(0, 256, (5, 8, 8, 3), np.uint8)
-    again = load_tokenizer(saved, expect=CONFIG)
-    ids = tokenizer.encode(images)
+    again = load_tokenizer(saved, expect=tokenizer.config)
+    tokens = tokenizer.encode(images)
     assert again.identity == tokenizer.identity
-    assert np.array_equal(again.encode(images), ids)
-    assert np.array_equal(again.decode(ids), tokenizer.decode(ids))
+    assert np.array_equal(again.encode(images), tokens)
+    assert np.array_equal(again.decode(tokens), tokenizer.decode(tokens))
 
 
 def test_identity_is_of_every_weight_and_every_setting(tokenizer):
-    assert make().identity == tokenizer.identity
+    config = tokenizer.config
+    assert make(config).identity == tokenizer.identity
     leaves, structure = jax.tree.flatten(tokenizer.params)
     seen = {tokenizer.identity}
     for i, leaf in enumerate(leaves):
         flat = np.array(leaf).ravel()
         flat[-1] = np.nextafter(flat[-1], np.float32(9))  # the last bit of one number
-        changed = [*leaves[:i], flat.reshape(leaf.shape), *leaves[i + 1 :]]
-        seen.add(LfqTokenizer(CONFIG, jax.tree.unflatten(structure, changed)).identity)
+        changed = jax.tree.unflatten(structure, [*leaves[:i], flat.reshape(leaf.shape), *leaves[i + 1 :]])
+        seen.add(make(config, params=changed).identity)
     assert len(seen) == 1 + len(leaves)
-    assert make(replace(CONFIG, factors=1)).identity not in seen  # the same weights, other ids' meaning
+    # The same weights, but other ids' meaning or another scale.
+    other = make(replace(config, factors=1)) if config.quantise else make(config, scale=0.41)
+    assert other.identity not in seen
+
+
+def test_settings_of_the_other_kind_do_not_change_the_identity():
+    """Tokenizers from before there were two kinds keep theirs."""
+    assert make(replace(CONFIG, latent_noise=0.5)).identity == make().identity
+    assert make(replace(CONTINUOUS, factors=1, entropy_weight=0.1)).identity == make(CONTINUOUS).identity
+    assert make(CONTINUOUS).identity != make().identity
 
 
 def test_saving_replaces_the_tokenizer_that_is_there(copy):
@@ -140,6 +155,23 @@ def test_archive_that_claims_what_numpy_never_writes(copy, field, value):
     assert f"{WEIGHTS} is damaged" in refusal(copy)
 
 
+@pytest.mark.parametrize("scale", [None, "1", True, 0.0, float("nan")])
+def test_scale_that_is_none(scale, tmp_path):
+    save_tokenizer(make(CONTINUOUS), tmp_path)
+    values = json.loads((tmp_path / DESCRIPTION).read_text())
+    (tmp_path / DESCRIPTION).write_text(json.dumps(values | {SCALE: scale}))
+    assert "again" in refusal(tmp_path)
+
+
+@pytest.mark.parametrize("config", BOTH.values(), ids=BOTH)
+def test_kind_that_the_configuration_contradicts(config, tmp_path):
+    save_tokenizer(make(config), tmp_path)
+    values = json.loads((tmp_path / DESCRIPTION).read_text())
+    values["config"]["quantise"] = not config.quantise
+    (tmp_path / DESCRIPTION).write_text(json.dumps(values))
+    assert "needs tokenizer.quantise=" in refusal(tmp_path)
+
+
 @pytest.mark.parametrize("text", ["null", "3", "[]", "{}", '{"kind": "lfq", "config": 3, "identity": "x"}'])
 def test_json_that_describes_no_tokenizer(copy, text):
     (copy / DESCRIPTION).write_text(text)
@@ -147,9 +179,9 @@ def test_json_that_describes_no_tokenizer(copy, text):
 
 
 def test_unknown_kind(copy):
-    text = (copy / DESCRIPTION).read_text()
-    (copy / DESCRIPTION).write_text(text.replace('"lfq"', '"magvit"'))
-    assert "unknown tokenizer kind 'magvit'; known: lfq" in refusal(copy)
+    values = json.loads((copy / DESCRIPTION).read_text())
+    (copy / DESCRIPTION).write_text(json.dumps(values | {"kind": "magvit"}))
+    assert "unknown tokenizer kind 'magvit'; known: lfq, continuous" in refusal(copy)
 
 
 def test_weights_of_another_training(copy, tmp_path):
@@ -162,12 +194,12 @@ def test_weights_of_another_configuration(copy, tmp_path):
     save_tokenizer(make(replace(CONFIG, channels=5)), tmp_path / "other")
     shutil.copy(tmp_path / "other" / WEIGHTS, copy / WEIGHTS)
     message = refusal(copy)
-    assert str(copy / WEIGHTS) in message and "should be (4,) but is (5,)" in message
+    assert "should be (4,) but is (5,)" in message
 
 
 def test_edited_configuration(copy):
     values = json.loads((copy / DESCRIPTION).read_text())
-    values["config"]["factors"] = 1
+    values["config"]["image_size"] = 16
     (copy / DESCRIPTION).write_text(json.dumps(values))
     assert "identity" in refusal(copy)
 

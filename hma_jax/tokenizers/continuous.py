@@ -1,0 +1,76 @@
+"""The continuous tokenizer: the same autoencoder without a quantiser.
+
+Latents are handed out with unit standard deviation, so that a generative model of them needs no
+tuning to the tokenizer. One number does it, measured on training frames when training ends (the
+release multiplies its latents by 0.18215 for the same purpose). It is one for all channels on
+purpose: noise of one size on all of them made the encoder spread its channels by importance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import islice
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import TokenizerConfig, require
+from hma_jax.params import Params
+from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
+
+SCALE_BATCHES = 32
+"""Batches of training frames that the scale is measured on."""
+
+
+class ContinuousTokenizer(AutoencoderTokenizer):
+    """Tokens are latent vectors: float32 [B, S, C], of unit standard deviation over everything."""
+
+    kind = "continuous"
+    ignored = ("quantise", "factors", "entropy_weight", "entropy_temperature", "commitment_weight")
+
+    def __init__(self, config: TokenizerConfig, params: Params, latent_std: float):
+        """`latent_std`: of the encoder's own output.
+
+        Raises ConfigError if `params` are not those that `config` declares, or if it is no scale.
+        """
+        require(not config.quantise, "a tokenizer of latents needs tokenizer.quantise=false")
+        require(
+            math.isfinite(latent_std) and latent_std > 0,
+            f"the standard deviation of the latents must be positive, got {latent_std}; a tokenizer "
+            "whose latents do not vary has learnt nothing",
+        )
+        self.latent_std = latent_std
+        super().__init__(config, params)
+
+    def _measured(self) -> tuple[float, ...]:
+        return (self.latent_std,)
+
+    def _from_latents(self, z: jax.Array) -> jax.Array:
+        return z / self.latent_std
+
+    def _to_latents(self, tokens: jax.Array) -> jax.Array:
+        # The encoder stays within +-1, so a value outside is an error of the generative model;
+        # the nearest value inside is never further from the truth.
+        return jnp.clip(tokens * self.latent_std, -1.0, 1.0)
+
+    def _checked(self, tokens: np.ndarray) -> np.ndarray:
+        shape = (self.tokens, self.channels)
+        require(
+            tokens.dtype.kind == "f" and tokens.ndim == 3 and tokens.shape[1:] == shape,
+            f"the tokenizer decodes latents, float [B, {self.tokens}, {self.channels}], "
+            f"got {tokens.dtype} {list(tokens.shape)}",
+        )
+        tokens = tokens.astype(np.float32)
+        require(bool(np.isfinite(tokens).all()), "latents are not finite; did the model diverge?")
+        return tokens
+
+
+def make_continuous(
+    config: TokenizerConfig, params: Params, batches: Iterator[np.ndarray]
+) -> ContinuousTokenizer:
+    """The tokenizer with its scale measured on uint8 images [B, H, W, 3] from `batches`."""
+    unscaled = ContinuousTokenizer(config, params, latent_std=1.0)
+    latents = np.concatenate([unscaled.encode(images) for images in islice(batches, SCALE_BATCHES)])
+    return ContinuousTokenizer(config, params, float(np.std(latents, dtype=np.float64)))
