@@ -16,7 +16,7 @@ import numpy as np
 from data_pipelines.errors import DataError
 from data_pipelines.order import hash64, stream_seed
 from data_pipelines.store import TokenStore
-from data_pipelines.windows import cut_actions, cut_frames, require_windows, val_windows
+from data_pipelines.windows import cut_actions, cut_frames, cut_tokens, require_windows, val_windows
 from hma_jax.config import ConfigError, from_dict, require, stable_hash, to_dict
 from hma_jax.embodiments import EmbodimentTable
 
@@ -127,10 +127,10 @@ def eval_batches(
 ) -> Iterator[dict]:
     """Batches of the frozen windows, one dataset at a time, each padded to `batch` rows.
 
-    `tokens` int32 [B, T, S], `actions` float32 [B, T, U] (raw units), `embodiment` int32 [B],
-    `frames` uint8 [B, T, H, W, 3], `window` int32 [B] (number of the window in the manifest,
-    the same whatever the batch size and choice of datasets), `valid` bool [B] (False for
-    padding, which repeats the last window) and `dataset`, its name.
+    `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C], `actions` float32 [B, T, U] (raw
+    units), `embodiment` int32 [B], `frames` uint8 [B, T, H, W, 3], `window` int32 [B] (number of
+    the window in the manifest, the same whatever the batch size and choice of datasets), `valid`
+    bool [B] (False for padding, which repeats the last window) and `dataset`, its name.
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
     dataset is not in the manifest or in `table`.
@@ -184,7 +184,7 @@ def _window(
     facts = store.manifest(name)
     item = store.episode(name, "val", episode)
     return {
-        "tokens": cut_frames(item.tokens, start, frames, facts).astype(np.int32),
+        "tokens": cut_tokens(item, start, frames, facts),
         "actions": cut_actions(item, start, frames, facts, table.action_width),
         "frames": cut_frames(item.frames, start, frames, facts),
     }

@@ -16,7 +16,7 @@ import numpy as np
 from data_pipelines.mixture import Mixture, make_mixture
 from data_pipelines.order import ENDLESS, endless_shuffle, random_below, stream_seed
 from data_pipelines.store import TokenStore
-from data_pipelines.windows import WindowSet, cut_actions, cut_frames, require_windows, train_windows
+from data_pipelines.windows import WindowSet, cut_actions, cut_tokens, require_windows, train_windows
 from hma_jax.config import require
 from hma_jax.embodiments import EmbodimentTable
 
@@ -77,9 +77,10 @@ def make_loader(
 ) -> Iterator[dict[str, np.ndarray]]:
     """Endless batches from step `start_step` on.
 
-    A batch: `tokens` int32 [B, T, S], `actions` float32 [B, T, U] in raw units, zero-padded,
-    `embodiment` int32 [B], index into `table`. Process p of n yields rows [p B/n, (p+1) B/n)
-    of the global batch. `threads` read ahead by `prefetch` batches each.
+    A batch: `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C]; `actions` float32
+    [B, T, U] in raw units, zero-padded; `embodiment` int32 [B], index into `table`. Process p of
+    n yields rows [p B/n, (p+1) B/n) of the global batch. `threads` read ahead by `prefetch`
+    batches each.
 
     Raises ConfigError for unknown datasets or a batch that does not split, DataError if no
     episode is long enough for one window.
@@ -126,7 +127,7 @@ class _Stream:
         at = endless_shuffle(i, len(windows), self.order_seed)
         episode, start = windows.locate(at)
         item = self.store.episode(windows.name, "train", episode)
-        tokens = cut_frames(item.tokens, start, frames, self.manifest).astype(np.int32)
+        tokens = cut_tokens(item, start, frames, self.manifest)
         if self.shuffle_actions:
             episode, start = windows.locate(self._other(at, i))
             item = self.store.episode(windows.name, "train", episode)

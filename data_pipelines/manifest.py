@@ -27,9 +27,10 @@ class TokenizerFacts:
     image_size: int
     grid: int
     tokens: int  # S
-    vocab_size: int
+    vocab_size: int  # 0, as the next two, where tokens are latents
     factors: int  # Q
     factor_vocab: int  # V
+    channels: int = 0  # C of latents; 0: tokens are ids
 
 
 @dataclass(frozen=True)

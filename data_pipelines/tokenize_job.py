@@ -117,6 +117,7 @@ def _facts(tokenizer: Tokenizer) -> TokenizerFacts:
         vocab_size=tokenizer.vocab_size,
         factors=tokenizer.factors,
         factor_vocab=tokenizer.factor_vocab,
+        channels=tokenizer.channels,
     )
 
 
@@ -146,7 +147,7 @@ def _write(
     splits = {name: _SplitWriter(directory, name, s.keep_frames in ("all", name)) for name in SPLITS}
     moments = _Moments(plan.spec.action_dim)
     pending: list[tuple[RawEpisode, np.ndarray]] = []  # episodes whose frames wait for a full batch
-    dtype = token_dtype(plan.tokenizer.vocab_size)
+    dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
     done = 0
 
     def flush() -> None:
@@ -154,9 +155,9 @@ def _write(
         if not pending:
             return
         images = np.concatenate([frames for _, frames in pending])
-        ids = np.concatenate([tokenizer.encode(images[i : i + batch]) for i in range(0, len(images), batch)])
+        parts = [tokenizer.encode(images[i : i + batch]) for i in range(0, len(images), batch)]
         ends = np.cumsum([len(frames) for _, frames in pending])[:-1]
-        for (raw, frames), tokens in zip(pending, np.split(ids, ends), strict=True):
+        for (raw, frames), tokens in zip(pending, np.split(np.concatenate(parts), ends), strict=True):
             name = "val" if is_val[raw.index] else "train"
             if name == "train":
                 moments.add(raw.actions)

@@ -146,6 +146,12 @@ def cut_frames(array: np.ndarray, start: int, frames: int, manifest: Manifest) -
     return array[start : start + frames * step : step]
 
 
+def cut_tokens(item: StoredEpisode, start: int, frames: int, manifest: Manifest) -> np.ndarray:
+    """The window's tokens: ids, int32 [T, S], or latents, float32 [T, S, C]."""
+    dtype = np.float32 if manifest.tokenizer.channels else np.int32
+    return cut_frames(item.tokens, start, frames, manifest).astype(dtype)
+
+
 def cut_actions(
     item: StoredEpisode, start: int, frames: int, manifest: Manifest, width: int
 ) -> np.ndarray:

@@ -4,7 +4,7 @@ import pytest
 
 from data_pipelines.store import TokenStore
 from data_pipelines.tokenize_job import tokenize_dataset
-from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
 
 SPECS = {
     # native Hz 4, 2 and 10: strides 2, 1 and 5; very unequal sizes
@@ -15,17 +15,32 @@ SPECS = {
 
 
 @pytest.fixture(scope="session")
-def store_root(tmp_path_factory):
-    """A token store of three datasets with actions of 3, 2 and 2 + 1 + 3 values."""
-    root = tmp_path_factory.mktemp("data")
-    for spec, lengths in SPECS.values():
-        tokenize_dataset(spec, write_rlds(root / "rlds", spec, lengths), FakeTokenizer(), root / "store")
-    return root / "store"
+def rlds(tmp_path_factory):
+    """Three datasets with actions of 3, 2 and 2 + 1 + 3 values."""
+    root = tmp_path_factory.mktemp("rlds")
+    return {spec: write_rlds(root, spec, lengths) for spec, lengths in SPECS.values()}
+
+
+@pytest.fixture(scope="session")
+def store_root(rlds, tmp_path_factory):
+    root = tmp_path_factory.mktemp("store")
+    for spec, directory in rlds.items():
+        tokenize_dataset(spec, directory, FakeTokenizer(), root)
+    return root
 
 
 @pytest.fixture(scope="session")
 def store(store_root):
     return TokenStore(store_root)
+
+
+@pytest.fixture(scope="session")
+def latent_store(rlds, tmp_path_factory):
+    """The same datasets as latents."""
+    root = tmp_path_factory.mktemp("latents")
+    for spec, directory in rlds.items():
+        tokenize_dataset(spec, directory, FakeLatents(), root)
+    return TokenStore(root)
 
 
 @pytest.fixture(scope="session")

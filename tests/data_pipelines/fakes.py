@@ -26,7 +26,7 @@ class FakeTokenizer:
     """Ids are 256 x red + green of the image's corners; S = 4 equal tokens."""
 
     image_size, grid, tokens = 8, 2, 4
-    vocab_size, factors, factor_vocab = 65536, 2, 256
+    vocab_size, factors, factor_vocab, channels = 65536, 2, 256, 0
 
     def __init__(self, identity: str = "fake"):
         self.identity = identity
@@ -38,6 +38,22 @@ class FakeTokenizer:
     def decode(self, ids: np.ndarray) -> np.ndarray:
         image = np.zeros((len(ids), 8, 8, 3), np.uint8)
         image[..., 0], image[..., 1] = (ids[:, :1, None] // 256), (ids[:, :1, None] % 256)
+        return image
+
+
+class FakeLatents(FakeTokenizer):
+    """Latents of C = 3 channels: the corner's red, its green, and a third of the green."""
+
+    vocab_size, factors, factor_vocab, channels = 0, 0, 0, 3
+
+    def encode(self, images: np.ndarray) -> np.ndarray:
+        corners = images[:, ::7, ::7].astype(np.float32).reshape(len(images), 4, 3)
+        corners[..., 2] = corners[..., 1] / 3  # no number of few bits
+        return corners
+
+    def decode(self, latents: np.ndarray) -> np.ndarray:
+        image = np.zeros((len(latents), 8, 8, 3), np.uint8)
+        image[..., :2] = latents[:, :1, None, :2]
         return image
 
 

@@ -57,6 +57,18 @@ def test_batches_give_each_window_once_with_its_frames_and_actions(store, table,
     assert seen == list(range(sum(len(d.windows) for d in manifest.datasets)))
 
 
+def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, manifest):
+    frozen = freeze_manifest(latent_store, store.names, frames=4, windows_per_dataset=5, seed=0)
+    assert frozen.datasets == manifest.datasets
+    pairs = zip(
+        eval_batches(store, table, manifest, 2), eval_batches(latent_store, table, frozen, 2), strict=True
+    )
+    for a, b in pairs:
+        assert b["tokens"].shape == (2, 4, 4, 3) and b["tokens"].dtype == np.float32
+        assert np.array_equal(b["tokens"][..., 0] * 256 + b["tokens"][..., 1], a["tokens"])
+        assert np.array_equal(a["frames"], b["frames"])
+
+
 def test_last_batch_is_padded_by_repeating(store, table, manifest):
     batches = [b for b in eval_batches(store, table, manifest, 3) if b["dataset"] == "arm"]
     assert batches[-1]["valid"].tolist() == [True, True, False]

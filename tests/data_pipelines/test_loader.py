@@ -40,6 +40,15 @@ def test_batch_has_the_agreed_shapes_and_types(store, table):
     }
 
 
+def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table):
+    ids, latents = take(store, table, 3), take(latent_store, table, 3)
+    for a, b in zip(ids, latents, strict=True):
+        assert b["tokens"].shape == (16, 6, 4, 3) and b["tokens"].dtype == np.float32
+        assert np.array_equal(b["tokens"][..., 0] * 256 + b["tokens"][..., 1], a["tokens"])
+        np.testing.assert_allclose(b["tokens"][..., 2], b["tokens"][..., 1] / 3, rtol=1e-3)
+        assert np.array_equal(a["actions"], b["actions"])
+
+
 def test_every_row_is_one_window_with_its_own_actions(store, table):
     """The fixture's tokens and actions both say (episode, step)."""
     for batch in take(store, table, 12):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import pickle
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -39,6 +40,24 @@ def test_record_keeps_everything(success, dtype, frames):
     assert np.array_equal(back.frames, item.frames) if frames else back.frames is None
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_record_keeps_latents(channels):
+    latents = np.random.default_rng(1).normal(size=(3, 5, channels)).astype(np.float16)
+    item = make_item(tokens=latents)
+    back = decode_episode(encode_episode(item))
+    assert back.tokens.dtype == np.float16 and np.array_equal(back.tokens, latents)
+    assert np.array_equal(back.actions, item.actions) and np.array_equal(back.frames, item.frames)
+
+
+def test_records_of_ids_have_kept_their_layout():
+    """Written out by hand: stores from before there were latents must still be read."""
+    header = np.asarray([1, 17, -1, 3, 5, 6, 7, 2, 8, 0], "<i4").tobytes()
+    item = make_item()
+    data = header + item.actions.tobytes() + item.tokens.tobytes() + item.frames.tobytes()
+    assert encode_episode(item) == data
+    assert np.array_equal(decode_episode(data).tokens, item.tokens)
+
+
 def test_record_of_another_length_or_version_is_refused():
     data = encode_episode(make_item())
     for bad in (data[:-1], data + b"\0", data[:10], b"\2" + data[1:]):
@@ -46,8 +65,17 @@ def test_record_of_another_length_or_version_is_refused():
             decode_episode(bad)
 
 
-def test_small_vocabularies_take_two_bytes():
+def test_small_vocabularies_and_latents_take_two_bytes():
     assert token_dtype(65536) == np.uint16 and token_dtype(65537) == np.uint32
+    assert token_dtype(0, channels=16) == np.float16
+
+
+def test_manifest_from_before_there_were_latents_is_one_of_ids(store_root, copy):
+    path = copy / "arm/manifest.json"
+    values = json.loads(path.read_text())
+    assert values["tokenizer"].pop("channels") == 0
+    path.write_text(json.dumps(values))
+    assert TokenStore(copy).manifest("arm") == TokenStore(store_root).manifest("arm")
 
 
 def test_table_follows_the_order_asked_for(store):

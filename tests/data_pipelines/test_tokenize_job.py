@@ -12,7 +12,7 @@ from data_pipelines.splits import held_out
 from data_pipelines.store import TokenStore
 from data_pipelines.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
-from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
 
 SPEC = make_spec(hz=4)  # stride 2
 
@@ -46,6 +46,24 @@ def test_every_episode_is_stored_once_with_its_own_frames_and_actions(tmp_path, 
     assert sorted(seen) == list(range(8))
     assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", 8)))
     assert files(tmp_path / "store" / "toy") == ["manifest.json", "train.array_record", "val.array_record"]
+
+
+def test_latents_are_stored_in_half_precision_with_their_own_frames(tmp_path, rlds):
+    manifest = tokenize_dataset(SPEC, rlds, FakeLatents(), tmp_path / "store", batch=7)
+    facts = manifest.tokenizer
+    assert (facts.channels, facts.vocab_size, facts.factors, facts.factor_vocab) == (3, 0, 0, 0)
+    store = TokenStore(tmp_path / "store")
+    for i, number in enumerate(manifest.train.episodes):
+        tokens, steps = store.episode("toy", "train", i).tokens, np.arange(0, 5 + number, 2)
+        assert tokens.dtype == np.float16 and tokens.shape == (len(steps), 4, 3)
+        assert (tokens[..., 0] == number).all() and (tokens[..., 1] == steps[:, None]).all()
+        assert np.array_equal(tokens[..., 2], np.float16(np.float32(steps[:, None]) / 3).repeat(4, 1))
+
+
+def test_ids_are_not_taken_for_latents(tmp_path, rlds):
+    tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
+    with pytest.raises(ConfigError, match="in another way.*tokenizer.channels: 0 -> 3"):
+        tokenize_dataset(SPEC, rlds, FakeLatents(), tmp_path / "store")
 
 
 def test_result_is_the_same_bytes_whenever_wherever_and_in_whatever_batches(tmp_path, rlds):
