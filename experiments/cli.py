@@ -25,7 +25,7 @@ from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
 from hma_jax.host_memory import keep_freed_memory
 
-Preset = Literal["smoke", "cpu", "accelerator", "paper"]
+Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous"]
 Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]
 
 
@@ -34,7 +34,8 @@ class Where:
     """Which study, on which data, in which directory."""
 
     preset: Preset = "cpu"
-    """Named study: smoke (seconds), cpu (minutes), accelerator (one GPU), paper (as published)."""
+    """Named study: smoke (seconds), cpu (minutes), accelerator (one GPU), paper (as published); with
+    -continuous, on latents instead of ids."""
     out: Path | None = None
     """Directory for everything that is written; runs/PRESET if not given."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from experiments.paper_mixture import PAPER_MIXTURE
 from experiments.study import StoreConfig, Study, SuiteConfig, TransferConfig
 from hma_jax.config import (
     ConfigError,
+    DiffusionConfig,
     EvalConfig,
     MaskingConfig,
     ModelConfig,
@@ -102,7 +105,21 @@ PAPER = Study(
     flops_per_second=8e14,  # eight accelerators at 100 TFLOP/s
 )
 
-PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER)}
+SMOKE_CONTINUOUS = replace(
+    SMOKE,
+    name="smoke-continuous",
+    tokenizer=replace(SMOKE.tokenizer, quantise=False),
+    model=replace(SMOKE.model, diffusion=DiffusionConfig(channels=8, patch=1, width=16, depth=1)),
+)
+
+CPU_CONTINUOUS = replace(
+    CPU,
+    name="cpu-continuous",  # the same study on latents instead of ids
+    tokenizer=replace(CPU.tokenizer, quantise=False, bits=16),
+    model=replace(CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=128, depth=2)),
+)
+
+PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS)}
 
 
 def get_preset(name: str) -> Study:

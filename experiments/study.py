@@ -110,16 +110,7 @@ class Study:
             f"widths {self.widths} must contain model.width {self.model.width}, the width of the "
             "reference trial",
         )
-        for name, want in (
-            ("tokens", self.tokenizer.tokens),
-            ("factors", self.tokenizer.factors),
-            ("factor_vocab", self.tokenizer.factor_vocab),
-        ):
-            require(
-                getattr(self.model, name) == want,
-                f"model.{name} is {getattr(self.model, name)} but the tokenizer makes {want}; "
-                f"set model.{name}={want} or change the tokenizer",
-            )
+        self._check_tokens()
         require(
             self.eval.prompt_frames < self.model.frames,
             f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of "
@@ -131,6 +122,37 @@ class Study:
             f"{len(self.datasets)}",
         )
         require(len(set(self.datasets)) == len(self.datasets), f"datasets repeat: {self.datasets}")
+
+    def _check_tokens(self) -> None:
+        """Raises ConfigError unless the model takes the tokens that the tokenizer makes."""
+        tokenizer, diffusion, channels = self.tokenizer, self.model.diffusion, self.tokenizer.token_channels
+        wanted = {"tokens": tokenizer.tokens}
+        if tokenizer.quantise:
+            wanted |= {"factors": tokenizer.factors, "factor_vocab": tokenizer.factor_vocab}
+        for name, want in wanted.items():
+            require(
+                getattr(self.model, name) == want,
+                f"model.{name} is {getattr(self.model, name)} but the tokenizer makes {want}; "
+                f"set model.{name}={want} or change the tokenizer",
+            )
+        if tokenizer.quantise:
+            require(
+                diffusion is None,
+                "model.diffusion is set, so the model takes latents, but the tokenizer makes ids; set "
+                "tokenizer.quantise=false, or start from a preset without diffusion",
+            )
+            return
+        require(
+            diffusion is not None,
+            "tokenizer.quantise is false, so tokens are latents, but the model takes ids; set "
+            f'model.diffusion={{"channels": {channels}, "patch": 1}}, or tokenizer.quantise=true',
+        )
+        require(
+            diffusion.token_channels == channels,
+            f"model.diffusion has {diffusion.token_channels} values per token (patch^2 x channels) but the "
+            f"tokenizer makes {channels}; set model.diffusion.patch=1 and "
+            f"model.diffusion.channels={channels}, or tokenizer.bits={diffusion.token_channels}",
+        )
 
     def dataset_names(self) -> tuple[str, ...]:
         """Every dataset of the study, in the order in which the datasets axis adds them."""

@@ -1,11 +1,13 @@
 """Studies, overrides and the three plans: shared reference, nested points, stable ids."""
 
 import dataclasses
+import typing
 from dataclasses import replace
 
 import pytest
 
 from experiments import scale_datasets, scale_trajectories, scale_width
+from experiments.cli import Preset
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.provenance import Provenance
@@ -105,6 +107,26 @@ def test_wrong_override_names_the_field(setting, message):
         override(SMOKE, [setting])
 
 
+@pytest.mark.parametrize(
+    ("preset", "setting", "message"),
+    [
+        ("smoke", "tokenizer.quantise=false", r'model takes ids; set model.diffusion=\{"channels": 8, "patch": 1\}'),
+        ("smoke-continuous", "tokenizer.quantise=true", "tokenizer makes ids; set tokenizer.quantise=false"),
+        ("smoke-continuous", "model.diffusion.patch=2", "32 values .*tokenizer makes 8; .*tokenizer.bits=32"),
+        ("smoke-continuous", "tokenizer.bits=9", "tokenizer makes 9; set .*model.diffusion.channels=9"),
+        ("smoke-continuous", "model.tokens=9", "the tokenizer makes 16"),
+    ],
+)
+def test_model_that_takes_other_tokens_is_told_what_to_set(preset, setting, message):
+    with pytest.raises(ConfigError, match=message):
+        override(get_preset(preset), [setting])
+
+
+def test_the_advice_makes_a_study_continuous():
+    study = override(SMOKE, ["tokenizer.quantise=false", 'model.diffusion={"channels": 8, "patch": 1}'])
+    assert study.model.diffusion.token_channels == study.tokenizer.token_channels == 8
+
+
 def test_every_choice_on_offer_is_accepted():
     for schedule in ("constant", "cosine", "wsd"):
         assert override(SMOKE, [f"train.optimizer.schedule={schedule}"]).train.optimizer.schedule == schedule
@@ -122,6 +144,10 @@ def test_every_choice_on_offer_is_accepted():
 def test_json_of_the_wrong_kind_names_the_field(values, message):
     with pytest.raises(ConfigError, match=message):
         from_dict(MeshConfig, values)
+
+
+def test_command_line_offers_every_preset():
+    assert set(typing.get_args(Preset)) == set(PRESETS)
 
 
 def test_unknown_preset_lists_the_known():
