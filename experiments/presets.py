@@ -14,6 +14,7 @@ from hma_jax.config import (
     ModelConfig,
     MupConfig,
     OptimizerConfig,
+    SamplerConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
@@ -110,6 +111,7 @@ SMOKE_CONTINUOUS = replace(
     name="smoke-continuous",
     tokenizer=replace(SMOKE.tokenizer, quantise=False),
     model=replace(SMOKE.model, diffusion=DiffusionConfig(channels=8, patch=1, width=16, depth=1)),
+    eval=replace(SMOKE.eval, sampler=SamplerConfig(steps=3, temperature=0.0)),
 )
 
 CPU_CONTINUOUS = replace(
@@ -117,6 +119,7 @@ CPU_CONTINUOUS = replace(
     name="cpu-continuous",  # the same study on latents instead of ids
     tokenizer=replace(CPU.tokenizer, quantise=False, bits=16),
     model=replace(CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=128, depth=2)),
+    eval=replace(CPU.eval, sampler=SamplerConfig(steps=20, temperature=0.0)),
 )
 
 PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS)}
