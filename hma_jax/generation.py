@@ -45,7 +45,7 @@ def rollout(
     count = _check_prompt(model, prompt, frames)
     flat = lambda x: None if x is None else jnp.repeat(x, repeats, axis=0)  # noqa: E731  [B, ...] -> [B R, ...]
     aligned = model.align(actions_BRTU)
-    hidden = None if hidden_BT is None else model.align_hidden(hidden_BT)
+    hidden = model.align_hidden(hidden_BT, (batch, frames))
     cache = None
     if count > 1:  # all prompt frames but the last, whose chunk may differ between sequences
         early = None if hidden is None else hidden[:, : count - 1]
@@ -162,7 +162,7 @@ def rollout_naive(
     frames = frames or actions_BTU.shape[1]
     count = _check_prompt(model, prompt, frames)
     aligned = None if actions_BTU is None else model.align(actions_BTU)
-    hidden = None if hidden_BT is None else model.align_hidden(hidden_BT)
+    hidden = None if actions_BTU is None else model.align_hidden(hidden_BT, (len(prompt), frames))
     blank = blank_frame(model.config, len(prompt))
     future = [blank.values[:, None].astype(prompt.dtype)] * (frames - count)
     window = jnp.concatenate([prompt, *future], axis=1)
@@ -199,7 +199,8 @@ def next_frame_outputs(
     masked = jnp.broadcast_to((jnp.arange(2 * count) >= count)[None, :, None], both.shape[:3])
     twice = lambda x: jnp.concatenate([x[:, :-1], x[:, 1:]], axis=1)  # noqa: E731
     actions = twice(model.align(actions_BTU))
-    hidden = None if hidden_BT is None else twice(model.align_hidden(hidden_BT))
+    hidden = model.align_hidden(hidden_BT, frames.shape[:2])
+    hidden = None if hidden is None else twice(hidden)
     positions = jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)])
     past, itself = causal(count), jnp.eye(count, dtype=bool)
     # A masked frame t sees the true frames before it and itself; nobody sees a masked frame.
@@ -231,7 +232,7 @@ def predict_actions(
     """
     count = frames.shape[1]
     visible = None if causally else jnp.ones((count, count), bool)
-    hidden = model.align_hidden(hidden_BT)
+    hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     out = model(frames, None, model.align(actions_BTU), embodiment_B, hidden_BT=hidden, visible=visible)
     return read_actions(model, out, embodiment_B, key_B, decode)
 
@@ -271,26 +272,30 @@ def rollout_policy(
     """
     frames = actions_BTU.shape[1]
     count = _check_prompt(model, prompt, frames)
+    shape = (len(prompt), frames)
+
+    def hidden_from(t: jax.Array | int) -> jax.Array:
+        """Frames that are shown no action while the chunks from t on are unknown."""
+        return model.align_hidden(jnp.broadcast_to(jnp.arange(frames) >= t, shape), shape)
+
     cache = None
     if count > 1:
-        past = model.align(actions_BTU)[:, : count - 1]
-        cache = model(prompt[:, :-1], None, past, embodiment_B, keep=True).cache
+        past, hidden = model.align(actions_BTU)[:, : count - 1], hidden_from(count - 1)[:, : count - 1]
+        cache = model(prompt[:, :-1], None, past, embodiment_B, hidden_BT=hidden, keep=True).cache
     cache = _make_room(model, cache, len(prompt), frames - 1)
     nothing_masked = jnp.zeros((len(prompt), 1, model.config.tokens), bool)
 
     def next_frame(carry: tuple[TemporalCache, jax.Array, jax.Array], t: jax.Array):
         cache, last, chunks = carry
         # The chunk after frame t - 1, read with that chunk hidden.
-        unknown = jnp.broadcast_to(jnp.arange(frames) >= t - 1, chunks.shape[:2])
-        act = _Window(model, model.align(chunks), model.align_hidden(unknown), embodiment_B)
+        act = _Window(model, model.align(chunks), hidden_from(t - 1), embodiment_B)
         seen = jnp.append(jnp.arange(cache.time[0].shape[2]) < t - 1, True)[None]
         out = act.pass_over(last[:, None], nothing_masked, t - 1, cache, seen)
         keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(key_B)
         chunk = read_actions(model, out, embodiment_B, keys[:, 0], decode)
         chunks = jax.lax.dynamic_update_slice_in_dim(chunks, chunk, t - 1, axis=1)
         # Now it is known; the one after frame t is not.
-        unknown = jnp.broadcast_to(jnp.arange(frames) >= t, chunks.shape[:2])
-        step = _Window(model, model.align(chunks), model.align_hidden(unknown), embodiment_B)
+        step = _Window(model, model.align(chunks), hidden_from(t), embodiment_B)
         out, cache = step.commit_and_look(cache, last, t)
         frame = decode_frame(model, out.frames[:, 1], lambda f: step.look(cache, f, t), keys[:, 1], decode)
         return (cache, frame, chunks), frame

@@ -55,7 +55,7 @@ def masked_loss(
 ) -> LossSums:
     """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise."""
     all_shown = masking.setting == "forward" and all(model.table.chunks)
-    hidden = None if all_shown else model.align_hidden(masked.hidden_T)
+    hidden = model.align_hidden(None if all_shown else masked.hidden_T, actions_BTU.shape[:2])
     frames = tokens.shape[1]
     everything = jnp.ones((frames, frames), bool) if masking.setting == "inverse" else None
     out = model(

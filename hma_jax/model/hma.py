@@ -119,21 +119,24 @@ class HMA(nnx.Module):
         return jnp.broadcast_to(feature_BTD[:, :, None], (b, t, self.config.action_tokens, d))
 
     def align(self, actions: jax.Array) -> jax.Array:
-        """Recorded chunks [..., T, U] -> the chunk that conditions each frame.
-
-        With `causal` alignment every frame takes the chunk that led to it; nothing led to the
-        first one, which keeps its own.
-        """
+        """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own as released,
+        with `causal` alignment the one before (and some chunk on the first frame, which
+        `align_hidden` hides)."""
         if self.config.action_alignment == "released":
             return actions
         return jnp.concatenate([actions[..., :1, :], actions[..., :-1, :]], axis=-2)
 
-    def align_hidden(self, hidden: jax.Array) -> jax.Array:
-        """Which recorded chunks [..., T] are hidden -> which frames' conditions are. With `causal`
-        alignment the first frame's is: its own chunk lies in its future."""
+    def align_hidden(self, hidden_BT: jax.Array | None, shape: tuple[int, int]) -> jax.Array | None:
+        """Which recorded chunks are hidden (None: none) -> which frames are shown no action.
+
+        `shape` is (B, T). With `causal` alignment the first frame never is: nothing led to it, and
+        its own chunk lies in its future.
+        """
         if self.config.action_alignment == "released":
-            return hidden
-        return jnp.concatenate([jnp.ones_like(hidden[..., :1]), hidden[..., :-1]], axis=-1)
+            return hidden_BT
+        if hidden_BT is None:
+            return jnp.broadcast_to(jnp.arange(shape[1]) == 0, shape)
+        return jnp.concatenate([jnp.ones_like(hidden_BT[:, :1]), hidden_BT[:, :-1]], axis=1)
 
 
 def declare_model(config: ModelConfig, table: EmbodimentTable) -> Declared:

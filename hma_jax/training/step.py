@@ -108,7 +108,7 @@ def make_train_step(
             state.params,
             declared.specs,
             multipliers,
-            find_presence(masked, batch["embodiment"], trained_E, everything=not config.only),
+            find_presence(masked, batch["embodiment"], trained_E, model, everything=not config.only),
             rate,
             config.optimizer,
         )
@@ -125,7 +125,11 @@ def make_train_step(
 
 
 def find_presence(
-    masked: Masked, embodiment_B: jax.Array, trained_E: jax.Array, everything: bool = True
+    masked: Masked,
+    embodiment_B: jax.Array,
+    trained_E: jax.Array,
+    model: ModelConfig,
+    everything: bool = True,
 ) -> Presence:
     """Which parameters a batch concerns. Only `trained_E` robots' own are moved, and the shared
     ones not at all unless `everything` is trained."""
@@ -133,7 +137,8 @@ def find_presence(
     rows: dict[Use, jax.Array] = {
         "always": jnp.ones(len(embodiment_B), bool),
         "actions_shown": (~hidden_BT).any(axis=1),
-        "actions_hidden": hidden_BT.any(axis=1),
+        # With causal alignment the first frame is never shown an action.
+        "actions_hidden": hidden_BT.any(axis=1) | (model.action_alignment == "causal"),
         "actions_predicted": masked.action_targets_T.any(axis=1),
         "frames_predicted": masked.targets_TS.any(axis=(1, 2)),
     }

@@ -21,6 +21,15 @@ def test_masked_counts_are_the_cosine_schedule_of_the_release():
     assert masked_counts(continuous, 4) == [236, 181, 97, 0]
 
 
+def jitted_rollout(declared, batch, actions, keys, decode, prompt, **options):
+    """params -> frames of one rollout of `batch` from `prompt` frames."""
+    return jax.jit(
+        lambda p: rollout(
+            declared.merge(p), batch["tokens"][:, :prompt], actions, batch["embodiment"], keys, decode, **options
+        )
+    )
+
+
 def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
     batch = random_batch(0, config, 4)
@@ -44,11 +53,15 @@ def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
 
 
 @pytest.mark.parametrize(
-    "decode",
-    [DecodeConfig(1), DecodeConfig(2), DecodeConfig(3, 1.0), DecodeConfig(4, order="confidence")],
+    "decode, prompt, alignment",
+    [
+        (DecodeConfig(1), 1, "released"),
+        (DecodeConfig(2), 3, "released"),
+        (DecodeConfig(3, 1.0), 3, "causal"),
+        (DecodeConfig(4, order="confidence"), 1, "causal"),
+    ],
     ids=str,
 )
-@pytest.mark.parametrize("prompt, alignment", [(1, "released"), (3, "released"), (3, "causal")])
 def test_the_cached_rollout_equals_recomputing_the_window(
     decode: DecodeConfig, prompt: int, alignment: str
 ):
@@ -84,8 +97,8 @@ def test_actions_that_are_all_hidden_make_no_difference(conditioning: str):
     batch = random_batch(0, config, 2)
     actions = np.stack([batch["actions"], batch["actions"] + 3], axis=1)
     keys = jax.random.split(jax.random.key(0), 2)
-    args = (declared.merge(params), batch["tokens"][:, :2], actions, batch["embodiment"], keys, DecodeConfig(2))
-    blind = rollout(*args, hidden_BT=np.ones((2, 6), bool))
+    hidden = np.ones((2, 6), bool)
+    blind = jitted_rollout(declared, batch, actions, keys, DecodeConfig(2), 2, hidden_BT=hidden)(params)
     np.testing.assert_array_equal(blind[:, 0], blind[:, 1])
 
 
@@ -94,10 +107,10 @@ def test_top_1_is_greedy():
     declared, params = lively_params(config)
     batch = random_batch(0, config, 2)
     keys = jax.random.split(jax.random.key(0), 2)
-    run = lambda decode: rollout(  # noqa: E731
-        declared.merge(params), batch["tokens"][:, :2], batch["actions"][:, None], batch["embodiment"], keys, decode
-    )
-    np.testing.assert_array_equal(run(DecodeConfig(2, 1.0, top_k=1)), run(DecodeConfig(2)))
+    actions = batch["actions"][:, None]
+    greedy, top = DecodeConfig(2), DecodeConfig(2, 1.0, top_k=1)
+    a, b = (jitted_rollout(declared, batch, actions, keys, d, 2)(params) for d in (greedy, top))
+    np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("alignment", ["released", "causal"])
@@ -155,9 +168,7 @@ def test_equal_actions_give_equal_rollouts_even_when_sampled():
     batch = random_batch(0, config, 2)
     same = np.stack([batch["actions"]] * 2, axis=1)
     keys = jax.random.split(jax.random.key(0), 2)
-    got = rollout(
-        declared.merge(params), batch["tokens"][:, :2], same, batch["embodiment"], keys, DecodeConfig(2, 1.0)
-    )
+    got = jitted_rollout(declared, batch, same, keys, DecodeConfig(2, 1.0), 2)(params)
     np.testing.assert_array_equal(got[:, 0], got[:, 1])
 
 
@@ -169,13 +180,14 @@ def test_causal_alignment_conditions_a_frame_on_the_chunk_that_led_to_it():
         batch = random_batch(0, config, 2)
         actions = batch["actions"].copy()
         actions[:, chunk, :2] += 3.0
-        given = [hma.align(a) for a in (batch["actions"], actions)]
-        logits = [hma(batch["tokens"], None, a, batch["embodiment"]).frames for a in given]
+        hidden = hma.align_hidden(None, (2, config.frames))
+        look = jax.jit(lambda a: hma(batch["tokens"], None, hma.align(a), batch["embodiment"], hidden_BT=hidden).frames)
+        logits = [look(a) for a in (batch["actions"], actions)]
         changed = np.abs(logits[0] - logits[1]).max((0, 2, 3, 4)) > 1e-3
         return int(np.argmax(changed))
 
     assert [first_frame_to_change("released", c) for c in (0, 2)] == [0, 2]
-    assert [first_frame_to_change("causal", c) for c in (0, 2)] == [0, 3]
+    assert [first_frame_to_change("causal", c) for c in (0, 2)] == [1, 3]
 
 
 @pytest.mark.parametrize("alignment", ["released", "causal"])
@@ -184,11 +196,16 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
     declared, params = lively_params(config, scale=0.1)
     batch = random_batch(0, config, 3)
     hma = declared.merge(params)
-    args = (hma.align(batch["actions"]), batch["embodiment"])
+    hidden = hma.align_hidden(None, batch["tokens"].shape[:2])
+    look = jax.jit(
+        lambda masked: hma(
+            batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden
+        ).frames
+    )
     fast = np.asarray(next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))
     for t in range(1, config.frames):
         masked = np.broadcast_to(np.arange(config.frames)[None, :, None] >= t, batch["tokens"].shape)
-        slow = np.asarray(hma(batch["tokens"], masked, *args).frames[:, t])
+        slow = np.asarray(look(masked)[:, t])
         np.testing.assert_allclose(fast[:, t - 1], slow, atol=1e-4 * np.abs(slow).max())
 
 
@@ -209,8 +226,7 @@ def test_temperature_is_a_temperature():
     actions = batch["actions"][:, None]
     keys = jax.random.split(jax.random.key(0), 8)
     run = lambda t: np.asarray(  # noqa: E731
-        rollout(declared.merge(params), batch["tokens"][:, :5], actions, batch["embodiment"], keys,
-                DecodeConfig(1, t))
+        jitted_rollout(declared, batch, actions, keys, DecodeConfig(1, t), 5)(params)
     )
     greedy = run(0.0)
     assert (run(0.01) == greedy).mean() > (run(5.0) == greedy).mean() + 0.2

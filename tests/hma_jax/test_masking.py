@@ -172,7 +172,7 @@ def test_what_a_step_does_not_concern_stands_still():
 def test_presence_is_by_use_and_robot():
     config = model_config()
     data, masked = masked_batch(config, MaskingConfig(setting="full"), MIXED)
-    presence = find_presence(masked, jnp.asarray(data["embodiment"]), jnp.ones(3, bool))
+    presence = find_presence(masked, jnp.asarray(data["embodiment"]), jnp.ones(3, bool), config)
     assert presence.robots["actions_shown"].tolist() == [True, False, True]
     assert presence.robots["actions_predicted"].tolist() == [True, False, True]
     assert presence.robots["frames_predicted"].tolist() == [True, True, False]
