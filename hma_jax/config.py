@@ -141,7 +141,9 @@ class TokenizerConfig:
     entropy_temperature: float = 1.0  # of the soft code assignment that the entropy is taken of
     commitment_weight: float = 0.0
     # Without quantisation: noise on the latents while training, its standard deviation in the
-    # range -1..1 of the encoder. It makes the decoder bear the errors of a generative model.
+    # range -1..1 of the encoder. It makes the decoder bear the errors of a generative model: on
+    # the suite 0.1 costs 0.6 dB without errors and gains 1.7 dB where they are 0.2 (of latents
+    # scaled to 1); 0.2 costs 1.3 dB and is better only from errors of 0.3 on.
     latent_noise: float = 0.1
 
     def __post_init__(self):
