@@ -17,7 +17,7 @@ from hma_jax.params import Declared, ParamSpec, normal
 from hma_jax.tokenizers import quantizer
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer, reconstruction_psnr
 from hma_jax.tokenizers.base import PIECE, in_pieces
-from hma_jax.tokenizers.continuous import ContinuousTokenizer, make_continuous
+from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer, code_usage
 from hma_jax.tokenizers.quantizer import (
     commitment,
@@ -55,11 +55,6 @@ def tokenizer(request):
 @pytest.fixture(scope="module")
 def discrete():
     return fresh(CONFIG)
-
-
-@pytest.fixture(scope="module")
-def continuous():
-    return fresh(CONTINUOUS)
 
 
 def noise(count: int, seed: int = 0) -> np.ndarray:
@@ -232,63 +227,6 @@ def test_ids_that_cannot_be_decoded_are_refused(discrete):
             discrete.decode(ids + wrong)
 
 
-def test_latents_that_cannot_be_decoded_are_refused(continuous):
-    latents = np.zeros((2, 16, 6), np.float32)
-    for wrong in (latents[..., :5], latents[:, :9], latents[0], latents.astype(np.int32)):
-        with pytest.raises(ConfigError, match=r"decodes latents, float \[B, 16, 6\], got"):
-            continuous.decode(wrong)
-    latents[1, 3, 2] = np.nan
-    with pytest.raises(ConfigError, match="not finite; did the model diverge"):
-        continuous.decode(latents)
-
-
-def test_half_precision_latents_decode_as_well(continuous):
-    """The token store keeps them so."""
-    latents = continuous.encode(noise(2))
-    exact, stored = continuous.decode(latents), continuous.decode(latents.astype(np.float16))
-    assert np.abs(exact.astype(int) - stored).max() <= 1
-
-
-def test_latents_have_unit_deviation_on_the_frames_they_were_measured_on():
-    batches = [scenes(8, seed) for seed in range(3)]
-    tokenizer = make_continuous(CONTINUOUS, declare_tokenizer(CONTINUOUS).init(0), iter(batches))
-    latents = np.concatenate([tokenizer.encode(images) for images in batches])
-    assert latents.std() == pytest.approx(1, abs=1e-5) and abs(tokenizer.latent_std - 1) > 0.1
-
-
-def test_scale_of_the_latents_is_undone_by_decoding(continuous):
-    other = ContinuousTokenizer(CONTINUOUS, continuous.params, 2 * continuous.latent_std)
-    latents = continuous.encode(noise(4))
-    np.testing.assert_allclose(other.encode(noise(4)), latents / 2, rtol=1e-6)
-    assert np.array_equal(other.decode(latents / 2), continuous.decode(latents))
-
-
-def test_latents_outside_the_encoders_range_are_taken_back_to_it(continuous):
-    edge = np.full((1, 16, 6), 1 / continuous.latent_std, np.float32)
-    assert np.array_equal(continuous.decode(5 * edge), continuous.decode(edge))
-    assert not np.array_equal(continuous.decode(0.5 * edge), continuous.decode(edge))
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf")])
-def test_what_is_no_scale_is_refused(continuous, scale):
-    with pytest.raises(ConfigError, match="standard deviation of the latents must be positive"):
-        ContinuousTokenizer(CONTINUOUS, continuous.params, scale)
-
-
-def test_kind_must_be_that_of_the_configuration(discrete):
-    with pytest.raises(ConfigError, match="needs tokenizer.quantise=true"):
-        LfqTokenizer(CONTINUOUS, discrete.params)
-    with pytest.raises(ConfigError, match="needs tokenizer.quantise=false"):
-        ContinuousTokenizer(CONFIG, discrete.params, 1.0)
-
-
-def test_any_number_of_channels_makes_a_continuous_token():
-    assert TokenizerConfig(quantise=False, bits=37).token_channels == 37
-    for wrong in ({"bits": 0}, {"latent_noise": -0.1}):
-        with pytest.raises(ConfigError, match=f"tokenizer.{next(iter(wrong))}"):
-            TokenizerConfig(quantise=False, **wrong)
-
-
 def test_code_usage_counts_codes_of_each_factor():
     class Constant:
         factors, factor_vocab = 2, 8
@@ -324,21 +262,6 @@ def test_regularisers_reach_loss_and_encoder():
     for term, (total, _, moved) in zip(expected, others, strict=True):
         assert term != 0 and float(total - plain) == pytest.approx(0.5 * term, abs=1e-6)
         assert not np.allclose(moved, at_rest)
-
-
-def test_noise_reaches_the_decoder_and_is_the_keys():
-    config = replace(CONTINUOUS, encoder_blocks=0, decoder_blocks=0)
-    declared = declare_tokenizer(config)
-    params, images = declared.init(0), jnp.asarray(scenes(4))
-
-    def losses(noise: float) -> list[float]:
-        """Of the same images under two keys."""
-        chosen = replace(config, latent_noise=noise)
-        loss = jax.jit(lambda params, key: tokenizer_loss(declared, params, images, chosen, key)[0])
-        return [float(loss(params, jax.random.key(seed))) for seed in (0, 1)]
-
-    silent, noisy = losses(0.0), losses(0.3)
-    assert silent[0] == silent[1] < min(noisy) and noisy[0] != noisy[1]
 
 
 def train(run_dir: Path, *, config=CONFIG, settings=TRAIN, last_step: int | None = None, **options):
