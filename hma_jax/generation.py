@@ -237,6 +237,42 @@ def predict_actions(
     return read_actions(model, out, embodiment_B, key_B, decode)
 
 
+def predict_next_actions(
+    model: HMA,
+    frames: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+) -> jax.Array:
+    """Raw chunks [B, T, U]: what the policy would do at every frame of a recorded window, having
+    seen the frames up to it and all actions before.
+
+    One pass: with causal alignment no frame is shown its own chunk; otherwise every frame stands
+    beside a copy of itself whose action is hidden, as in `next_frame_outputs`.
+    """
+    batch, count = frames.shape[:2]
+    if model.config.action_alignment == "causal":
+        nothing = jnp.zeros((batch, count), bool)
+        return predict_actions(model, frames, actions_BTU, embodiment_B, nothing, key_B, decode)
+    twice = lambda x: jnp.concatenate([x, x], axis=1)  # noqa: E731
+    hidden = jnp.broadcast_to(jnp.arange(2 * count) >= count, (batch, 2 * count))
+    past, before = causal(count), jnp.tril(jnp.ones((count, count), bool), -1)
+    visible = jnp.block([[past, jnp.zeros_like(past)], [before, jnp.eye(count, dtype=bool)]])
+    positions = jnp.concatenate([jnp.arange(count)] * 2)
+    out = model(
+        twice(frames),
+        None,
+        twice(actions_BTU),
+        embodiment_B,
+        hidden_BT=hidden,
+        visible=visible,
+        positions=positions,
+    )
+    own = out._replace(actions=None if out.actions is None else out.actions[:, count:])
+    return read_actions(model, own, embodiment_B, key_B, decode)
+
+
 def read_actions(
     model: HMA, out: Outputs, embodiment_B: jax.Array, key_B: jax.Array, decode: DecodeConfig
 ) -> jax.Array:

@@ -11,7 +11,8 @@ frames' tokens are masked and which actions are hidden:
     policy    none            from a random frame on    hidden actions
     inverse   none            all                       hidden actions; attention is not causal
 
-A robot without recorded actions has all of them hidden and none predicted; one whose video is
+With causal alignment no frame is shown the chunk that follows it, so that all of them can be
+predicted, not only the hidden ones. A robot without recorded actions has all of them hidden and none predicted; one whose video is
 no target has no token masked. Each trains what it can.
 """
 
@@ -153,7 +154,8 @@ def mask_example(
             inputs, targets = corrupt(tokens, draws, config, masking), masked
     else:
         masked = targets = jnp.zeros((frames, config.tokens), bool)
-    action_targets = hidden & has_actions & masking.predicts_actions
+    unseen = hidden | (config.action_alignment == "causal")
+    action_targets = unseen & has_actions & masking.predicts_actions
     return Masked(inputs, masked, targets, hidden, action_targets)
 
 

@@ -8,8 +8,9 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
   frames (not their reconstruction by the tokenizer);
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
   under random action sequences, unmasking with the same random numbers;
-* policy, where the model was trained to predict actions: squared error of the chunks after the
-  prompt, read off the true frames with those chunks hidden, against that of the mean action.
+* policy, where the model was trained to predict actions: squared error of every chunk after the
+  prompt, given the true frames and actions before it (inverse dynamics: all frames and no
+  action), against that of the mean action.
 
 A model trained on passive video is shown no action anywhere.
 
@@ -41,7 +42,7 @@ from hma_jax.evaluation.metrics import (
     ssim,
     stratified,
 )
-from hma_jax.generation import next_frame_outputs, predict_actions, rollout
+from hma_jax.generation import next_frame_outputs, predict_actions, predict_next_actions, rollout
 from hma_jax.model import HMA, declare_model
 from hma_jax.model.frames import compose
 from hma_jax.objectives import frame_diffusion_loss
@@ -169,10 +170,13 @@ def _policy_errors(
 ) -> dict[str, jax.Array]:
     """Per window [B]: mean squared error of the chunks from `first` on, in variances of each live
     action value, of the model and of always giving the mean."""
-    hidden = jnp.broadcast_to(jnp.arange(frames.shape[1]) >= first, frames.shape[:2])
-    predicted = predict_actions(
-        model, frames, actions_BTU, embodiment_B, hidden, key_B, decode, causally=causally
-    )
+    if causally:
+        predicted = predict_next_actions(model, frames, actions_BTU, embodiment_B, key_B, decode)
+    else:
+        hidden = jnp.ones(frames.shape[:2], bool)
+        predicted = predict_actions(
+            model, frames, actions_BTU, embodiment_B, hidden, key_B, decode, causally=False
+        )
     table = model.table
     alive_BU = jnp.asarray(table.alive())[embodiment_B]
     truth, guess = (table.normalise(x, embodiment_B)[:, first:] for x in (actions_BTU, predicted))

@@ -5,7 +5,14 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.decoding import Frame, masked_counts, unmask
-from hma_jax.generation import next_frame_outputs, predict_actions, rollout, rollout_naive, rollout_policy
+from hma_jax.generation import (
+    next_frame_outputs,
+    predict_actions,
+    predict_next_actions,
+    rollout,
+    rollout_naive,
+    rollout_policy,
+)
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
 SAMPLER = SamplerConfig(steps=5)
@@ -140,6 +147,21 @@ def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(alignment:
         window = jnp.concatenate([window, new], axis=1)
     np.testing.assert_allclose(chunks, actions, atol=1e-3)
     np.testing.assert_allclose(frames, window[:, prompt:], atol=1e-3)
+
+
+@pytest.mark.parametrize("alignment", ["released", "causal"])
+def test_next_actions_equal_one_window_per_frame_with_the_rest_hidden(alignment: str):
+    config = model_config(action_alignment=alignment)
+    declared, params = lively_params(config, scale=0.1)
+    batch = random_batch(0, config, 2)
+    keys = jax.random.split(jax.random.key(0), 2)
+    args = (batch["tokens"], batch["actions"], batch["embodiment"])
+    fast = jax.jit(lambda p: predict_next_actions(declared.merge(p), *args, keys, DecodeConfig()))(params)
+    one = jax.jit(lambda p, h: predict_actions(declared.merge(p), *args, h, keys, DecodeConfig()))
+    for t in range(config.frames):
+        hidden = np.broadcast_to(np.arange(config.frames) >= t, (2, config.frames))
+        slow = one(params, hidden)[:, t]
+        np.testing.assert_allclose(fast[:, t], slow, atol=1e-4 * np.abs(slow).max())
 
 
 @pytest.mark.parametrize("alignment", ["released", "causal"])
