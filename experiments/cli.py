@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands
+from experiments import commands, model_commands
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
@@ -40,11 +40,13 @@ class Where:
     """Directory for everything that is written; runs/PRESET if not given."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
     """Your RLDS directories, instead of the simulated suite. Their names must be in the registry."""
+    tokenizer: Path | None = None
+    """Directory of a trained tokenizer to use, instead of training one on the data."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
     """Change one setting, such as --set model.frames=4 --set train.steps=100; may be repeated."""
 
     def setting(self) -> commands.Setting:
-        return commands.make_setting(self.preset, self.out, self.data, self.set)
+        return commands.make_setting(self.preset, self.out, self.data, self.set, self.tokenizer)
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,30 @@ def train(
         run: Directory of the training run; OUT/model if not given. Resumed if it exists.
         mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
     """
-    commands.train(where.setting(), run, MeshConfig(*mesh))
+    model_commands.train(where.setting(), run, MeshConfig(*mesh))
+
+
+@app.command(name="adapt")
+def adapt(
+    source: Positional[Path],
+    where: OmitArgPrefixes[Where],
+    run: Path | None = None,
+    everything: bool = False,
+    mesh: tuple[int, int, int] = (-1, 1, 1),
+) -> None:
+    """Add new robots to a trained model and train them on the study's datasets.
+
+    The model gets a stem, conditioning and head for every dataset it does not know. What it says of
+    the robots it knows stays the same, bit for bit, unless everything is trained.
+
+    Args:
+        source: Directory of the training run that knows the other robots.
+        where: The study with the new datasets. Give --tokenizer: the one of the trained model.
+        run: Directory of the new training run; OUT/model if not given. Resumed if it exists.
+        everything: Train the whole model, not the new robots' own parameters alone.
+        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
+    """
+    model_commands.adapt(where.setting(), source, run, everything, MeshConfig(*mesh))
 
 
 @app.command(name="evaluate")
@@ -144,7 +169,7 @@ def evaluate(run: Positional[Path], where: OmitArgPrefixes[Where]) -> None:
         run: Directory of the training run.
         where: The study whose windows, tokenizer and protocol are used.
     """
-    commands.evaluate(where.setting(), run)
+    model_commands.evaluate(where.setting(), run)
 
 
 @app.command(name="report")

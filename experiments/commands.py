@@ -11,7 +11,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
@@ -30,13 +29,9 @@ from experiments.program import PROGRAM
 from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
-from experiments.sweep import reference_trial, titles, unique_trials
+from experiments.sweep import titles, unique_trials
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
 from hma_jax.config import ConfigError, MeshConfig, to_dict
-
-if TYPE_CHECKING:
-    from experiments.trial import Materials
-    from hma_jax.training.train import Run
 
 AXES = {
     "datasets": scale_datasets.plan,
@@ -61,9 +56,16 @@ class Setting:
     study: Study
     data: tuple[str, ...]
     workspace: Workspace
+    tokenizer: Path | None = None  # a trained one to use; None: train one on the data
 
 
-def make_setting(preset: str, out: Path | None, data: Sequence[str], settings: Sequence[str]) -> Setting:
+def make_setting(
+    preset: str,
+    out: Path | None,
+    data: Sequence[str],
+    settings: Sequence[str],
+    tokenizer: Path | None = None,
+) -> Setting:
     """The preset, on the user's data if given, with overrides. Touches no file but `data`."""
     study = get_preset(preset)
     if data:
@@ -72,7 +74,8 @@ def make_setting(preset: str, out: Path | None, data: Sequence[str], settings: S
         study = on_user_data(study, name_datasets(data))
     study = override(study, settings)
     directories = tuple(str(Path(d).absolute()) for d in data)
-    return Setting(study, directories, Workspace((out or Path("runs") / study.name).absolute()))
+    workspace = Workspace((out or Path("runs") / study.name).absolute())
+    return Setting(study, directories, workspace, tokenizer and tokenizer.absolute())
 
 
 def dry_run(study: Study, axes: Sequence[str]) -> None:
@@ -96,7 +99,7 @@ def run_study(
     sweeps = [AXES[axis](study) for axis in axes]
     with workspace.claimed():
         all_axes = merge_axes(workspace, study, axes)
-        provenance = prepare(study, workspace, setting.data)
+        provenance = prepare(study, workspace, setting.data, setting.tokenizer)
         record = Record(study, setting.data, all_axes, command_line(), provenance)
         save_record(workspace, record)
         trials = unique_trials(sweeps, provenance)
@@ -164,7 +167,7 @@ def complain(jobs: Sequence[Job], states: dict[str, State]) -> None:
 
 def wrote(*paths: Path, then: str = "") -> None:
     for path in paths:
-        console.print(f"wrote [bold]{escape(_short(path))}[/]", soft_wrap=True)
+        console.print(f"wrote [bold]{escape(short(path))}[/]", soft_wrap=True)
     if then:
         console.print(f"next: {escape(then)}", soft_wrap=True)
 
@@ -174,7 +177,7 @@ def command_line() -> str:
     return shlex.join([PROGRAM, *sys.argv[1:]])
 
 
-def _short(path: Path) -> str:
+def short(path: Path) -> str:
     try:
         return str(path.relative_to(Path.cwd()))
     except ValueError:
@@ -208,7 +211,7 @@ def write_suite(setting: Setting) -> None:
 
     with setting.workspace.claimed():
         make_suite(setting.study, setting.workspace)
-    wrote(setting.workspace.suite, then=_next("tokenizer train", setting))
+    wrote(setting.workspace.suite, then=next_command("tokenizer train", setting))
 
 
 def train_tokenizer(setting: Setting) -> None:
@@ -218,87 +221,15 @@ def train_tokenizer(setting: Setting) -> None:
     with workspace.claimed():
         sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace)
         make_tokenizer(study, workspace, sources)
-    wrote(workspace.tokenizer, then=_next("tokenize", setting))
+    wrote(workspace.tokenizer, then=next_command("tokenize", setting))
 
 
 def tokenize(setting: Setting) -> None:
     from experiments.pipeline import prepare
 
     with setting.workspace.claimed():
-        prepare(setting.study, setting.workspace, setting.data)
-    wrote(setting.workspace.store, setting.workspace.manifest, then=_next("train", setting))
-
-
-def train(setting: Setting, run: Path | None, mesh: MeshConfig) -> None:
-    from experiments.pipeline import prepare
-    from experiments.trial import open_materials, train_trial
-
-    study, workspace = setting.study, setting.workspace
-    run = run or workspace.root / "model"
-    with workspace.claimed():
-        prepare(study, workspace, setting.data)
-    trial = reference_trial(study, study.seeds[0])
-    with step(f"train: {trial.title}") as update:
-        result = train_trial(
-            trial,
-            open_materials(workspace),
-            run,
-            mesh=mesh,
-            progress=lambda phase, done, total: update(done, total, phase),
-        )
-    console.print(f"loss {result.losses[-1]:.4f} after {len(result.losses):,} steps")
-    wrote(run, then=_next(f"evaluate {shlex.quote(_short(run))}", setting))
-
-
-def evaluate(setting: Setting, run: Path) -> None:
-    from experiments.trial import evaluate_on, open_materials, write_samples
-    from hma_jax.training.train import load_run
-
-    trained = load_run(run)
-    materials = open_materials(setting.workspace)
-    check_fits(trained, materials)
-    with step(f"evaluate {_short(run)}") as update:
-        evaluation = evaluate_on(
-            trained.table.names,
-            trained.params,
-            trained.model,
-            trained.table,
-            materials,
-            setting.study.eval,
-            trained.train.masking.setting,
-            progress=lambda phase, done, total: update(done, total, phase),
-        )
-    wanted = ("perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain")
-    metrics = [m for m in wanted if m in evaluation.overall]
-    table = tidy_table(f"{_short(run)}, step {trained.step:,}", "dataset", *metrics)
-    for name, stats in [*evaluation.datasets.items(), ("overall", evaluation.overall)]:
-        table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
-    console.print(table)
-    write_atomically(run / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1))
-    write_samples(run / "samples.npz", evaluation.samples)
-    wrote(run / "evaluation.json", run / "samples.npz")
-
-
-def check_fits(trained: Run, materials: Materials) -> None:
-    """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
-    advice = "; evaluate it with the --out it was trained in"
-    tokenizer, here = trained.provenance.get("tokenizer"), materials.tokenizer.identity
-    if tokenizer != here:
-        raise ConfigError(
-            f"the model was trained on tokens of tokenizer {tokenizer}, the study here uses {here}{advice}"
-        )
-    frames, manifest = trained.model.frames, materials.manifest
-    if frames != manifest.frames:
-        raise ConfigError(
-            f"the model sees windows of {frames} frames, those frozen for evaluation here have "
-            f"{manifest.frames}{advice}"
-        )
-    missing = set(trained.table.names) - {d.dataset for d in manifest.datasets}
-    if missing:
-        raise ConfigError(
-            f"the model was trained on {', '.join(sorted(missing))}, of which the study here has no "
-            f"windows{advice}"
-        )
+        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer)
+    wrote(setting.workspace.store, setting.workspace.manifest, then=next_command("train", setting))
 
 
 def draw_again(out: Path) -> None:
@@ -307,7 +238,9 @@ def draw_again(out: Path) -> None:
     draw(workspace, load_record(workspace))
 
 
-def _next(command: str, setting: Setting) -> str:
-    out = _short(setting.workspace.root)
+def next_command(command: str, setting: Setting) -> str:
+    """A command line for the same study, data and directory."""
+    out = short(setting.workspace.root)
     data = " --data " + " ".join(map(shlex.quote, setting.data)) if setting.data else ""
-    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}"
+    tokenizer = f" --tokenizer {shlex.quote(short(setting.tokenizer))}" if setting.tokenizer else ""
+    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}{tokenizer}"

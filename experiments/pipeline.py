@@ -42,14 +42,20 @@ Source = tuple["DatasetSpec", Path]
 """A dataset: how it is read, and its RLDS directory."""
 
 
-def prepare(study: Study, workspace: Workspace, data: Sequence[str] = ()) -> Provenance:
+def prepare(
+    study: Study, workspace: Workspace, data: Sequence[str] = (), tokenizer: Path | None = None
+) -> Provenance:
     """Makes what is missing and returns what trials depend on.
 
-    `data` are RLDS directories of the user, in the study's order; () simulates the suite.
+    `data` are RLDS directories of the user, in the study's order; () simulates the suite. Instead
+    of training one, a trained `tokenizer` is taken from its directory.
     Raises ConfigError or DataError.
     """
     sources = find_sources(study, data) if data else make_suite(study, workspace)
-    make_tokenizer(study, workspace, sources)
+    if tokenizer is None:
+        make_tokenizer(study, workspace, sources)
+    else:
+        adopt_tokenizer(tokenizer, study, workspace)
     make_store(study, workspace, sources)
     return freeze_windows(study, workspace)
 
@@ -138,6 +144,23 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
         quality = reconstruction_psnr(tokenizer, frames(0, "val"))
     console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
     write_atomically(aside / QUALITY, json.dumps(quality))
+    write_atomically(aside / STAMP, made_from)
+    shutil.rmtree(workspace.tokenizer, ignore_errors=True)
+    os.replace(aside, workspace.tokenizer)
+
+
+def adopt_tokenizer(source: Path, study: Study, workspace: Workspace) -> None:
+    """A copy of a tokenizer that was trained elsewhere. Raises ConfigError if it is not the kind
+    that the study is made for."""
+    from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
+
+    tokenizer = load_tokenizer(source, expect=study.tokenizer)
+    made_from = f"adopted {tokenizer.identity}"
+    if _reads(workspace.tokenizer / STAMP, made_from):
+        return
+    aside = workspace.root / "tokenizer.adopted"
+    shutil.rmtree(aside, ignore_errors=True)
+    save_tokenizer(tokenizer, aside)
     write_atomically(aside / STAMP, made_from)
     shutil.rmtree(workspace.tokenizer, ignore_errors=True)
     os.replace(aside, workspace.tokenizer)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from data_pipelines.store import TokenStore
     from hma_jax.embodiments import EmbodimentTable
     from hma_jax.evaluation.protocol import Evaluation
+    from hma_jax.params import Params
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.loop import FitResult
 
@@ -96,8 +97,15 @@ def train_trial(
     *,
     mesh: MeshConfig = MeshConfig(),
     progress: Progress = lambda *_: None,
+    table: EmbodimentTable | None = None,
+    initial: Params | None = None,
+    origin: dict[str, Any] | None = None,
 ) -> FitResult:
-    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train_model`."""
+    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train_model`.
+
+    A model that is not new has a `table` of its own (of which the trial's datasets are part), its
+    `initial` parameters and an `origin`, which its checkpoints remember.
+    """
     import jax
 
     from data_pipelines.loader import LoaderConfig, make_loader
@@ -105,7 +113,7 @@ def train_trial(
     from hma_jax.training.train import train_model
 
     store = materials.store
-    table = store.embodiment_table(trial.datasets)
+    table = table or store.embodiment_table(trial.datasets)
     loader = LoaderConfig(
         frames=trial.model.frames,
         batch=trial.train.batch,
@@ -129,7 +137,9 @@ def train_trial(
             "store": store.hash(trial.datasets),
             "tokenizer": materials.tokenizer.identity,
             "loader": to_dict(loader),
+            **({"origin": origin} if origin else {}),
         },
+        initial=initial,
         options=LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
         progress=lambda step, steps, _: progress("training", step, steps),
     )

@@ -13,7 +13,7 @@ from hma_jax.config import ModelConfig, TrainConfig, require
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.masking import Masked, mask_batch
 from hma_jax.objectives import LossSums, TargetCounts, count_targets, masked_loss
-from hma_jax.params import Declared, Use, is_spec
+from hma_jax.params import Declared, Params, Use, is_spec
 from hma_jax.training.optimizer import (
     Presence,
     apply_adamw,
@@ -31,10 +31,16 @@ embodiment int32 [B]."""
 
 
 def init_state(
-    declared: Declared, table: EmbodimentTable, seed: int, shardings: TrainState | None = None
+    declared: Declared,
+    table: EmbodimentTable,
+    seed: int,
+    shardings: TrainState | None = None,
+    params: Params | None = None,
 ) -> TrainState:
-    """The state before step 1, laid out by `shardings` (default: on one device)."""
-    params = declared.init(seed, shardings and shardings.params)
+    """The state before step 1, laid out by `shardings` (default: on one device), around `params`
+    or freshly drawn ones."""
+    if params is None:
+        params = declared.init(seed, shardings and shardings.params)
     state = TrainState(jnp.zeros((), jnp.int32), params, init_adam(params, table.size))
     return jax.device_put(state, shardings)
 

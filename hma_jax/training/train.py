@@ -47,11 +47,12 @@ def train_model(
     mesh: MeshConfig = MeshConfig(),
     options: LoopOptions = LoopOptions(),
     progress: Progress | None = None,
+    initial: Params | None = None,
 ) -> FitResult:
     """Trains to `config.steps`, resuming what is in `run_dir`.
 
     `make_batches(start)` yields this process's rows of the global batches from step `start`
-    on. `provenance` says what data the batches come from; resuming on other data is refused.
+    on. A new run starts from `initial` parameters, or from a draw. `provenance` says what data the batches come from; resuming on other data is refused.
     Raises ConfigError, CheckpointError, DivergedError, Interrupted.
     """
     declared = declare_model(model, table)
@@ -59,7 +60,7 @@ def train_model(
     audit_sharding(plan_sharding(declared, device_mesh, mesh), device_mesh)
     shardings = state_shardings(declared, device_mesh, mesh)
     with jax.set_mesh(device_mesh):
-        state = init_state(declared, table, config.seed, shardings)
+        state = init_state(declared, table, config.seed, shardings, initial)
         step = jax.jit(
             make_train_step(declared, table, model, config),
             donate_argnums=0,
