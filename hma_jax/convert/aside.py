@@ -1,0 +1,33 @@
+"""Directories that are never seen half written."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hma_jax.config import require
+
+
+@contextmanager
+def written_aside(directory: Path) -> Iterator[Path]:
+    """A new directory to write into, which takes the place of `directory` when the block ends well.
+
+    Raises ConfigError if something is there already, before any work is done.
+    """
+    directory = Path(directory).absolute()
+    empty = directory.is_dir() and not any(directory.iterdir())
+    require(
+        empty or not directory.exists(),
+        f"{directory} exists already; choose another output directory or remove it",
+    )
+    directory.parent.mkdir(parents=True, exist_ok=True)
+    aside = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
+    aside.mkdir()
+    try:
+        yield aside
+        os.replace(aside, directory)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)

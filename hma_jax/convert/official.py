@@ -1,0 +1,188 @@
+"""Checkpoints of the official PyTorch release (STMaskGIT and STMAR), as a `Run` and back.
+
+A directory holds config.json and model.safetensors, or a torch file in its place. Reading is
+strict: a tensor too few, too many or of another shape is refused, where the release leaves random
+weights in its place. What we have no use for is kept in the run's provenance, so that a run that
+came from there goes back byte for byte.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require, stable_hash
+from hma_jax.convert.aside import written_aside
+from hma_jax.convert.official_config import (
+    BASE_WIDTH,
+    CONTINUOUS_DEFAULTS,
+    DISCRETE_DEFAULTS,
+    is_continuous,
+    read_masking,
+    read_model,
+    read_table,
+    write_config,
+)
+from hma_jax.convert.table import check_names, flat, from_official, nested, official_parts, to_official
+from hma_jax.convert.tensors import Stored, read_safetensors, write_safetensors
+from hma_jax.convert.torch_file import read_torch
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model import declare_model
+from hma_jax.training.train import Run
+
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")
+FLOATS = ("float32", "float16", "bfloat16")
+
+
+def official_shapes(model: ModelConfig, table: EmbodimentTable) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of every tensor of an official checkpoint, statistics included."""
+    parts = official_parts(model, table, declare_model(model, table).leaves())
+    shapes = {part.name: part.shape for own in parts.values() for part in own}
+    for entry in table.entries:
+        shapes |= {name: (entry.action_dim,) for name in _statistics(entry.name)}
+    return shapes
+
+
+def _statistics(robot: str) -> tuple[str, str]:
+    return f"action_preprocessor.{robot}.mean", f"action_preprocessor.{robot}.std"
+
+
+# --- Reading -----------------------------------------------------------------------------------
+
+
+def read_official(directory: Path) -> Run:
+    """A run at step 0. Raises ConfigError naming the file and field or tensors that do not fit."""
+    directory = Path(directory)
+    config, tensors = read_config(directory), _read_weights(directory)
+    where = str(directory / CONFIG)
+    require(
+        is_continuous(config) == any(name.startswith("diffloss.") for name in tensors),
+        f"{directory}: {CONFIG} describes the {_variant(config)} variant, the tensors are the other's",
+    )
+    model = read_model(config, where)
+    names = config["action_domains"] if isinstance(config.get("action_domains"), list) else []
+    missing = [name for robot in names for name in _statistics(robot) if name not in tensors]
+    require(not missing, f"{directory}: missing tensors {', '.join(missing[:10])}")
+    statistics = {robot: tuple(tensors[name].read() for name in _statistics(robot)) for robot in names}
+    table = read_table(config, statistics, where)
+    check_names(
+        official_shapes(model, table), {name: tensor.shape for name, tensor in tensors.items()}, str(directory)
+    )
+    foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
+    require(not foreign, f"{directory}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
+    leaves = declare_model(model, table).leaves()
+    params = from_official(tensors, official_parts(model, table, leaves), leaves)
+    provenance = {
+        "official": {
+            "variant": _variant(config),
+            "config": config,
+            "table": stable_hash(table),
+            "halves": {n: t.dtype.name for n, t in tensors.items() if t.dtype.name != "float32"},
+        }
+    }
+    return Run(model, TrainConfig(masking=read_masking(config)), table, params, 0, provenance)
+
+
+def read_config(directory: Path) -> dict[str, Any]:
+    """Raises ConfigError if there is no readable config.json."""
+    path = Path(directory) / CONFIG
+    try:
+        config = json.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(
+            f"no {path} ({error.strerror}); give a directory with {CONFIG} and {WEIGHTS}"
+        ) from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not JSON: {error}") from error
+    require(isinstance(config, dict), f"{path}: expected named fields, got {type(config).__name__}")
+    return config
+
+
+def _read_weights(directory: Path) -> dict[str, Stored]:
+    found = [directory / name for name in (WEIGHTS, *TORCH_WEIGHTS) if (directory / name).is_file()]
+    require(bool(found), f"{directory} has neither {WEIGHTS} nor {' nor '.join(TORCH_WEIGHTS)}")
+    tensors = read_safetensors(found[0]) if found[0].name == WEIGHTS else read_torch(found[0])
+    # What torch's data parallelism puts before every name.
+    prefix = "module."
+    if tensors and all(name.startswith(prefix) for name in tensors):
+        return {name.removeprefix(prefix): tensor for name, tensor in tensors.items()}
+    return tensors
+
+
+def _variant(config: dict[str, Any]) -> str:
+    return "continuous" if is_continuous(config) else "discrete"
+
+
+# --- Writing -----------------------------------------------------------------------------------
+
+
+def write_official(run: Run, directory: Path) -> list[str]:
+    """Writes config.json and model.safetensors; returns remarks for the user.
+
+    Raises ConfigError if `directory` exists or the release could not compute the model.
+    """
+    config = official_config(run)
+    tensors, remarks = official_tensors(run)
+    with written_aside(directory) as aside:
+        (aside / CONFIG).write_text(json.dumps(config, indent=2, sort_keys=True))
+        write_safetensors(aside / WEIGHTS, tensors)
+    return remarks
+
+
+def official_config(run: Run) -> dict[str, Any]:
+    """The original config.json where the run still is what it described, else brought up to date."""
+    source = run.provenance.get("official", {})
+    original = source.get("config", {})
+    model = _at_official_base(run.model)
+    fields = write_config(model, run.table, run.train.masking)
+    if original and source["table"] == stable_hash(run.table):
+        same = read_model(original, CONFIG) == model and read_masking(original) == run.train.masking
+        if same:
+            return original
+        kept = ("action_domains", "d_actions", "action_stats")
+        fields = {name: value for name, value in fields.items() if name not in kept}
+    return {**(CONTINUOUS_DEFAULTS if model.diffusion else DISCRETE_DEFAULTS), **original, **fields}
+
+
+def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
+    """(name -> array, remarks for the user)."""
+    remarks = []
+    model = replace(_at_official_base(run.model), action_heads=True)
+    leaves = declare_model(model, run.table).leaves()
+    arrays = flat(run.params)
+    if not run.model.action_heads:
+        arrays |= {path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays}
+        remarks.append("the release has action heads, this model has none: they are written as zeros")
+    ratio = model.mup_multiplier("readout") / run.model.mup_multiplier("readout")
+    if ratio != 1:
+        outputs = [path for path, spec in leaves.items() if spec.role == "output"]
+        arrays |= {path: np.asarray(arrays[path]) * np.float32(ratio) for path in outputs}
+        remarks.append(
+            f"read-outs are multiplied by {ratio:g}, because the release divides their inputs by width / "
+            f"{model.mup.base_width} and this model by width / {run.model.mup.base_width}"
+        )
+    tensors = to_official(nested(arrays), official_parts(model, run.table, leaves))
+    for entry in run.table.entries:
+        for name, values in zip(_statistics(entry.name), (entry.mean, entry.std), strict=True):
+            tensors[name] = np.asarray(values, np.float32)
+    halves = run.provenance.get("official", {}).get("halves", {})
+    return {name: _narrow(x, halves.get(name)) for name, x in tensors.items()}, remarks
+
+
+def _at_official_base(model: ModelConfig) -> ModelConfig:
+    """With the base width that the release computes with, and nothing of muP taken away."""
+    base = model.width if model.diffusion else BASE_WIDTH
+    return replace(model, mup=replace(model.mup, base_width=base, without=()))
+
+
+def _narrow(tensor: np.ndarray, dtype: str | None) -> np.ndarray:
+    """In the type that it was read in, while nothing is lost by that."""
+    if dtype is None:
+        return tensor
+    narrow = tensor.astype(dtype)
+    return narrow if np.array_equal(narrow.astype(tensor.dtype), tensor, equal_nan=True) else tensor

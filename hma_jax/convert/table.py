@@ -1,0 +1,242 @@
+"""Which official tensor is which part of which parameter of ours: one table, read in both directions.
+
+An entry names a parameter of ours, the official tensors it is made of, and an einops pattern from
+one of its slices to the official layout; read backwards the pattern is the inverse. Of the axes
+that we stack (layers N, robots E, factors Q) every index is an official tensor of its own where
+the official name has a place for it. A robot's slice is cut to its own chunk along U: what lies
+beyond is padding, which is zero and without influence. Facts: reference sections 8.3 and 8.4.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from einops import rearrange
+from flax import nnx
+
+from hma_jax.config import ConfigError, ModelConfig
+from hma_jax.convert.tensors import Stored
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
+
+PLACES = {LAYER_AXIS: "{layer}", EMBODIMENT_AXIS: "{robot}", "Q": "{factor}"}
+"""Where the index of a stacked axis stands in an official name."""
+
+LINEAR = "i o -> o i"
+SAME = "d -> d"
+
+
+class Entry(NamedTuple):
+    ours: str  # path of a parameter
+    official: str  # names of its tensors
+    pattern: str  # einops, one slice of ours -> the official tensor
+
+
+def _linear(ours: str, official: str) -> tuple[Entry, ...]:
+    return (
+        Entry(f"{ours}/kernel", f"{official}.weight", LINEAR),
+        Entry(f"{ours}/bias", f"{official}.bias", SAME),
+    )
+
+
+def _norm(ours: str, official: str) -> tuple[Entry, ...]:
+    return (Entry(f"{ours}/gain", f"{official}.weight", SAME), Entry(f"{ours}/bias", f"{official}.bias", SAME))
+
+
+def _attention(ours: str, official: str) -> tuple[Entry, ...]:
+    return (
+        Entry(f"{ours}/qkv", f"{official}.qkv.weight", "d c h i -> (c h i) d"),
+        Entry(f"{ours}/qkv_bias", f"{official}.qkv.bias", "c h i -> (c h i)"),
+        Entry(f"{ours}/out", f"{official}.proj.weight", "h i d -> d (h i)"),
+        Entry(f"{ours}/out_bias", f"{official}.proj.bias", SAME),
+        *_norm(f"{ours}/norm", f"{official}.norm"),
+    )
+
+
+def _denoiser(ours: str, official: str, depth: int) -> tuple[Entry, ...]:
+    entries = [
+        *_linear(f"{ours}/time_in", f"{official}.time_embed.mlp.0"),
+        *_linear(f"{ours}/time_out", f"{official}.time_embed.mlp.2"),
+        *_linear(f"{ours}/condition", f"{official}.cond_embed"),
+        *_linear(f"{ours}/into", f"{official}.input_proj"),
+        *_linear(f"{ours}/modulation", f"{official}.final_layer.adaLN_modulation.1"),
+        Entry(f"{ours}/out", f"{official}.final_layer.linear.weight", "f k c -> (k c) f"),
+        Entry(f"{ours}/out_bias", f"{official}.final_layer.linear.bias", "k c -> (k c)"),
+    ]
+    for j in range(depth):
+        block, theirs = f"{ours}/blocks/{j}", f"{official}.res_blocks.{j}"
+        entries += _norm(f"{block}/norm", f"{theirs}.in_ln")
+        entries += _linear(f"{block}/into", f"{theirs}.mlp.0")
+        entries += _linear(f"{block}/out", f"{theirs}.mlp.2")
+        entries += _linear(f"{block}/modulation", f"{theirs}.adaLN_modulation.1")
+    return tuple(entries)
+
+
+BLOCK = "trunk/blocks"
+LAYER = "decoder.layers.{layer}"
+PROJECTOR = LAYER + ".action_projectors.{robot}"
+
+SHARED = (
+    Entry("positions", "pos_embed_TSC", "t p d -> 1 t p d"),
+    Entry("action_mask", "action_mask_tokens", "t d -> 1 t 1 d"),
+    *_linear("stem/into", "action_mlp.{robot}.model.0"),
+    *_norm("stem", "action_mlp.{robot}.model.1"),
+    *_linear("stem/out", "action_mlp.{robot}.model.3"),
+    *_norm(f"{BLOCK}/norm_space", f"{LAYER}.norm1"),
+    *_attention(f"{BLOCK}/space", f"{LAYER}.spatial_attn"),
+    *_attention(f"{BLOCK}/time", f"{LAYER}.temporal_attn"),
+    *_norm(f"{BLOCK}/norm_mlp", f"{LAYER}.norm2"),
+    *_linear(f"{BLOCK}/mlp_in", f"{LAYER}.mlp.fc1"),
+    *_linear(f"{BLOCK}/mlp_out", f"{LAYER}.mlp.fc2"),
+    *_linear("frame_head/linear", "out_x_proj"),
+)
+
+DISCRETE = (
+    Entry("embed/tables", "token_embed.factored_embeds.{factor}.weight", "v d -> v d"),
+    Entry("embed/mask", "token_embed.mask_token_embed", "d -> 1 d"),
+    *_linear("action_head/linear", "action_out_projectors.{robot}"),
+)
+
+CONTINUOUS = (
+    Entry("embed/kernel", "token_embed.weight", LINEAR),
+    Entry("embed/mask", "mask_token", "c -> 1 1 c"),
+    Entry("frame_head/positions", "diffusion_pos_embed_learned", "t s d -> 1 (t s) d"),
+    *_norm("frame_head/norm", "decoder_norm"),
+    *_norm("norm", "z_proj_ln"),
+)
+
+MODULATION = (
+    *_linear(f"{BLOCK}/conditioning/hidden", f"{PROJECTOR}.adaLN_modulation.0"),
+    *_linear(f"{BLOCK}/conditioning/shift_scale", f"{PROJECTOR}.adaLN_modulation.2"),
+    *_linear(f"{BLOCK}/conditioning/out", f"{PROJECTOR}.linear_out"),
+)
+
+CROSS_ATTENTION = (
+    *(Entry(f"{BLOCK}/conditioning/{x}", f"{PROJECTOR}.to_{x}.weight", LINEAR) for x in "qkv"),
+    *_linear(f"{BLOCK}/conditioning/out", f"{PROJECTOR}.proj"),
+    *_norm(f"{BLOCK}/conditioning", f"{PROJECTOR}.norm"),
+)
+
+
+def entries_of(model: ModelConfig) -> dict[str, Entry]:
+    """Our path -> its entry; also of parameters that the model's switches leave out."""
+    entries = [*SHARED, *(CROSS_ATTENTION if model.conditioning == "cross_attention" else MODULATION)]
+    if model.diffusion:
+        depth = model.diffusion.depth
+        entries += CONTINUOUS
+        entries += _denoiser("denoiser", "diffloss.net", depth)
+        entries += _denoiser("action_head/robots", "action_diff_losses.{robot}.net", depth)
+    else:
+        entries += DISCRETE
+    return {entry.ours: entry for entry in entries}
+
+
+# --- One official tensor as a part of one parameter --------------------------------------------
+
+
+@dataclass(frozen=True)
+class Part:
+    """`ours[index]` is the official tensor `name`, up to `pattern`."""
+
+    name: str
+    index: tuple[int | slice, ...]
+    sizes: dict[str, int]  # of the slice's axes, as the pattern calls them
+    pattern: str
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the official tensor."""
+        groups = re.findall(r"\(([^)]*)\)|(\S+)", self.pattern.split(" -> ")[1])
+        names = [(group or single).split() for group, single in groups]
+        return tuple(math.prod(self.sizes.get(name, 1) for name in axis) for axis in names)
+
+    def to_official(self, parameter: np.ndarray) -> np.ndarray:
+        return rearrange(parameter[self.index], self.pattern)
+
+    def from_official(self, tensor: np.ndarray) -> np.ndarray:
+        left, right = self.pattern.split(" -> ")
+        return rearrange(tensor, f"{right} -> {left}", **self.sizes)
+
+
+def parts_of(entry: Entry, spec: ParamSpec, table: EmbodimentTable) -> Iterator[Part]:
+    """The official tensors that a parameter consists of."""
+    stacked = [axis for axis in spec.axes if axis in PLACES and PLACES[axis] in entry.official]
+    axes, shape = spec.axes[len(stacked) :], spec.shape[len(stacked) :]
+    for index in np.ndindex(spec.shape[: len(stacked)]):
+        where = dict(zip(stacked, index, strict=True))
+        robot = table.entries[where[EMBODIMENT_AXIS]] if EMBODIMENT_AXIS in where else None
+        own = [robot.chunk if axis == "U" else size for axis, size in zip(axes, shape, strict=True)]
+        name = entry.official.format(
+            layer=where.get(LAYER_AXIS), factor=where.get("Q"), robot=robot and robot.name
+        )
+        names = entry.pattern.split(" -> ")[0].split()
+        sizes = dict(zip(names, own, strict=True))
+        yield Part(name, (*index, *(slice(size) for size in own)), sizes, entry.pattern)
+
+
+# --- Whole models ------------------------------------------------------------------------------
+
+
+def official_parts(
+    model: ModelConfig, table: EmbodimentTable, leaves: Mapping[str, ParamSpec]
+) -> dict[str, list[Part]]:
+    """Our path -> the official tensors it consists of, for all declared parameters (`Declared.leaves`)."""
+    entries = entries_of(model)
+    return {path: list(parts_of(entries[path], spec, table)) for path, spec in leaves.items()}
+
+
+def from_official(
+    tensors: Mapping[str, Stored], parts: Mapping[str, list[Part]], leaves: Mapping[str, ParamSpec]
+) -> Params:
+    """Our parameters from official tensors whose names and shapes have been checked."""
+
+    def assemble(path: str, spec: ParamSpec) -> np.ndarray:
+        whole = np.zeros(spec.shape, np.float32)
+        for part in parts[path]:
+            whole[part.index] = part.from_official(tensors[part.name].read())
+        return whole
+
+    return nested({path: assemble(path, spec) for path, spec in leaves.items()})
+
+
+def to_official(params: Params, parts: Mapping[str, list[Part]]) -> dict[str, np.ndarray]:
+    """Official name -> array from our parameters, or from anything shaped like them (gradients)."""
+    arrays = flat(params)
+    return {
+        part.name: part.to_official(np.asarray(arrays[path])) for path, own in parts.items() for part in own
+    }
+
+
+def check_names(
+    want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], where: str, shown: int = 10
+) -> None:
+    """Raises ConfigError naming (the first few) tensors that are missing, too many or of another shape."""
+    wrong = {
+        "missing": [f"{n} {want[n]}" for n in want if n not in found],
+        "not expected": [f"{n} {found[n]}" for n in found if n not in want],
+        "of another shape": [
+            f"{n}: expected {want[n]}, found {found[n]}" for n in want if n in found and found[n] != want[n]
+        ],
+    }
+    lines = [
+        f"\n  {len(names)} {problem}: " + "; ".join(names[:shown]) + ("; ..." if len(names) > shown else "")
+        for problem, names in wrong.items()
+        if names
+    ]
+    if lines:
+        raise ConfigError(f"{where}: the tensors are not those that the description asks for:" + "".join(lines))
+
+
+def flat(params: Params) -> dict[str, np.ndarray]:
+    """'path/of/parameter' -> array."""
+    return {"/".join(path): leaf for path, leaf in nnx.traversals.flatten_mapping(params).items()}
+
+
+def nested(arrays: Mapping[str, np.ndarray]) -> Params:
+    """The inverse of `flat`."""
+    return nnx.traversals.unflatten_mapping({tuple(path.split("/")): leaf for path, leaf in arrays.items()})

@@ -1,0 +1,62 @@
+"""Named tensors in files, read one at a time: safetensors, and torch's state dicts (`torch_file`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import ml_dtypes
+import numpy as np
+import safetensors.numpy
+from safetensors import SafetensorError, safe_open
+
+from hma_jax.config import ConfigError
+
+DTYPES = {
+    "F64": np.dtype(np.float64),
+    "F32": np.dtype(np.float32),
+    "F16": np.dtype(np.float16),
+    "BF16": np.dtype(ml_dtypes.bfloat16),
+    "I64": np.dtype(np.int64),
+    "I32": np.dtype(np.int32),
+    "I16": np.dtype(np.int16),
+    "I8": np.dtype(np.int8),
+    "U8": np.dtype(np.uint8),
+    "BOOL": np.dtype(np.bool_),
+}
+"""What safetensors calls the element types that a checkpoint may have."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One tensor of a file. `read` fetches its values."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[], np.ndarray]
+
+
+def read_safetensors(path: Path) -> dict[str, Stored]:
+    """name -> tensor. Raises ConfigError for a file that is damaged or of another format."""
+
+    def stored(name: str) -> Stored:
+        entry = file.get_slice(name)
+        kind = entry.get_dtype()
+        if kind not in DTYPES:
+            raise ConfigError(f"{path}: {name} has elements of type {kind}, which are not supported")
+        return Stored(tuple(entry.get_shape()), DTYPES[kind], lambda: file.get_tensor(name))
+
+    try:
+        file = safe_open(path, framework="np")
+        return {name: stored(name) for name in file.keys()}  # noqa: SIM118 (it is no dictionary)
+    except SafetensorError as error:
+        raise ConfigError(f"{path}: no readable safetensors file ({error}); fetch it again") from error
+
+
+def write_safetensors(
+    path: Path, tensors: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None
+) -> None:
+    """Writes contiguous copies where needed; the values' bytes are kept."""
+    dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
+    safetensors.numpy.save_file(dense, path, metadata)

@@ -1,0 +1,125 @@
+"""Reads a plain state dict from a file that torch saved, without torch and without running code.
+
+Such a file is a zip: `data.pkl` describes the tensors, `data/KEY` holds their elements. A pickle
+is a program; this reader knows the few names that a state dict of tensors needs and refuses every
+other by name, before anything is called.
+"""
+
+from __future__ import annotations
+
+import collections
+import pickle
+import zipfile
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+
+from hma_jax.config import ConfigError, require
+from hma_jax.convert.tensors import Stored
+
+STORAGES = {
+    "DoubleStorage": np.float64,
+    "FloatStorage": np.float32,
+    "HalfStorage": np.float16,
+    "BFloat16Storage": ml_dtypes.bfloat16,
+    "LongStorage": np.int64,
+    "IntStorage": np.int32,
+    "ShortStorage": np.int16,
+    "CharStorage": np.int8,
+    "ByteStorage": np.uint8,
+    "BoolStorage": np.bool_,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _StorageType:
+    dtype: np.dtype
+
+
+@dataclass(frozen=True, slots=True)
+class _Storage:
+    dtype: np.dtype
+    key: str
+
+
+class _Refused(ConfigError):
+    """Not wrapped by what reports damaged files."""
+
+
+class _Reader(pickle.Unpickler):
+    """Knows ordered dictionaries, storages and how a tensor is made of one."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, root: str):
+        super().__init__(archive.open(f"{root}data.pkl"))
+        self.path, self.root = path, root
+        self.bytes = {info.filename: info.file_size for info in archive.infolist()}
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("collections", "OrderedDict"):
+            return collections.OrderedDict
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
+            return self._rebuild
+        if module == "torch" and name in STORAGES:
+            return _StorageType(np.dtype(STORAGES[name]))
+        raise _Refused(
+            f"{self.path} asks for {module}.{name}, which a plain state dict of tensors does not need; it is "
+            "not read. Save the tensors alone, best as model.safetensors"
+        )
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        kind, storage_type, key, _, _ = pid
+        if kind != "storage" or not isinstance(storage_type, _StorageType) or not isinstance(key, str):
+            raise pickle.UnpicklingError(f"unknown kind of data {kind!r}")
+        return _Storage(storage_type.dtype, key)
+
+    def _rebuild(
+        self, storage: _Storage, offset: int, shape: tuple[int, ...], stride: tuple[int, ...], *rest: Any
+    ) -> Stored:
+        del rest  # gradients and hooks
+        numbers = (offset, *shape, *stride)
+        if not all(type(n) is int and n >= 0 for n in numbers) or len(shape) != len(stride):
+            raise pickle.UnpicklingError(f"a tensor of shape {shape} and strides {stride} from {offset}")
+        entry, size = f"{self.root}data/{storage.key}", storage.dtype.itemsize
+        last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
+        if prod(shape) and (last + 1) * size > self.bytes[entry]:
+            raise pickle.UnpicklingError(f"a tensor that reaches beyond {entry}")
+
+        def read() -> np.ndarray:
+            if not prod(shape):
+                return np.zeros(shape, storage.dtype)
+            with zipfile.ZipFile(self.path) as archive:
+                elements = np.frombuffer(archive.read(entry), storage.dtype)[offset:]
+            strides = [s * size for s in stride]
+            return np.lib.stride_tricks.as_strided(elements, shape, strides, writeable=False).copy()
+
+        return Stored(tuple(shape), storage.dtype, read)
+
+
+def read_torch(path: Path) -> dict[str, Stored]:
+    """name -> tensor. Raises ConfigError for whatever is not a plain state dict, naming what it is."""
+    advice = "; save it with torch.save(model.state_dict(), ...) or as model.safetensors"
+    try:
+        with zipfile.ZipFile(path) as archive:
+            pickles = [name for name in archive.namelist() if PurePosixPath(name).name == "data.pkl"]
+            require(len(pickles) == 1, f"{path} is a zip file without a torch state dict{advice}")
+            root = pickles[0].removesuffix("data.pkl")
+            if f"{root}byteorder" in archive.namelist():
+                require(archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little")
+            state = _Reader(path, archive, root).load()
+    except _Refused:
+        raise
+    except zipfile.BadZipFile as error:
+        raise ConfigError(f"{path}: no zip file, damaged or saved by torch before 1.6{advice}") from error
+    except (pickle.UnpicklingError, EOFError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"{path}: its description of tensors cannot be read ({error}){advice}") from error
+    plain = isinstance(state, dict) and all(
+        isinstance(name, str) and isinstance(tensor, Stored) for name, tensor in state.items()
+    )
+    require(plain, f"{path} holds something else than names and tensors{advice}")
+    return dict(state)
