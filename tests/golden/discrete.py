@@ -1,0 +1,351 @@
+"""Cases of the discrete model: logits, loss and gradients, generation, actions, training steps."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import DecodeConfig, MaskingConfig, OptimizerConfig
+from hma_jax.decoding import Frame, masked_counts, sample_tokens, unmask
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.generation import rollout
+from hma_jax.masking import Masked
+from hma_jax.model import declare_model
+from hma_jax.model.frames import factorise
+from hma_jax.objectives import masked_loss, smoothed_cross_entropy
+from hma_jax.params import is_spec
+from hma_jax.training.optimizer import apply_adamw, clip_by_global_norm, init_adam, learning_rate_multiplier
+from hma_jax.training.step import find_presence
+from tests.golden.case import Case, norms
+from tests.golden.mup_table import check_mup_table
+
+MASKING = MaskingConfig()
+
+
+def channels_first(logits_BTSQV: jax.Array, want: np.ndarray) -> np.ndarray:
+    """Our logits in the release's layout: batch, channel (factor-major), time, height, width."""
+    b, t, s, q, v = logits_BTSQV.shape
+    flat = np.asarray(logits_BTSQV).reshape(b, t, *want.shape[-2:], q * v)
+    return np.moveaxis(flat, -1, 1)
+
+
+def windows(case: Case, name: str) -> tuple[jax.Array, jax.Array]:
+    """(ids [B, T, S], masked): official ids hold the vocabulary's size where masked."""
+    ids = case.inputs[name]
+    ids = jnp.asarray(ids.reshape(len(ids), -1, case.run.model.tokens))
+    masked = ids == case.run.model.vocab_size
+    return jnp.where(masked, 0, ids), masked
+
+
+def applier(case: Case):
+    """apply(ids, masked, actions, robots, hidden=None, leak=...) -> Outputs, compiled."""
+
+    @jax.jit
+    def apply(params, ids, masked, actions, robots, hidden):
+        return case.declared.merge(params)(ids, masked, actions, robots, hidden_BT=hidden)
+
+    return lambda ids, masked, actions, robots, hidden=None: apply(
+        case.params, ids, masked, actions, robots, hidden
+    )
+
+
+def check_logits(case: Case) -> None:
+    ids, masked = windows(case, "tokens")
+    apply, batch = applier(case), len(ids)
+
+    def check(output, actions, robot, frames=None):
+        out = apply(ids[:, :frames], masked[:, :frames], actions, case.robot(robot, batch))
+        case.check(output, channels_first(out.frames, case.outputs[output]))
+
+    for robot in case.domains:
+        check(f"logits__{robot}", case.actions(robot), robot)
+    if "logits__no_action" in case.outputs:
+        check("logits__no_action", None, case.domains[0])
+    if "logits_short_window" in case.outputs:
+        short = case.info["short_window"]
+        check("logits_short_window", case.actions(case.domains[0])[:, :short], case.domains[0], short)
+    if "logits_skip_normalization" in case.outputs:
+        robot = case.domains[-1]
+        plain = [replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries]
+        declared = declare_model(case.run.model, EmbodimentTable(tuple(plain)))
+        out = jax.jit(lambda p, *args: declared.merge(p)(*args).frames)(
+            case.params, ids, masked, case.actions(robot), case.robot(robot, batch)
+        )
+        output = "logits_skip_normalization"
+        case.check(output, channels_first(out, case.outputs[output]))
+
+
+# --- Loss --------------------------------------------------------------------------------------
+
+
+def as_masked(ids: jax.Array, masked: jax.Array, hidden: jax.Array | None = None) -> Masked:
+    """Recorded masks as our collator would give them: frame 0 is never a target."""
+    targets = masked & (jnp.arange(ids.shape[1]) > 0)[None, :, None]
+    if hidden is None:
+        hidden = jnp.zeros(ids.shape[:2], bool)
+    return Masked(ids, masked, targets, hidden, hidden)
+
+
+def loss_and_accuracy(model, masked: Masked, labels, actions, robots, masking: MaskingConfig = MASKING):
+    keys = jax.random.split(jax.random.key(0), len(labels))  # of no effect on ids
+    sums = masked_loss(model, masked, labels, actions, robots, masking, keys)
+    count = masked.targets_TS.sum()
+    return sums.tokens / count, sums.correct / count
+
+
+def check_loss(case: Case) -> None:
+    ids, masked = windows(case, "input_ids")
+    labels, _ = windows(case, "labels")
+    recorded, apply, batch = as_masked(ids, masked), applier(case), len(ids)
+
+    @jax.jit
+    def gradient(params, actions, robots):
+        def loss(p):
+            return loss_and_accuracy(case.declared.merge(p), recorded, labels, actions, robots)
+
+        return jax.value_and_grad(loss, has_aux=True)(params)
+
+    for index, robot in enumerate(case.domains):
+        actions, robots = case.actions(robot), case.robot(robot, batch)
+        (loss, accuracy), grads = gradient(case.params, actions, robots)
+        case.check(f"loss__{robot}", loss)
+        case.check(f"acc__{robot}", accuracy)
+        logits = np.asarray(apply(ids, masked, actions, robots).frames)
+        if f"logits__{robot}" in case.outputs:
+            case.check(f"logits__{robot}", channels_first(logits, case.outputs[f"logits__{robot}"]))
+        if f"logits_last_frame__{robot}" in case.outputs:
+            want = case.outputs[f"logits_last_frame__{robot}"]
+            case.check(f"logits_last_frame__{robot}", channels_first(logits[:, -1:], want)[:, :, 0])
+        if index == 0:
+            named = case.official(grads)
+            case.check_group("grad", named)
+            case.check_group("gradnorm", norms(named))
+            case.check_zero(named, case.info["unused_parameters"])
+
+    if "loss__no_action" in case.outputs:
+        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).frames
+        digits = factorise(labels, case.run.model.factors, case.run.model.factor_vocab)
+        weight = recorded.targets_TS / recorded.targets_TS.sum()
+        per_token = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
+        case.check("loss__no_action", (per_token * weight).sum())
+        right = (logits.argmax(-1) == digits).all(-1)
+        case.check("acc__no_action", (right * weight).sum())
+    if (case.folder / "mup_table.json").exists():
+        check_mup_table(case)
+
+
+# --- Generation --------------------------------------------------------------------------------
+
+
+def classes_first(logits_BSQV: jax.Array, grid: tuple[int, int]) -> np.ndarray:
+    """The release's layout of a frame's logits: batch, class, factor, height, width."""
+    b, _, q, v = logits_BSQV.shape
+    return np.asarray(logits_BSQV).transpose(0, 3, 2, 1).reshape(b, v, q, *grid)
+
+
+class Decoder:
+    """The release's inner loop over one frame of a whole window, by our parts and recorded numbers."""
+
+    def __init__(self, case: Case, actions: jax.Array | None, hidden: jax.Array | None = None):
+        self.case, self.apply = case, applier(case)
+        self.actions, self.hidden = actions, hidden
+
+    def run(self, window: jax.Array, unknown: jax.Array, t: int, steps: int, scores: list[np.ndarray] | None):
+        """(frame, first logits, frames after each step, the last pass). Without `scores` by confidence."""
+        config, batch = self.case.run.model, len(window)
+        robots, keys = self.case.robot(self.case.domains[0], batch), jax.random.split(jax.random.key(0), batch)
+        frame = Frame(jnp.zeros_like(window[:, t]), jnp.ones(window[:, t].shape, bool))
+        states, first = [], None
+        for step, keep in enumerate(masked_counts(config, steps)):
+            ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
+            out = self.apply(ids, masked, self.actions, robots, self.hidden)
+            logits = out.frames[:, t]
+            first = logits if first is None else first
+            sampled, score = sample_tokens(logits, keys, 0.0)
+            if keep and scores is not None:
+                score = jnp.asarray(scores[step].reshape(batch, -1))
+            frame = unmask(frame, sampled, score, keep)
+            states.append(np.where(frame.masked, config.vocab_size, frame.values))
+        return frame.values, first, np.stack(states, axis=1), out
+
+    def generate(self, tokens: jax.Array, prompt: int, steps: int, scores: list[np.ndarray]):
+        """(whole window [B, T, S], first logits of every new frame, the last pass)."""
+        frames = tokens.shape[1]
+        unknown = jnp.broadcast_to((jnp.arange(frames) >= prompt)[None, :, None], tokens.shape)
+        window, firsts, out = tokens, [], None
+        for new, t in enumerate(range(prompt, frames)):
+            own = scores[new * (steps - 1) : (new + 1) * (steps - 1)]
+            frame, first, _, out = self.run(window, unknown, t, steps, own)
+            window, unknown = window.at[:, t].set(frame), unknown.at[:, t].set(False)
+            firsts.append(first)
+        return window, firsts, out
+
+
+def recorded_scores(case: Case, run: str) -> list[np.ndarray]:
+    count = sum(key.startswith(f"rand__{run}__") for key in case.inputs)
+    return [case.inputs[f"rand__{run}__{k}"] for k in range(count)]
+
+
+def check_generation(case: Case) -> None:
+    tokens, _ = windows(case, "tokens")
+    grid = case.inputs["tokens"].shape[-2:]
+    robot, out_t, prompt = case.domains[0], case.info["out_t"], case.info["num_prompt"]
+    actions = case.actions(robot)
+    later = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= out_t)[None, :, None], tokens.shape)
+    as_frame = lambda x: np.asarray(x).reshape(*x.shape[:-1], *grid)  # noqa: E731
+
+    with_actions, without = Decoder(case, actions), Decoder(case, None)
+    runs = {m.group(1) for m in (re.fullmatch(r"(m\d+\w*?)_tokens", key) for key in case.outputs) if m}
+    for run in sorted(runs):
+        steps, kind = re.fullmatch(r"m(\d+)_?(.*)", run).groups()
+        if kind not in ("", "random", "greedy", "no_action"):
+            continue  # reported as not checked
+        decoder = without if kind == "no_action" else with_actions
+        scores = None if kind == "greedy" else recorded_scores(case, run)
+        frame, first, states, _ = decoder.run(tokens, later, out_t, int(steps), scores)
+        case.check(f"{run}_tokens", as_frame(frame))
+        case.check_if_there(f"{run}_first_logits", classes_first(first, grid))
+        case.check_if_there(f"{run}_states", as_frame(states))
+
+    for key in [key for key in case.outputs if re.fullmatch(r"generate_m\d+_tokens", key)]:
+        run = key.removesuffix("_tokens")
+        steps = int(run.removeprefix("generate_m"))
+        window, firsts, _ = with_actions.generate(tokens, prompt, steps, recorded_scores(case, run))
+        case.check(key, window.reshape(len(window), -1))
+        logits = np.stack([classes_first(first, grid) for first in firsts], axis=3)
+        case.check_if_there(f"{run}_first_logits", logits)
+        if steps == 1:  # nothing is drawn: the cached rollout must say the same
+            keys = jax.random.split(jax.random.key(0), len(tokens))
+            decode = DecodeConfig(unmask_steps=1, temperature=0.0)
+            robots = case.robot(robot, len(tokens))
+            new = jax.jit(
+                lambda p: rollout(
+                    case.declared.merge(p), tokens[:, :prompt], actions[:, None], robots, keys, decode
+                )
+            )(case.params)
+            whole = jnp.concatenate([tokens[:, :prompt], new[:, 0]], axis=1)
+            case.check(key, whole.reshape(len(whole), -1), via="rollout")
+
+
+# --- Actions -----------------------------------------------------------------------------------
+
+
+def check_joint(case: Case) -> None:
+    ids, masked = windows(case, "tokens")
+    config, batch = case.run.model, len(ids)
+    everything = jnp.ones(ids.shape[:2], bool)
+
+    @jax.jit
+    def read(params, actions, robots, hidden):
+        model = case.declared.merge(params)
+        out = model(ids, masked, actions, robots, hidden_BT=hidden)
+        return out.frames, model.action_head(out.actions, robots)
+
+    for robot in case.domains:
+        robots, chunk = case.robot(robot, batch), case.table.entries[case.table.index(robot)].chunk
+        for way, hidden in (("given", ~everything), ("policy", everything)):
+            logits, predicted = read(case.params, case.actions(robot), robots, hidden)
+            case.check(f"states_{way}__{robot}", channels_first(logits, case.outputs[f"states_{way}__{robot}"]))
+            case.check(f"actions_{way}__{robot}", predicted[..., :chunk])
+        raw = case.table.unnormalise(predicted, robots)
+        case.check(f"actions_policy_unnormalized__{robot}", raw[..., :chunk])
+    _check_joint_training(case)
+
+    tokens, _ = windows(case, "clean_tokens")
+    robot, prompt = case.domains[0], case.info["num_prompt"]
+    nothing = jnp.zeros_like(case.actions(robot))
+    window, _, out = Decoder(case, nothing, everything).generate(tokens, prompt, 1, [])
+    case.check("generate_policy_tokens", window.reshape(batch, -1))
+    robots = case.robot(robot, batch)
+    predicted = case.declared.merge(case.params).action_head(out.actions, robots)
+    raw = case.table.unnormalise(predicted, robots)
+    chunk = case.table.entries[case.table.index(robot)].chunk
+    case.check("generate_policy_actions_unnormalized", raw[..., :chunk])
+
+
+def _check_joint_training(case: Case) -> None:
+    """As released: hidden actions go on modulating, and the action loss is the mean squared error to
+    raw actions times the mean of the mask."""
+    ids, masked = windows(case, "input_ids")
+    labels, _ = windows(case, "labels")
+    robot, batch = case.domains[0], len(ids)
+    actions, robots = case.actions(robot), case.robot(robot, batch)
+    chunk = case.table.entries[case.table.index(robot)].chunk
+    hidden = jnp.asarray(case.inputs["action_mask_draw"] < case.inputs["action_drop_ratio"])[..., 0]
+    masking = replace(MASKING, setting="full", action_leak="conditioning")
+    weight = case.settings["action_loss_weight"]
+    recorded = as_masked(ids, masked, hidden)
+
+    @jax.jit
+    def gradient(params):
+        def total(p):
+            model = case.declared.merge(p)
+            loss, accuracy = loss_and_accuracy(model, recorded, labels, actions, robots, masking)
+            out = model(ids, masked, actions, robots, hidden_BT=hidden, leak=masking.action_leak)
+            predicted = model.action_head(out.actions, robots)[..., :chunk]
+            action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(hidden.astype(jnp.float32))
+            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.frames)
+
+        return jax.grad(total, has_aux=True)(params)
+
+    grads, (loss, accuracy, action_loss, predicted, logits) = gradient(case.params)
+    case.check("train_loss", loss)
+    case.check("train_acc", accuracy)
+    case.check("train_action_loss", action_loss)
+    case.check("train_actions", predicted)
+    case.check("train_logits", channels_first(logits, case.outputs["train_logits"]))
+    case.check("train_action_mask", hidden[..., None])
+    named = case.official(grads)
+    case.check_group("grad", named)
+    case.check_group("gradnorm", norms(named))
+    case.check_zero(named, case.info["unused_parameters"])
+
+
+# --- Training ----------------------------------------------------------------------------------
+
+
+def check_train_steps(case: Case) -> None:
+    """Updates with absent robots, muP learning rates, clipping and decay."""
+    settings, config = case.info["optimizer"], case.run.model
+    optimizer = OptimizerConfig(
+        learning_rate=settings["lr"],
+        weight_decay=settings["weight_decay"],
+        beta1=settings["beta1"],
+        beta2=settings["beta2"],
+        epsilon=settings["eps"],
+        clip_norm=settings["max_grad_norm"],
+    )
+    specs = case.declared.specs
+    multipliers = jax.tree.map(lambda spec: learning_rate_multiplier(spec, config), specs, is_leaf=is_spec)
+    trained = jnp.ones(case.table.size, bool)
+
+    @jax.jit
+    def step(params, state, recorded, labels, actions, robots):
+        def mean_loss(p):
+            return loss_and_accuracy(case.declared.merge(p), recorded, labels, actions, robots)[0]
+
+        loss, grads = jax.value_and_grad(mean_loss)(params)
+        grads, norm = clip_by_global_norm(grads, optimizer.clip_norm)
+        presence = find_presence(recorded, robots, trained)
+        rate = jnp.float32(optimizer.learning_rate)
+        return *apply_adamw(grads, state, params, specs, multipliers, presence, rate, optimizer), loss, norm
+
+    params, state = case.params, init_adam(case.params, case.table.size)
+    losses, gradient_norms = [], []
+    for s, robot in enumerate(case.info["step_domains"]):
+        ids = jnp.asarray(case.inputs["input_ids"][s])
+        ids = ids.reshape(len(ids), -1, config.tokens)
+        masked = ids == config.vocab_size
+        labels = jnp.asarray(case.inputs["labels"][s]).reshape(ids.shape)
+        recorded = as_masked(jnp.where(masked, 0, ids), masked)
+        actions, robots = case.actions(f"step{s}"), case.robot(robot, len(ids))
+        params, state, loss, norm = step(params, state, recorded, labels, actions, robots)
+        losses.append(loss)
+        gradient_norms.append(norm)
+    case.check("loss_per_step", jnp.stack(losses))
+    case.check("grad_norm_before_clip_per_step", jnp.stack(gradient_norms))
+    case.check_group("final", case.official(params))
