@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hma_jax.config import ConfigError
-from tests.golden import discrete
+from tests.golden import continuous, discrete
 from tests.golden.case import Case
 
 KINDS: dict[str, Callable[[Case], None]] = {
@@ -21,6 +21,10 @@ KINDS: dict[str, Callable[[Case], None]] = {
     "discrete_generation": discrete.check_generation,
     "discrete_joint": discrete.check_joint,
     "discrete_train": discrete.check_train_steps,
+    "mar_forward": continuous.check_forward,
+    "mar_loss": continuous.check_loss,
+    "mar_generation": continuous.check_generation,
+    "mar_joint": continuous.check_joint,
 }
 
 NOT_SUPPORTED = ("tokenizer", "vae", "vae_decoder")

@@ -1,0 +1,275 @@
+"""Cases of the continuous model: forward pass and sampler, loss and gradients, generation, actions."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import SamplerConfig
+from hma_jax.decoding import Frame, choose_patches, commit, masked_counts
+from hma_jax.diffusion import Trajectory, diffusion_loss, make_process, respace, sample
+from hma_jax.model.frames import mask_cells, patchify, unpatchify
+from tests.golden.case import Case, norms
+
+
+class Latents:
+    """Recorded latents [B, T, h, w, c] as tokens [B, T, S, C], and back."""
+
+    def __init__(self, case: Case):
+        self.config = case.run.model.diffusion
+        latents = jnp.asarray(case.inputs["latents"])
+        self.batch, self.frames, h, w, _ = latents.shape
+        self.grid = (h // self.config.patch, w // self.config.patch)
+        self.tokens = patchify(latents, self.config.patch)
+
+    def masked(self, indicator: np.ndarray) -> jax.Array:
+        """bool [B, T, S, cells] from bool [B, T, h, w]."""
+        return patchify(jnp.asarray(indicator)[..., None], self.config.patch)
+
+    def on_grid(self, x: jax.Array) -> np.ndarray:
+        """[..., S, n] -> [..., rows, columns, n]."""
+        return np.asarray(x).reshape(*x.shape[:-2], *self.grid, x.shape[-1])
+
+    def channels_first(self, z: jax.Array) -> np.ndarray:
+        """[B, ..., S, D] -> batch, channel, ..., row, column."""
+        return np.moveaxis(self.on_grid(z), -1, 1)
+
+    def cells(self, tokens: jax.Array) -> jax.Array:
+        return unpatchify(tokens, self.config.patch, self.grid[1])
+
+
+def applier(case: Case):
+    """apply(tokens, masked, actions, robots, hidden=None) -> Outputs, compiled."""
+
+    @jax.jit
+    def apply(params, tokens, masked, actions, robots, hidden):
+        return case.declared.merge(params)(tokens, masked, actions, robots, hidden_BT=hidden)
+
+    return lambda tokens, masked, actions, robots, hidden=None: apply(
+        case.params, tokens, masked, actions, robots, hidden
+    )
+
+
+def run_sampler(
+    case: Case, head, noise_init: np.ndarray, noise_steps: np.ndarray, temperature: float, trajectory: bool = False
+) -> jax.Array | tuple[jax.Array, Trajectory]:
+    """The release's sampler with recorded noise; head(model, x, t) is a denoising network."""
+    steps = int(case.settings["num_sampling_steps"])
+    config = case.run.model.diffusion
+    # As released, temperature multiplies the noise of the steps only.
+    sampler = SamplerConfig(steps=steps, temperature=temperature, scale_initial_noise=False)
+    process = respace(make_process(config.steps), steps)
+
+    @jax.jit
+    def run(params, start, noises):
+        model = case.declared.merge(params)
+        noises = noises if sampler.noisy_steps else None
+        return sample(lambda x, t: head(model, x, t), start, noises, process, sampler, config.clip, trajectory)
+
+    return run(case.params, noise_init, noise_steps)
+
+
+# --- Forward -----------------------------------------------------------------------------------
+
+
+def check_forward(case: Case) -> None:
+    latents, apply = Latents(case), applier(case)
+    tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
+    model = case.declared.merge(case.params)
+    case.check("patches_of_latents", latents.on_grid(tokens))
+    replaced = mask_cells(tokens, masked, model.embed.mask.get_value(), case.run.model.diffusion)
+    case.check("masked_patches", latents.on_grid(replaced))
+
+    def check_z(output, actions, robot, frames=None):
+        robots = case.robot(robot, latents.batch)
+        z = apply(tokens[:, :frames], masked[:, :frames], actions, robots).frames
+        case.check(output, latents.channels_first(z))
+
+    for robot in case.domains:
+        check_z(f"z__{robot}", case.actions(robot), robot)
+    if "z__no_action" in case.outputs:
+        check_z("z__no_action", None, case.domains[0])
+    if "z_short_window" in case.outputs:
+        short = case.info["short_window"]
+        check_z("z_short_window", case.actions(case.domains[0])[:, :short], case.domains[0], short)
+
+    time, condition = (jnp.asarray(case.inputs[f"head_{name}"]) for name in "tc")
+    case.check("head_output", model.denoiser(jnp.asarray(case.inputs["head_x_t"]), time, condition))
+    for robot in case.domains:
+        case.check(f"action_head_output__{robot}", _action_head(case, robot, time, condition))
+
+    condition = jnp.asarray(case.inputs["sample_c"])
+    head = lambda model, x, t: model.denoiser(x, t, condition)  # noqa: E731
+    noise = case.inputs["sample_noise_init"], case.inputs["sample_noise_steps"]
+    last, visited = run_sampler(case, head, *noise, 1.0, trajectory=True)
+    case.check("sample_temperature1", last)
+    case.check("sample_trajectory", visited.x)
+    case.check("sample_pred_x0", visited.x0)
+    case.check("sample_temperature0", run_sampler(case, head, *noise, 0.0))
+
+
+def _pad(case: Case, x: np.ndarray) -> jax.Array:
+    """[..., chunk] -> [..., U]."""
+    return jnp.pad(jnp.asarray(x), [(0, 0)] * (x.ndim - 1) + [(0, case.table.action_width - x.shape[-1])])
+
+
+def _action_head(case: Case, robot: str, time: jax.Array, condition: jax.Array) -> jax.Array:
+    """Rows [n, 2 chunk] of one robot's head."""
+    x = case.inputs[f"action_head_x_t__{robot}"]
+    model = case.declared.merge(case.params)
+    out = model.action_head(_pad(case, x)[None], time[None], condition[None], case.robot(robot, 1))[0]
+    return out.reshape(len(x), 2, -1)[..., : x.shape[-1]].reshape(len(x), -1)
+
+
+# --- Loss --------------------------------------------------------------------------------------
+
+
+def frame_loss(model, case: Case, tokens: jax.Array, z: jax.Array, masked: jax.Array):
+    """(loss, mse, vb) with the recorded times and noises; rows are ordered repeat, sample, time, patch."""
+    shape = (-1, *tokens.shape[:3])
+    time = jnp.asarray(case.inputs["t"]).reshape(shape)
+    noise = jnp.asarray(case.inputs["noise"]).reshape(*time.shape, -1)
+    z, x0 = (jnp.broadcast_to(x, (*time.shape, x.shape[-1])) for x in (z, tokens))
+    process = make_process(case.run.model.diffusion.steps)
+    mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z), x0, time, noise, process)
+    weight = jnp.broadcast_to(masked.any(-1), mse.shape)
+    return jnp.sum((mse + vb) * weight) / jnp.sum(weight), mse, vb
+
+
+def check_loss(case: Case) -> None:
+    latents = Latents(case)
+    tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
+    case.check("patch_mask", np.asarray(masked.any(-1)).reshape(*tokens.shape[:2], *latents.grid))
+
+    @jax.jit
+    def gradient(params, actions, robots):
+        def loss(p):
+            model = case.declared.merge(p)
+            z = model(tokens, masked, actions, robots).frames
+            total, *rows = frame_loss(model, case, tokens, z, masked)
+            return total, rows
+
+        return jax.value_and_grad(loss, has_aux=True)(params)
+
+    for index, robot in enumerate(case.domains):
+        robots = case.robot(robot, latents.batch)
+        (loss, (mse, vb)), grads = gradient(case.params, case.actions(robot), robots)
+        case.check(f"loss__{robot}", loss)
+        case.check(f"per_token_mse__{robot}", mse.ravel())
+        case.check(f"per_token_vb__{robot}", vb.ravel())
+        if index == 0:
+            named = case.official(grads)
+            case.check_group("grad", named)
+            case.check_group("gradnorm", norms(named))
+            case.check_zero(named, case.info["unused_parameters"])
+
+
+# --- Generation --------------------------------------------------------------------------------
+
+
+def check_generation(case: Case) -> None:
+    latents, apply = Latents(case), applier(case)
+    robot, config = case.domains[0], case.run.model
+    robots, actions = case.robot(robot, latents.batch), case.actions(robot)
+
+    def decode(window, unknown, t, steps, temperature, order, noise_name):
+        """(frame, first conditions, patches after each step), as released: nothing is marked as known."""
+        frame = Frame(jnp.zeros_like(window[:, t]), jnp.ones(window[:, t].shape[:2], bool))
+        states, first = [], None
+        for step, keep in enumerate(masked_counts(config, steps)):
+            ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
+            z = apply(ids, masked, actions[:, : window.shape[1]], robots).frames[:, t]
+            first = z if first is None else first
+            chosen = choose_patches(jnp.asarray(order), order.shape[1], keep)
+            condition = jnp.take_along_axis(z, chosen[..., None], axis=1)
+            rows = condition.reshape(-1, condition.shape[-1])
+            head = lambda model, x, t, rows=rows: model.denoiser(x, t, rows)  # noqa: E731
+            noise = [case.inputs[f"noise_{kind}__{noise_name}__{step}"] for kind in ("init", "steps")]
+            new = run_sampler(case, head, *noise, temperature).reshape(*chosen.shape, -1)
+            frame = commit(frame, chosen, new)
+            vector = case.declared.merge(case.params).embed.mask.get_value()
+            states.append(mask_cells(frame.values, frame.masked, vector, config.diffusion))
+        return frame.values, first, jnp.stack(states, axis=1)
+
+    for run, settings in case.info["runs"].items():
+        tokens = latents.tokens[:, : settings.get("window", latents.frames)]
+        t = settings["out_t"]
+        unknown = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= t)[None, :, None], tokens.shape[:3])
+        order = case.inputs[f"order__{run}"]
+        frame, first, states = decode(tokens, unknown, t, settings["M"], settings["temperature"], order, run)
+        case.check(f"{run}_frame", latents.cells(frame))
+        case.check(f"{run}_first_z", latents.channels_first(first))
+        case.check(f"{run}_patch_states", latents.on_grid(states))
+
+    settings, steps = case.info.get("generate"), case.settings["maskgit_steps"]
+    if settings:
+        window, prompt = latents.tokens, settings["num_prompt"]
+        unknown = jnp.broadcast_to((jnp.arange(latents.frames) >= prompt)[None, :, None], window.shape[:3])
+        for new, t in enumerate(range(prompt, latents.frames)):
+            name = f"generate__{new}"
+            order = case.inputs[f"order__{name}"]
+            frame, _, _ = decode(window, unknown, t, steps, settings["temperature"], order, name)
+            window, unknown = window.at[:, t].set(frame), unknown.at[:, t].set(False)
+        flat = np.asarray(latents.cells(window))
+        case.check("generate_latents", flat.reshape(latents.batch, -1, flat.shape[-1]))
+
+
+# --- Actions -----------------------------------------------------------------------------------
+
+
+def check_joint(case: Case) -> None:
+    latents, apply = Latents(case), applier(case)
+    tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
+    for robot in case.domains:
+        out = apply(tokens, masked, case.actions(robot), case.robot(robot, latents.batch))
+        case.check(f"z_given__{robot}", latents.channels_first(out.frames))
+        case.check(f"action_z_given__{robot}", out.actions)
+
+    robot = case.domains[0]
+    robots = case.robot(robot, latents.batch)
+    everything = jnp.ones(tokens.shape[:2], bool)
+    out = apply(tokens, masked, jnp.zeros_like(case.actions(robot)), robots, everything)
+    case.check("z_policy", latents.channels_first(out.frames))
+    case.check("action_z_policy", out.actions)
+
+    rows = out.actions.reshape(1, -1, out.actions.shape[-1])
+    head = lambda model, x, t: model.action_head(x[None], t[None], rows, robots[:1])[0]  # noqa: E731
+    noise = [_pad(case, case.inputs[f"action_noise_{kind}"]) for kind in ("init", "steps")]
+    chunk = case.table.entries[case.table.index(robot)].chunk
+    case.check("action_sample_policy", run_sampler(case, head, *noise, 1.0)[:, :chunk])
+    _check_joint_training(case, latents, robot)
+
+
+def _check_joint_training(case: Case, latents: Latents, robot: str) -> None:
+    """As released: actions are shown, raw ones are the target, and chunks from a random one on count."""
+    tokens, masked = latents.tokens, latents.masked(case.inputs["masked_tokens_indicator"])
+    robots, actions = case.robot(robot, latents.batch), case.actions(robot)
+    shape = actions.shape[:2]
+    time = jnp.asarray(case.inputs["action_t"]).reshape(shape)
+    noise = _pad(case, case.inputs["action_noise"]).reshape(*shape, -1)
+    hidden = jnp.arange(shape[1])[None] >= case.inputs["action_mask_start"].reshape(-1, 1)
+    chunk = case.table.entries[case.table.index(robot)].chunk
+    own = jnp.broadcast_to(jnp.arange(actions.shape[-1]) < chunk, actions.shape)
+    weight, process = case.settings["action_loss_weight"], make_process(case.run.model.diffusion.steps)
+
+    @jax.jit
+    def gradient(params):
+        def total(p):
+            model = case.declared.merge(p)
+            out = model(tokens, masked, actions, robots, hidden_BT=hidden, leak="all")
+            loss, _, _ = frame_loss(model, case, tokens, out.frames, masked)
+            network = lambda x, t: model.action_head(x, t, out.actions, robots)  # noqa: E731
+            mse, vb = diffusion_loss(network, actions, time, noise, process, valid=own)
+            action_loss = jnp.sum((mse + vb) * hidden) / jnp.sum(hidden)
+            return loss + weight * action_loss, (loss, action_loss)
+
+        return jax.grad(total, has_aux=True)(params)
+
+    grads, (loss, action_loss) = gradient(case.params)
+    case.check("train_loss", loss)
+    case.check("train_action_loss", action_loss)
+    named = case.official(grads)
+    case.check_group("grad", named)
+    case.check_group("gradnorm", norms(named))
+    case.check_zero(named, case.info["unused_parameters"])
