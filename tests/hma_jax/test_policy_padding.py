@@ -1,0 +1,30 @@
+"""Sampled actions of a robot do not depend on how wide the widest robot's are."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import DecodeConfig, DiffusionConfig, SamplerConfig
+from hma_jax.generation import read_actions
+from hma_jax.model.hma import Outputs
+from tests.tiny import TABLE, lively_params, model_config
+
+
+def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():
+    diffusion = DiffusionConfig(channels=1, patch=1, width=16, depth=1)
+    config = model_config(layers=1, diffusion=diffusion)
+    declared, params = lively_params(config)
+    pusher = jnp.zeros(2, jnp.int32)  # 2 values of 14
+    pooled = jax.random.normal(jax.random.key(0), (2, 3, config.width))
+    decode = DecodeConfig(sampler=SamplerConfig(steps=4))
+
+    @jax.jit
+    def read(params):
+        out = Outputs(pooled, pooled, None)
+        return read_actions(declared.merge(params), out, pusher, jax.random.split(jax.random.key(1), 2), decode)
+
+    into = params["action_head"]["robots"]["into"]
+    before = np.asarray(read(params))
+    into["kernel"] = into["kernel"].at[:, 2:].add(1.0)  # rows that only padding meets
+    np.testing.assert_array_equal(before[..., :2], read(params)[..., :2])
+    assert (before[..., 2:] == 0).all()
