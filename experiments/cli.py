@@ -20,6 +20,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from experiments import commands, model_commands
+from experiments.cli_convert import HELP, convert_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
@@ -184,6 +185,7 @@ def report(out: Path) -> None:
 
 app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
+app.command(convert_app, name="convert", help=HELP)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

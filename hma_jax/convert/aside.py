@@ -11,18 +11,24 @@ from pathlib import Path
 from hma_jax.config import require
 
 
-@contextmanager
-def written_aside(directory: Path) -> Iterator[Path]:
-    """A new directory to write into, which takes the place of `directory` when the block ends well.
-
-    Raises ConfigError if something is there already, before any work is done.
-    """
-    directory = Path(directory).absolute()
+def require_free(directory: Path) -> None:
+    """Raises ConfigError if there is something at `directory`, which an output would replace."""
+    directory = Path(directory)
     empty = directory.is_dir() and not any(directory.iterdir())
     require(
         empty or not directory.exists(),
         f"{directory} exists already; choose another output directory or remove it",
     )
+
+
+@contextmanager
+def written_aside(directory: Path) -> Iterator[Path]:
+    """A new directory to write into, which takes the place of `directory` when the block ends well.
+
+    Raises ConfigError if something is there already.
+    """
+    require_free(directory)
+    directory = Path(directory).absolute()
     directory.parent.mkdir(parents=True, exist_ok=True)
     aside = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
     aside.mkdir()

@@ -1,0 +1,96 @@
+"""A model for other frameworks: arrays under our paths, and a JSON description that explains them.
+
+    model.safetensors   every parameter, float32
+    model.json          configurations, robots and provenance; of every array its shape, axes (the
+                        dimension letters; null where an axis has none) and muP role
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hma_jax.config import ConfigError, ModelConfig, TrainConfig, from_dict, require
+from hma_jax.convert.aside import written_aside
+from hma_jax.convert.table import check_names, flat, nested
+from hma_jax.convert.tensors import read_safetensors, write_safetensors
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model import declare_model
+from hma_jax.params import ParamSpec
+from hma_jax.training.train import Run, describe_run
+
+FORMAT, VERSION = "hma-jax", 1
+DESCRIPTION, WEIGHTS = "model.json", "model.safetensors"
+
+
+def describe_tensors(leaves: Mapping[str, ParamSpec]) -> dict[str, dict[str, Any]]:
+    return {
+        path: {"shape": list(spec.shape), "axes": list(spec.axes), "role": spec.role}
+        for path, spec in leaves.items()
+    }
+
+
+def write_neutral(run: Run, directory: Path) -> None:
+    """Raises ConfigError if `directory` exists."""
+    arrays = {path: np.asarray(x) for path, x in flat(run.params).items()}
+    description = {
+        "format": FORMAT,
+        "version": VERSION,
+        "step": run.step,
+        **describe_run(run.model, run.train, run.table, run.provenance),
+        "tensors": describe_tensors(declare_model(run.model, run.table).leaves()),
+    }
+    with written_aside(directory) as aside:
+        (aside / DESCRIPTION).write_text(json.dumps(description, indent=1))
+        write_safetensors(aside / WEIGHTS, arrays)
+
+
+def read_neutral(directory: Path) -> Run:
+    """Raises ConfigError naming the field or tensors that do not fit."""
+    directory = Path(directory)
+    path = directory / DESCRIPTION
+    try:
+        description = json.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(
+            f"no {path} ({error.strerror}); give a directory with {DESCRIPTION} and {WEIGHTS}"
+        ) from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not JSON: {error}") from error
+    fields = {"format", "version", "step", "model", "train", "table", "provenance", "tensors"}
+    found = set(description) if isinstance(description, dict) else set()
+    require(
+        found == fields and description["format"] == FORMAT,
+        f"{path}: not a description of this project: its fields are {', '.join(sorted(found)) or 'none'}, "
+        f"expected {', '.join(sorted(fields))}",
+    )
+    require(
+        description["version"] == VERSION,
+        f"{path}: version {description['version']}, this program reads {VERSION}; convert it with its own",
+    )
+    model = from_dict(ModelConfig, description["model"], f"{path}: model")
+    table = from_dict(EmbodimentTable, description["table"], f"{path}: table")
+    leaves = declare_model(model, table).leaves()
+    want = describe_tensors(leaves)
+    wrong = [name for name in want.keys() | description["tensors"].keys() if want.get(name) != description["tensors"].get(name)]
+    require(
+        not wrong, f"{path}: tensors that are not described as its model has them: {', '.join(sorted(wrong)[:10])}"
+    )
+    require((directory / WEIGHTS).is_file(), f"{directory} has no {WEIGHTS}")
+    tensors = read_safetensors(directory / WEIGHTS)
+    shapes = {name: spec.shape for name, spec in leaves.items()}
+    check_names(shapes, {name: tensor.shape for name, tensor in tensors.items()}, str(directory / WEIGHTS))
+    foreign = [name for name, tensor in tensors.items() if tensor.dtype != np.float32]
+    require(not foreign, f"{directory / WEIGHTS}: not of type float32: {', '.join(foreign[:10])}")
+    return Run(
+        model,
+        from_dict(TrainConfig, description["train"], f"{path}: train"),
+        table,
+        nested({name: tensor.read() for name, tensor in tensors.items()}),
+        description["step"],
+        description["provenance"],
+    )

@@ -1,0 +1,37 @@
+"""A run directory from a converted model: what `training.train.load_run` reads and training resumes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import get_args
+
+import jax
+import numpy as np
+
+from hma_jax.convert.aside import written_aside
+from hma_jax.params import Use
+from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.optimizer import AdamState
+from hma_jax.training.state import TrainState
+from hma_jax.training.train import Run, describe_run
+
+
+def write_run(run: Run, directory: Path) -> None:
+    """Writes a checkpoint of step 0 with an optimiser that has not moved yet.
+
+    Raises ConfigError if `directory` exists.
+    """
+    with written_aside(directory) as aside:
+        meta = describe_run(run.model, run.train, run.table, run.provenance)
+        with Checkpoints(aside / "checkpoints", meta) as checkpoints:
+            checkpoints.save(0, fresh_state(run))
+
+
+def fresh_state(run: Run) -> TrainState:
+    """What training starts with, in memory of the host."""
+    params = jax.tree.map(np.asarray, run.params)
+    # Untouched zeros cost no memory.
+    moments = [jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), params) for _ in range(2)]
+    shared = {use: np.zeros((), np.int32) for use in get_args(Use)}
+    robots = {use: np.zeros(run.table.size, np.int32) for use in get_args(Use)}
+    return TrainState(np.zeros((), np.int32), params, AdamState(*moments, shared, robots))
