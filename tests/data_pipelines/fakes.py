@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.example import encode_example
+from data_pipelines.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.tfrecord import write_shard
 
@@ -149,3 +150,23 @@ def _write_metadata(directory: Path, spec: DatasetSpec, counts: list[int]) -> No
         ],
     }
     (directory / "dataset_info.json").write_text(json.dumps(info))
+
+
+class OneDataset:
+    """A store of one dataset that has a manifest only."""
+
+    def __init__(self, steps, hz=2.0, frame_step=1, episodes=None, dims=(3,)):
+        self._manifest = Manifest(
+            spec=DatasetSpec("toy", "observation/image", ("action",), dims, hz),
+            tokenizer=TokenizerFacts("fake", 8, 4, 16, 65536, 2, 256),
+            settings=JobSettings(frame_step=frame_step),
+            source="",
+            source_version="1.0.0",
+            action_mean=(0.0,) * sum(dims),
+            action_std=(1.0,) * sum(dims),
+            train=SplitFacts(tuple(episodes or range(len(steps))), tuple(steps)),
+            val=SplitFacts((), ()),
+        )
+
+    def manifest(self, name):
+        return self._manifest

@@ -8,8 +8,6 @@ import pytest
 
 from data_pipelines.episode_record import StoredEpisode
 from data_pipelines.errors import DataError
-from data_pipelines.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
-from data_pipelines.registry import DatasetSpec
 from data_pipelines.tokenize_job import _Moments
 from data_pipelines.windows import (
     count_windows,
@@ -20,27 +18,7 @@ from data_pipelines.windows import (
     val_windows,
 )
 from hma_jax.config import ConfigError
-from tests.data_pipelines.fakes import GOLDEN
-
-
-class OneDataset:
-    """A store of one dataset that has a manifest only."""
-
-    def __init__(self, steps, hz=2.0, frame_step=1, episodes=None, dims=(3,)):
-        self._manifest = Manifest(
-            spec=DatasetSpec("toy", "observation/image", ("action",), dims, hz),
-            tokenizer=TokenizerFacts("fake", 8, 4, 16, 65536, 2, 256),
-            settings=JobSettings(frame_step=frame_step),
-            source="",
-            source_version="1.0.0",
-            action_mean=(0.0,) * sum(dims),
-            action_std=(1.0,) * sum(dims),
-            train=SplitFacts(tuple(episodes or range(len(steps))), tuple(steps)),
-            val=SplitFacts((), ()),
-        )
-
-    def manifest(self, name):
-        return self._manifest
+from tests.data_pipelines.fakes import GOLDEN, OneDataset
 
 
 # --- which windows exist ----------------------------------------------------------------------

@@ -29,10 +29,13 @@ RTOL = 1e-4
 
 @dataclass(frozen=True)
 class Finding:
-    """How one output compares. `error` is the largest absolute one, `allowed` the absolute tolerance."""
+    """How one output compares. `error` is the largest absolute one, `allowed` the absolute tolerance.
+
+    Not `good` and not bad (None): a remark on what is not compared, and why.
+    """
 
     output: str
-    good: bool
+    good: bool | None
     error: float | None = None
     allowed: float | None = None
     note: str = ""
@@ -41,7 +44,8 @@ class Finding:
         numbers = "" if self.error is None else f"  max error {self.error:.2e}"
         if self.allowed is not None:
             numbers += f"  atol {self.allowed:.0e}"
-        return f"  {'ok  ' if self.good else 'FAIL'} {self.output}{numbers}{'  ' + self.note if self.note else ''}"
+        verdict = {True: "ok  ", False: "FAIL", None: "note"}[self.good]
+        return f"  {verdict} {self.output}{numbers}{'  ' + self.note if self.note else ''}"
 
 
 class Case:
@@ -103,7 +107,7 @@ class Case:
 
     def check(self, output: str, got: Any, via: str = "") -> None:
         """|got - want| <= atol + rtol |want| with the case's own tolerance; integers exactly."""
-        tolerance = self.info["tolerance"].get(output, {"atol": 0.0, "rtol": RTOL})
+        tolerance = self.info.get("tolerance", {}).get(output, {"atol": 0.0, "rtol": RTOL})
         self.checked.add(output)
         self.compare(output, got, self.outputs[output], tolerance["atol"], tolerance["rtol"], via)
 
@@ -141,7 +145,8 @@ class Case:
         if added and all(f.good for f in added):
             worst = max(added, key=lambda f: f.error or 0.0)
             del self.findings[before:]
-            self.add(Finding(f"{prefix}::* ({len(added)})", True, worst.error, worst.allowed, f"largest: {worst.output}"))
+            note = f"largest: {worst.output}"
+            self.add(Finding(f"{prefix}::* ({len(added)})", True, worst.error, worst.allowed, note))
 
     def check_zero(self, arrays: dict[str, np.ndarray], names: Iterable[str]) -> None:
         """Gradients of parameters that the release says have no influence."""
@@ -154,4 +159,4 @@ class Case:
 
 
 def norms(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    return {name: np.sqrt(np.sum(np.square(x, dtype=np.float64))).astype(np.float32) for name, x in arrays.items()}
+    return {n: np.sqrt(np.sum(np.square(x, dtype=np.float64))).astype(np.float32) for n, x in arrays.items()}

@@ -42,7 +42,7 @@ def windows(case: Case, name: str) -> tuple[jax.Array, jax.Array]:
 
 
 def applier(case: Case):
-    """apply(ids, masked, actions, robots, hidden=None, leak=...) -> Outputs, compiled."""
+    """apply(ids, masked, actions, robots, hidden=None) -> Outputs, compiled."""
 
     @jax.jit
     def apply(params, ids, masked, actions, robots, hidden):
