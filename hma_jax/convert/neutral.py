@@ -1,8 +1,8 @@
 """A model for other frameworks: arrays under our paths, and a JSON description that explains them.
 
-    model.safetensors   every parameter, float32
-    model.json          configurations, robots and provenance; of every array its shape, axes (the
-                        dimension letters; null where an axis has none) and muP role
+model.safetensors   every parameter, float32
+model.json          configurations, robots and provenance; of every array its shape, axes (the
+                    dimension letters; null where an axis has none) and muP role
 """
 
 from __future__ import annotations
@@ -76,9 +76,14 @@ def read_neutral(directory: Path) -> Run:
     table = from_dict(EmbodimentTable, description["table"], f"{path}: table")
     leaves = declare_model(model, table).leaves()
     want = describe_tensors(leaves)
-    wrong = [name for name in want.keys() | description["tensors"].keys() if want.get(name) != description["tensors"].get(name)]
+    wrong = [
+        name
+        for name in want.keys() | description["tensors"].keys()
+        if want.get(name) != description["tensors"].get(name)
+    ]
     require(
-        not wrong, f"{path}: tensors that are not described as its model has them: {', '.join(sorted(wrong)[:10])}"
+        not wrong,
+        f"{path}: tensors that are not described as its model has them: {', '.join(sorted(wrong)[:10])}",
     )
     require((directory / WEIGHTS).is_file(), f"{directory} has no {WEIGHTS}")
     tensors = read_safetensors(directory / WEIGHTS)

@@ -71,7 +71,9 @@ def read_official(directory: Path) -> Run:
     statistics = {robot: tuple(tensors[name].read() for name in _statistics(robot)) for robot in names}
     table = read_table(config, statistics, where)
     check_names(
-        official_shapes(model, table), {name: tensor.shape for name, tensor in tensors.items()}, str(directory)
+        official_shapes(model, table),
+        {name: tensor.shape for name, tensor in tensors.items()},
+        str(directory),
     )
     foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
     require(not foreign, f"{directory}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
@@ -156,7 +158,9 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     leaves = declare_model(model, run.table).leaves()
     arrays = flat(run.params)
     if not run.model.action_heads:
-        arrays |= {path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays}
+        arrays |= {
+            path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays
+        }
         remarks.append("the release has action heads, this model has none: they are written as zeros")
     ratio = model.mup_multiplier("readout") / run.model.mup_multiplier("readout")
     if ratio != 1:

@@ -239,7 +239,9 @@ def require_official(model: ModelConfig, table: EmbodimentTable) -> None:
     """Raises ConfigError for a model that the release cannot compute."""
     reasons = []
     if model.action_alignment != "released":
-        reasons.append(f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only")
+        reasons.append(
+            f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only"
+        )
     if model.mup.enabled and (model.mup.attention_scale != 8 or "attention" in model.mup.without):
         reasons.append(
             f"its attention scale is not the release's 8 / head width (model.mup.attention_scale "

@@ -1,9 +1,9 @@
 """Generation as a StableHLO program with fixed shapes, that runs where this project is not installed.
 
-    model.stablehlo     `jax.export` bytes; jax.export.deserialize(bytes).call(weights, prompt, actions,
-                        embodiment, key) -> new frames
-    model.safetensors   the weights, name -> array
-    model.json          every input and output, in the order of the program's arguments
+model.stablehlo     `jax.export` bytes; jax.export.deserialize(bytes).call(weights, prompt, actions,
+                    embodiment, key) -> new frames
+model.safetensors   the weights, name -> array
+model.json          every input and output, in the order of the program's arguments
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ class ProgramConfig:
         )
 
 
-def generate_function(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> Callable[..., jax.Array]:
+def generate_function(
+    model: ModelConfig, table: EmbodimentTable, config: ProgramConfig
+) -> Callable[..., jax.Array]:
     """generate(weights, prompt, actions, embodiment, key) -> frames prompt .. frames - 1.
 
     weights: path -> array. prompt int32 [B, T', S] or float32 [B, T', S, C]; actions float32
@@ -75,7 +77,9 @@ def generate_function(model: ModelConfig, table: EmbodimentTable, config: Progra
     return generate
 
 
-def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> dict[str, jax.ShapeDtypeStruct]:
+def input_shapes(
+    model: ModelConfig, table: EmbodimentTable, config: ProgramConfig
+) -> dict[str, jax.ShapeDtypeStruct]:
     """The inputs after the weights, in order."""
     b, channels = config.batch, (model.diffusion.token_channels,) if model.diffusion else ()
     kind = jnp.float32 if model.diffusion else jnp.int32
@@ -119,7 +123,10 @@ def _describe(
 ) -> dict[str, Any]:
     tensors = describe_tensors(declare_model(run.model, run.table).leaves())
     of_array = lambda x: {"shape": list(x.shape), "dtype": x.dtype.name}  # noqa: E731
-    order = [{"name": f"weights/{name}", "shape": t["shape"], "dtype": "float32"} for name, t in sorted(tensors.items())]
+    order = [
+        {"name": f"weights/{name}", "shape": t["shape"], "dtype": "float32"}
+        for name, t in sorted(tensors.items())
+    ]
     order += [{"name": name, **of_array(x), "meaning": MEANINGS[name]} for name, x in inputs.items()]
     if [tuple(i["shape"]) for i in order] != [a.shape for a in exported.in_avals]:
         raise ConfigError("the program's arguments are not in the order of their description")

@@ -45,7 +45,10 @@ def _linear(ours: str, official: str) -> tuple[Entry, ...]:
 
 
 def _norm(ours: str, official: str) -> tuple[Entry, ...]:
-    return (Entry(f"{ours}/gain", f"{official}.weight", SAME), Entry(f"{ours}/bias", f"{official}.bias", SAME))
+    return (
+        Entry(f"{ours}/gain", f"{official}.weight", SAME),
+        Entry(f"{ours}/bias", f"{official}.bias", SAME),
+    )
 
 
 def _attention(ours: str, official: str) -> tuple[Entry, ...]:
@@ -229,7 +232,9 @@ def check_names(
         if names
     ]
     if lines:
-        raise ConfigError(f"{where}: the tensors are not those that the description asks for:" + "".join(lines))
+        raise ConfigError(
+            f"{where}: the tensors are not those that the description asks for:" + "".join(lines)
+        )
 
 
 def flat(params: Params) -> dict[str, np.ndarray]:

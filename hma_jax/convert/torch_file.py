@@ -108,13 +108,23 @@ def read_torch(path: Path) -> dict[str, Stored]:
             require(len(pickles) == 1, f"{path} is a zip file without a torch state dict{advice}")
             root = pickles[0].removesuffix("data.pkl")
             if f"{root}byteorder" in archive.namelist():
-                require(archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little")
+                require(
+                    archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little"
+                )
             state = _Reader(path, archive, root).load()
     except _Refused:
         raise
     except zipfile.BadZipFile as error:
         raise ConfigError(f"{path}: no zip file, damaged or saved by torch before 1.6{advice}") from error
-    except (pickle.UnpicklingError, EOFError, KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+    except (
+        pickle.UnpicklingError,
+        EOFError,
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path}: its description of tensors cannot be read ({error}){advice}") from error

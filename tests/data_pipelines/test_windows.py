@@ -1,14 +1,10 @@
 from __future__ import annotations
 
-import json
-import re
-
 import numpy as np
 import pytest
 
 from data_pipelines.episode_record import StoredEpisode
 from data_pipelines.errors import DataError
-from data_pipelines.tokenize_job import _Moments
 from data_pipelines.windows import (
     count_windows,
     cut_actions,
@@ -18,7 +14,7 @@ from data_pipelines.windows import (
     val_windows,
 )
 from hma_jax.config import ConfigError
-from tests.data_pipelines.fakes import GOLDEN, OneDataset
+from tests.data_pipelines.fakes import OneDataset
 
 
 # --- which windows exist ----------------------------------------------------------------------
@@ -97,70 +93,3 @@ def test_memory_does_not_grow_with_windows():
     assert len(windows) == 3 * (10**6 - 11)
     assert windows.ends.nbytes + windows.episodes.nbytes < 100
     assert windows.locate(len(windows) - 1) == (2, 10**6 - 12)
-
-
-# --- against the official release ---------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def official():
-    root = GOLDEN / "15_windows"
-    segments = np.fromfile(root / "segment_ids.bin", np.int32)
-    tokens = np.fromfile(root / "video.bin", np.uint32).reshape(len(segments), 16)
-    actions = np.fromfile(root / "actions.bin", np.float32).reshape(len(segments), 3)
-    facts = json.loads((root / "windows.json").read_text())
-    return segments, tokens, actions, facts, np.load(root / "items.npz")
-
-
-def test_starts_equal_the_official_ones_but_for_the_two_stated_differences(official):
-    segments, _, _, facts, _ = official
-    ends = np.flatnonzero(np.diff(segments, append=-1)) + 1
-    firsts = np.concatenate([[0], ends[:-1]])
-    checked = 0
-    for case in facts["window_lists"]:
-        if not case["filter_interrupts"] or case["filter_overlaps"]:
-            continue  # windows over an episode's end; DIFFERS: overlapping windows are kept
-        frames, stride = case["window"], case["stride"]
-        ours = train_windows(OneDataset((ends - firsts).tolist(), hz=2 * stride), "toy", frames)
-        starts = set((firsts[ours.episode_idx] + ours.start).tolist())
-        theirs = set(case["starts"])
-        # DIFFERS: theirs lets the last chunk run over the end of the episode ...
-        over = {s for s in theirs if s + frames * stride > ends[segments[s]]}
-        # ... and drops the very last window of the dataset.
-        last = {len(segments) - frames * stride}
-        assert starts == (theirs - over) | last
-        assert bool(over) == (stride > 1)
-        checked += 1
-    assert checked == 3
-
-
-def test_items_equal_the_official_ones(official):
-    segments, tokens, actions, _, items = official
-    checked = 0
-    for key in items:
-        if not key.endswith("input_ids"):
-            continue
-        name = key.removesuffix("__input_ids")
-        frames, stride, start = map(int, re.findall(r"\d+", name))
-        episode = np.flatnonzero(segments == segments[start])
-        if start + frames * stride > episode[-1] + 1:
-            continue
-        data = OneDataset([len(episode)], hz=2 * stride)
-        item = StoredEpisode(0, None, tokens[episode], actions[episode], None)
-        first = start - episode[0]
-        ours = cut_frames(item.tokens, first, frames, data.manifest("toy"))
-        assert np.array_equal(ours.ravel(), items[key])
-        chunks = cut_actions(item, first, frames, data.manifest("toy"), width=3 * stride)
-        assert np.array_equal(chunks, items[f"{name}__action_ids"])
-        checked += 1
-    assert checked >= 5
-
-
-def test_action_statistics_equal_the_official_ones(official):
-    segments, _, actions, facts, _ = official
-    moments = _Moments(3)
-    for episode in range(segments[-1] + 1):
-        moments.add(actions[segments == episode])
-    mean, std = moments.result()
-    np.testing.assert_allclose(mean, facts["action_mean"], atol=1e-5)
-    np.testing.assert_allclose(std, facts["action_std"], atol=1e-5)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import SamplerConfig
 from hma_jax.decoding import Frame, choose_patches, commit, masked_counts
-from hma_jax.diffusion import Trajectory, diffusion_loss, make_process, respace, sample
+from hma_jax.diffusion import diffusion_loss, make_process, respace, sample
 from hma_jax.model.frames import mask_cells, patchify, unpatchify
 from tests.golden.case import Case, norms
 
@@ -51,10 +54,11 @@ def applier(case: Case):
     )
 
 
-def run_sampler(
-    case: Case, head, noise_init: np.ndarray, noise_steps: np.ndarray, temperature: float, trajectory: bool = False
-) -> jax.Array | tuple[jax.Array, Trajectory]:
-    """The release's sampler with recorded noise; head(model, x, t) is a denoising network."""
+def make_sampler(case: Case, head: Callable, temperature: float, trajectory: bool = False) -> Callable:
+    """sample(condition, noise_init, noise_steps): the release's sampler with recorded noise.
+
+    head(model, x, t, condition) is a denoising network.
+    """
     steps = int(case.settings["num_sampling_steps"])
     config = case.run.model.diffusion
     # As released, temperature multiplies the noise of the steps only.
@@ -62,12 +66,17 @@ def run_sampler(
     process = respace(make_process(config.steps), steps)
 
     @jax.jit
-    def run(params, start, noises):
+    def run(params, condition, start, noises):
         model = case.declared.merge(params)
+        network = lambda x, t: head(model, x, t, condition)  # noqa: E731
         noises = noises if sampler.noisy_steps else None
-        return sample(lambda x, t: head(model, x, t), start, noises, process, sampler, config.clip, trajectory)
+        return sample(network, start, noises, process, sampler, config.clip, trajectory)
 
-    return run(case.params, noise_init, noise_steps)
+    return functools.partial(run, case.params)
+
+
+def frame_head(model, x: jax.Array, t: jax.Array, condition: jax.Array) -> jax.Array:
+    return model.denoiser(x, t, condition)
 
 
 # --- Forward -----------------------------------------------------------------------------------
@@ -100,13 +109,12 @@ def check_forward(case: Case) -> None:
         case.check(f"action_head_output__{robot}", _action_head(case, robot, time, condition))
 
     condition = jnp.asarray(case.inputs["sample_c"])
-    head = lambda model, x, t: model.denoiser(x, t, condition)  # noqa: E731
     noise = case.inputs["sample_noise_init"], case.inputs["sample_noise_steps"]
-    last, visited = run_sampler(case, head, *noise, 1.0, trajectory=True)
+    last, visited = make_sampler(case, frame_head, 1.0, trajectory=True)(condition, *noise)
     case.check("sample_temperature1", last)
     case.check("sample_trajectory", visited.x)
     case.check("sample_pred_x0", visited.x0)
-    case.check("sample_temperature0", run_sampler(case, head, *noise, 0.0))
+    case.check("sample_temperature0", make_sampler(case, frame_head, 0.0)(condition, *noise))
 
 
 def _pad(case: Case, x: np.ndarray) -> jax.Array:
@@ -172,6 +180,7 @@ def check_generation(case: Case) -> None:
     latents, apply = Latents(case), applier(case)
     robot, config = case.domains[0], case.run.model
     robots, actions = case.robot(robot, latents.batch), case.actions(robot)
+    sampler = functools.cache(lambda temperature: make_sampler(case, frame_head, temperature))
 
     def decode(window, unknown, t, steps, temperature, order, noise_name):
         """(frame, first conditions, patches after each step), as released: nothing is marked as known."""
@@ -184,9 +193,8 @@ def check_generation(case: Case) -> None:
             chosen = choose_patches(jnp.asarray(order), order.shape[1], keep)
             condition = jnp.take_along_axis(z, chosen[..., None], axis=1)
             rows = condition.reshape(-1, condition.shape[-1])
-            head = lambda model, x, t, rows=rows: model.denoiser(x, t, rows)  # noqa: E731
             noise = [case.inputs[f"noise_{kind}__{noise_name}__{step}"] for kind in ("init", "steps")]
-            new = run_sampler(case, head, *noise, temperature).reshape(*chosen.shape, -1)
+            new = sampler(temperature)(rows, *noise).reshape(*chosen.shape, -1)
             frame = commit(frame, chosen, new)
             vector = case.declared.merge(case.params).embed.mask.get_value()
             states.append(mask_cells(frame.values, frame.masked, vector, config.diffusion))
@@ -234,10 +242,10 @@ def check_joint(case: Case) -> None:
     case.check("action_z_policy", out.actions)
 
     rows = out.actions.reshape(1, -1, out.actions.shape[-1])
-    head = lambda model, x, t: model.action_head(x[None], t[None], rows, robots[:1])[0]  # noqa: E731
+    head = lambda model, x, t, z: model.action_head(x[None], t[None], z, robots[:1])[0]  # noqa: E731
     noise = [_pad(case, case.inputs[f"action_noise_{kind}"]) for kind in ("init", "steps")]
     chunk = case.table.entries[case.table.index(robot)].chunk
-    case.check("action_sample_policy", run_sampler(case, head, *noise, 1.0)[:, :chunk])
+    case.check("action_sample_policy", make_sampler(case, head, 1.0)(rows, *noise)[:, :chunk])
     _check_joint_training(case, latents, robot)
 
 

@@ -132,7 +132,9 @@ def _check_starts(case: Case, data: OnDisk, one: dict[str, Any]) -> None:
     frames, stride = one["window"], one["stride"]
     label = f"starts, window {frames}, stride {stride}"
     if not one["filter_interrupts"] or one["filter_overlaps"]:
-        why = "we keep overlapping windows" if one["filter_overlaps"] else "our windows never leave an episode"
+        why = (
+            "we keep overlapping windows" if one["filter_overlaps"] else "our windows never leave an episode"
+        )
         case.add(Finding(label, None, note=f"not followed: {why}"))
         return
     ours = train_windows(OneDataset((data.ends - data.firsts).tolist(), hz=2 * stride), "toy", frames)
@@ -193,7 +195,9 @@ def check_metrics(case: Case) -> None:
     }
     for name, expected in want.items():
         if name in got:
-            case.compare(name, np.asarray(got[name][0], np.float64), np.asarray(expected, np.float64), got[name][1])
+            case.compare(
+                name, np.asarray(got[name][0], np.float64), np.asarray(expected, np.float64), got[name][1]
+            )
         else:
             case.add(Finding(name, False, note="unknown metric"))
 

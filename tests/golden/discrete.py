@@ -70,7 +70,9 @@ def check_logits(case: Case) -> None:
         check("logits_short_window", case.actions(case.domains[0])[:, :short], case.domains[0], short)
     if "logits_skip_normalization" in case.outputs:
         robot = case.domains[-1]
-        plain = [replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries]
+        plain = [
+            replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries
+        ]
         declared = declare_model(case.run.model, EmbodimentTable(tuple(plain)))
         out = jax.jit(lambda p, *args: declared.merge(p)(*args).frames)(
             case.params, ids, masked, case.actions(robot), case.robot(robot, batch)
@@ -157,7 +159,10 @@ class Decoder:
     def run(self, window: jax.Array, unknown: jax.Array, t: int, steps: int, scores: list[np.ndarray] | None):
         """(frame, first logits, frames after each step, the last pass). Without `scores` by confidence."""
         config, batch = self.case.run.model, len(window)
-        robots, keys = self.case.robot(self.case.domains[0], batch), jax.random.split(jax.random.key(0), batch)
+        robots, keys = (
+            self.case.robot(self.case.domains[0], batch),
+            jax.random.split(jax.random.key(0), batch),
+        )
         frame = Frame(jnp.zeros_like(window[:, t]), jnp.ones(window[:, t].shape, bool))
         states, first = [], None
         for step, keep in enumerate(masked_counts(config, steps)):
@@ -236,7 +241,7 @@ def check_generation(case: Case) -> None:
 
 def check_joint(case: Case) -> None:
     ids, masked = windows(case, "tokens")
-    config, batch = case.run.model, len(ids)
+    batch = len(ids)
     everything = jnp.ones(ids.shape[:2], bool)
 
     @jax.jit
@@ -249,7 +254,9 @@ def check_joint(case: Case) -> None:
         robots, chunk = case.robot(robot, batch), case.table.entries[case.table.index(robot)].chunk
         for way, hidden in (("given", ~everything), ("policy", everything)):
             logits, predicted = read(case.params, case.actions(robot), robots, hidden)
-            case.check(f"states_{way}__{robot}", channels_first(logits, case.outputs[f"states_{way}__{robot}"]))
+            case.check(
+                f"states_{way}__{robot}", channels_first(logits, case.outputs[f"states_{way}__{robot}"])
+            )
             case.check(f"actions_{way}__{robot}", predicted[..., :chunk])
         raw = case.table.unnormalise(predicted, robots)
         case.check(f"actions_policy_unnormalized__{robot}", raw[..., :chunk])
@@ -287,7 +294,9 @@ def _check_joint_training(case: Case) -> None:
             loss, accuracy = loss_and_accuracy(model, recorded, labels, actions, robots, masking)
             out = model(ids, masked, actions, robots, hidden_BT=hidden, leak=masking.action_leak)
             predicted = model.action_head(out.actions, robots)[..., :chunk]
-            action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(hidden.astype(jnp.float32))
+            action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(
+                hidden.astype(jnp.float32)
+            )
             return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.frames)
 
         return jax.grad(total, has_aux=True)(params)

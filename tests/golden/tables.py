@@ -136,7 +136,12 @@ def _cosine(case: Case, label: str, want: dict[str, Any]) -> None:
 
 def _weights(case: Case, label: str, want: list[dict[str, Any]]) -> None:
     got = [mixture_weights(one["sizes"], one["temperature"]) for one in want]
-    _close(case, f"{label}.weights ({len(want)})", np.concatenate(got), np.concatenate([o["weights"] for o in want]))
+    _close(
+        case,
+        f"{label}.weights ({len(want)})",
+        np.concatenate(got),
+        np.concatenate([o["weights"] for o in want]),
+    )
     note = "not followed: training counts steps, not epochs"
     case.add(Finding(f"{label}.batches_per_epoch", None, note=note))
 
@@ -210,7 +215,9 @@ def _check_initial(case: Case, label: str, variant: str, want: dict[str, dict[st
     declared = declare_model(model, table)
     parts = official_parts(model, table, declared.leaves())
     own = {part.name: (path, part) for path, parts_ in parts.items() for part in parts_}
-    arrays = {path: spec.init(np.random.default_rng(0), spec.shape) for path, spec in declared.leaves().items()}
+    arrays = {
+        path: spec.init(np.random.default_rng(0), spec.shape) for path, spec in declared.leaves().items()
+    }
 
     wrong, differ, followed = [f"{n}: not ours" for n in want if n not in own], 0, 0
     wrong += [f"{n}: not theirs" for n in own if n not in want]

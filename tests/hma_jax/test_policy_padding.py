@@ -7,7 +7,7 @@ import numpy as np
 from hma_jax.config import DecodeConfig, DiffusionConfig, SamplerConfig
 from hma_jax.generation import read_actions
 from hma_jax.model.hma import Outputs
-from tests.tiny import TABLE, lively_params, model_config
+from tests.tiny import lively_params, model_config
 
 
 def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():
@@ -21,7 +21,9 @@ def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():
     @jax.jit
     def read(params):
         out = Outputs(pooled, pooled, None)
-        return read_actions(declared.merge(params), out, pusher, jax.random.split(jax.random.key(1), 2), decode)
+        return read_actions(
+            declared.merge(params), out, pusher, jax.random.split(jax.random.key(1), 2), decode
+        )
 
     into = params["action_head"]["robots"]["into"]
     before = np.asarray(read(params))

@@ -1,0 +1,99 @@
+"""The small copies of reference cases kept here, and that a wrong number is not overlooked."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hma_jax.convert.tensors import read_safetensors, write_safetensors
+from tests.golden import verify
+
+HERE = Path(__file__).parent
+CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exists())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_official_release_s_numbers(name: str):
+    assert verify.main([str(HERE / name)]) == 0
+
+
+@pytest.fixture
+def copy(tmp_path):
+    def make(name: str) -> Path:
+        return Path(shutil.copytree(HERE / name, tmp_path / name))
+
+    return make
+
+
+def rewrite(path: Path, change) -> None:
+    arrays = dict(np.load(path))
+    change(arrays)
+    np.savez(path, **arrays)
+
+
+def said(capsys) -> str:
+    return capsys.readouterr().out
+
+
+def test_one_wrong_number_fails(copy, capsys):
+    case = copy("14_collators")
+
+    def change(arrays):
+        arrays["mlm__input_ids"][1, 20] += 1
+
+    rewrite(case / "outputs.npz", change)
+    assert verify.main([str(case)]) == 1
+    assert "FAIL mlm__input_ids  1 of 128 differ" in said(capsys)
+
+
+def test_a_float_outside_its_tolerance_or_not_a_number_fails(copy, capsys):
+    case = copy("04_discrete_mlp")
+    allowed = json.loads((case / "case.json").read_text())["tolerance"]["logits__arm7"]["atol"]
+
+    def change(arrays):
+        arrays["logits__arm7"][0, 3, 1, 2, 0] += 3 * allowed + 1e-3
+        arrays["logits__push2"][0, 0, 0, 0, 0] = np.nan
+
+    rewrite(case / "outputs.npz", change)
+    assert verify.main([str(case)]) == 1
+    out = said(capsys)
+    assert "FAIL logits__arm7" in out and "FAIL logits__push2" in out
+
+
+def test_other_weights_fail(copy, capsys):
+    case = copy("04_discrete_mlp")
+    path = case / "model.safetensors"
+    tensors = {name: tensor.read() for name, tensor in read_safetensors(path).items()}
+    tensors["decoder.layers.1.temporal_attn.proj.bias"][5] += 0.1
+    write_safetensors(path, tensors)
+    assert verify.main([str(case)]) == 1
+    assert "FAIL logits__arm7" in said(capsys)
+
+
+def test_what_is_not_compared_fails(copy, capsys):
+    case = copy("14_collators")
+    rewrite(case / "outputs.npz", lambda arrays: arrays.update(mystery=np.zeros(3)))
+    assert verify.main([str(case)]) == 1
+    assert "FAIL not compared: mystery" in said(capsys)
+
+
+def test_unknown_and_unsupported_kinds_are_named(tmp_path, capsys):
+    for kind in ("tokenizer", "telepathy"):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / "case.json").write_text(json.dumps({"kind": kind}))
+    assert verify.main([str(tmp_path / "tokenizer")]) == 1
+    assert "not supported yet" in said(capsys)
+    assert verify.main([str(tmp_path / "tokenizer"), "--skip-unsupported"]) == 0
+    assert verify.main([str(tmp_path / "telepathy"), "--skip-unsupported"]) == 1
+    assert "FAIL unknown kind" in said(capsys)
+
+
+def test_a_broken_case_does_not_stop_the_others(copy, capsys):
+    broken = copy("04_discrete_mlp")
+    (broken / "model.safetensors").write_bytes(b"not a safetensors file")
+    assert verify.main([str(broken), str(HERE / "14_collators")]) == 1
+    assert "2 cases: 1 good, 1 failed" in said(capsys)
