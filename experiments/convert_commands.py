@@ -32,10 +32,8 @@ def to_official(run: Path, out: Path) -> None:
     for remark in write_official(loaded, out):
         console.print(f"note: {remark}", markup=False, soft_wrap=True)
     _describe(loaded)
-    wrote(
-        out,
-        then=f"load it with the official release, or check it: hma convert from-official {_quoted(out)} --out RUN",
-    )
+    then = f"load it with the official release, or read it again: hma convert from-official {_quoted(out)}"
+    wrote(out, then=f"{then} --out RUN")
 
 
 def to_safetensors(run: Path, out: Path) -> None:
@@ -46,10 +44,8 @@ def to_safetensors(run: Path, out: Path) -> None:
     loaded = load_run(run)
     write_neutral(loaded, out)
     _describe(loaded)
-    wrote(
-        out,
-        then=f"read {_quoted(out / 'model.json')}; back with hma convert from-safetensors {_quoted(out)} --out RUN",
-    )
+    back = f"hma convert from-safetensors {_quoted(out)} --out RUN"
+    wrote(out, then=f"{_quoted(out / 'model.json')} explains the weights; back with {back}")
 
 
 def from_safetensors(directory: Path, out: Path) -> None:

@@ -141,7 +141,7 @@ def official_config(run: Run) -> dict[str, Any]:
     source = run.provenance.get("official", {})
     original = source.get("config", {})
     model = _at_official_base(run.model)
-    fields = write_config(model, run.table, run.train.masking)
+    fields = write_config(run.model, run.table, run.train.masking)
     if original and source["table"] == stable_hash(run.table):
         same = read_model(original, CONFIG) == model and read_masking(original) == run.train.masking
         if same:

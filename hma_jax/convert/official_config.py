@@ -192,7 +192,7 @@ def read_table(
     names, chunks = full["action_domains"], full["d_actions"]
     require(
         len(names) == len(chunks) >= 1,
-        f"{where}: {len(names)} action_domains but {len(chunks)} d_actions; a model needs at least one of each",
+        f"{where}: {len(names)} action_domains but {len(chunks)} d_actions; there must be one for each",
     )
     entries = []
     for name, chunk in zip(names, chunks, strict=True):

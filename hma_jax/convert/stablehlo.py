@@ -48,7 +48,7 @@ class ProgramConfig:
         require(self.batch >= 1, f"batch must be at least 1, got {self.batch}")
         require(
             1 <= self.prompt < self.frames,
-            f"there must be more frames than prompt frames, and one of these: got {self.frames} and {self.prompt}",
+            f"frames must exceed prompt, and prompt be at least 1: got {self.frames} and {self.prompt}",
         )
         unknown = set(self.platforms) - set(PLATFORMS)
         require(

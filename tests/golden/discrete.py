@@ -224,16 +224,21 @@ def check_generation(case: Case) -> None:
         logits = np.stack([classes_first(first, grid) for first in firsts], axis=3)
         case.check_if_there(f"{run}_first_logits", logits)
         if steps == 1:  # nothing is drawn: the cached rollout must say the same
-            keys = jax.random.split(jax.random.key(0), len(tokens))
-            decode = DecodeConfig(unmask_steps=1, temperature=0.0)
-            robots = case.robot(robot, len(tokens))
-            new = jax.jit(
-                lambda p: rollout(
-                    case.declared.merge(p), tokens[:, :prompt], actions[:, None], robots, keys, decode
-                )
-            )(case.params)
-            whole = jnp.concatenate([tokens[:, :prompt], new[:, 0]], axis=1)
+            whole = rolled_out(case, tokens, prompt, actions)
             case.check(key, whole.reshape(len(whole), -1), via="rollout")
+
+
+def rolled_out(case: Case, tokens: jax.Array, prompt: int, actions: jax.Array) -> jax.Array:
+    """The window [B, T, S] as `rollout` continues its prompt, likeliest tokens at once."""
+    keys = jax.random.split(jax.random.key(0), len(tokens))
+    robots, decode = case.robot(case.domains[0], len(tokens)), DecodeConfig(unmask_steps=1)
+
+    @jax.jit
+    def run(params, start):
+        return rollout(case.declared.merge(params), start, actions[:, None], robots, keys, decode)[:, 0]
+
+    start = tokens[:, :prompt]
+    return jnp.concatenate([start, run(case.params, start)], axis=1)
 
 
 # --- Actions -----------------------------------------------------------------------------------

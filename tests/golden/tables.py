@@ -187,12 +187,23 @@ def _resize(case: Case, label: str, want: dict[str, Any]) -> None:
 
 # --- Initial parameters ------------------------------------------------------------------------
 
-OWN_INITIALISERS = {
+OWN_INITIALISERS: dict[str, tuple[str, ...]] = {
     "discrete": (),
-    "continuous": ("trunk/blocks/space", "trunk/blocks/time", "trunk/blocks/mlp", "embed/kernel", "frame_head/linear",
-                   "denoiser/into", "denoiser/blocks", "denoiser/modulation", "denoiser/out",
-                   "action_head/robots/condition", "action_head/robots/into", "action_head/robots/blocks"),
-}  # fmt: skip
+    "continuous": (
+        "trunk/blocks/space",
+        "trunk/blocks/time",
+        "trunk/blocks/mlp",
+        "embed/kernel",
+        "frame_head/linear",
+        "denoiser/into",
+        "denoiser/blocks",
+        "denoiser/modulation",
+        "denoiser/out",
+        "action_head/robots/condition",
+        "action_head/robots/into",
+        "action_head/robots/blocks",
+    ),
+}
 """DIFFERS: where our continuous variant is drawn otherwise than the release's, whose reset of all linear
 layers to N(0, 0.02) depends on the order of its constructors (`model.initial`, `model.heads`)."""
 

@@ -1,0 +1,179 @@
+"""Runs, framework-neutral safetensors and StableHLO programs."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, DecodeConfig, DiffusionConfig, SamplerConfig
+from hma_jax.convert import (
+    ProgramConfig,
+    read_neutral,
+    read_official,
+    write_neutral,
+    write_run,
+    write_stablehlo,
+)
+from hma_jax.convert.table import flat
+from hma_jax.convert.tensors import read_safetensors, write_safetensors
+from hma_jax.generation import rollout
+from hma_jax.training.train import Run, load_run, train_model
+from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
+from tests.tiny import TABLE, batches, lively_params, model_config, random_batch, train_config
+
+DIFFUSION = DiffusionConfig(channels=2, patch=2, width=8, depth=1)
+
+
+def small_run(**changes) -> Run:
+    config = model_config(frames=4, layers=1, **changes)
+    params = jax.tree.map(np.asarray, lively_params(config)[1])
+    return Run(config, train_config(steps=2), TABLE, params, 3, {"data": "random"})
+
+
+def same(a: Run, b: Run) -> None:
+    assert replace(a, params=None) == replace(b, params=None)
+    x, y = flat(a.params), flat(b.params)
+    assert x.keys() == y.keys()
+    assert all(np.asarray(x[name]).tobytes() == np.asarray(y[name]).tobytes() for name in x)
+
+
+@pytest.mark.parametrize("base", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_a_converted_checkpoint_is_a_run(base, tmp_path):
+    run = read_official(make_checkpoint(tmp_path / "a", base, [("arm", 7, 2), ("push", 2, 1)]))
+    write_run(run, tmp_path / "run")
+    same(load_run(tmp_path / "run"), run)
+
+
+def test_training_goes_on_from_a_converted_run(tmp_path):
+    run = replace(small_run(), step=0)
+    write_run(run, tmp_path / "run")
+    make = batches(run.model)
+    result = train_model(
+        run.model, run.table, run.train, make, run_dir=tmp_path / "run", provenance=run.provenance
+    )
+    assert result.resumed_from == 0 and len(result.losses) == 2
+    after = load_run(tmp_path / "run")
+    assert after.step == 2
+    moved = np.abs(after.params["embed"]["tables"] - run.params["embed"]["tables"]).max()
+    assert 0 < moved < 0.01
+
+
+@pytest.mark.parametrize("changes", [{}, {"diffusion": DIFFUSION}], ids=["discrete", "continuous"])
+def test_safetensors_bring_everything_back(changes, tmp_path):
+    run = small_run(**changes)
+    write_neutral(run, tmp_path / "out")
+    same(read_neutral(tmp_path / "out"), run)
+    described = json.loads((tmp_path / "out" / "model.json").read_text())["tensors"]
+    stored = read_safetensors(tmp_path / "out" / "model.safetensors")
+    assert {name: tuple(t["shape"]) for name, t in described.items()} == {
+        n: t.shape for n, t in stored.items()
+    }
+    assert described["stem/into/kernel"] == {"shape": [3, 14, 32], "axes": ["E", "U", "D"], "role": "input"}
+
+
+def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
+    write_neutral(small_run(), tmp_path / "out")
+    path, weights = tmp_path / "out" / "model.json", tmp_path / "out" / "model.safetensors"
+    good = json.loads(path.read_text())
+
+    def refused(message, **changes):
+        path.write_text(json.dumps(good | changes))
+        with pytest.raises(ConfigError, match=message):
+            read_neutral(tmp_path / "out")
+
+    refused("version 2, this program reads 1", version=2)
+    refused("not a description of this project", format="other")
+    refused("model.width", model=good["model"] | {"width": "wide"})
+    refused("embed/tables", model=good["model"] | {"factor_vocab": 16})
+    refused(
+        "embed/mask",
+        tensors=good["tensors"] | {"embed/mask": {"shape": [32], "axes": ["H"], "role": "vector"}},
+    )
+    path.write_text(json.dumps(good))
+    tensors = {name: tensor.read() for name, tensor in read_safetensors(weights).items()}
+    write_safetensors(
+        weights,
+        {name: x for name, x in tensors.items() if name != "positions"} | {"other": tensors["positions"]},
+    )
+    with pytest.raises(ConfigError, match=r"1 missing: positions(.|\n)*1 not expected: other"):
+        read_neutral(tmp_path / "out")
+
+
+SCRIPT = """
+import json, sys
+import numpy as np
+import jax
+from jax import export
+from safetensors.numpy import load_file
+
+folder = sys.argv[1]
+about = json.load(open(f"{folder}/model.json"))
+program = export.deserialize(bytearray(open(f"{folder}/model.stablehlo", "rb").read()))
+weights = load_file(f"{folder}/model.safetensors")
+given = np.load(f"{folder}/inputs.npz")
+names = [one["name"] for one in about["inputs"]]
+assert names == [f"weights/{name}" for name in sorted(weights)] + ["prompt", "actions", "embodiment", "key"]
+for one in about["inputs"][-4:]:
+    assert list(given[one["name"]].shape) == one["shape"] and given[one["name"]].dtype == one["dtype"], one
+out = program.call(weights, *(given[name] for name in names[-4:]))
+assert list(out.shape) == about["outputs"][0]["shape"] and out.dtype == about["outputs"][0]["dtype"]
+np.save(f"{folder}/frames.npy", out)
+assert not [name for name in sys.modules if name.split(".")[0] in ("hma_jax", "experiments", "flax")]
+"""
+
+
+@pytest.mark.parametrize(
+    "changes, decode",
+    [
+        ({}, DecodeConfig(2, 1.0)),
+        ({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3))),
+    ],
+    ids=["discrete", "continuous"],
+)
+def test_the_program_generates_the_same_frames_where_this_project_is_not_installed(changes, decode, tmp_path):
+    run, config = small_run(**changes), ProgramConfig(batch=2, prompt=2, frames=4, decode=decode)
+    out = tmp_path / "out"
+    write_stablehlo(run, out, config)
+    batch = random_batch(0, run.model, 2)
+    frames = batch["tokens"]
+    if run.model.diffusion:
+        frames = np.random.default_rng(0).standard_normal((*frames.shape, 8)).astype(np.float32)
+    key = np.array([7, 11], np.uint32)
+    given = {
+        "prompt": frames[:, :2],
+        "actions": batch["actions"],
+        "embodiment": batch["embodiment"],
+        "key": key,
+    }
+    np.savez(out / "inputs.npz", **given)
+    done = subprocess.run(
+        [sys.executable, "-I", "-c", SCRIPT, str(out)], capture_output=True, text=True, cwd="/"
+    )
+    assert done.returncode == 0, done.stderr
+
+    declared = lively_params(run.model)[0]
+    keys = jnp.stack([jax.random.fold_in(jax.random.wrap_key_data(key), row) for row in range(2)])
+    args = (given["prompt"], batch["actions"][:, None], batch["embodiment"], keys, decode)
+    want = jax.jit(lambda p: rollout(declared.merge(p), *args))(run.params)[:, 0]
+    got = np.load(out / "frames.npy")
+    if run.model.diffusion:
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4)
+    else:
+        np.testing.assert_array_equal(got, want)
+
+
+def test_a_program_that_cannot_be_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="9 frames do not fit the model's window of 4"):
+        write_stablehlo(small_run(), tmp_path / "out", ProgramConfig(frames=9))
+    with pytest.raises(ConfigError, match="frames must exceed prompt"):
+        ProgramConfig(prompt=3, frames=3)
+    with pytest.raises(ConfigError, match="choose some of cpu, cuda"):
+        ProgramConfig(platforms=("abacus",))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,216 @@
+"""Official checkpoints: what goes through us comes back as it was, and what does not fit is named."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import ml_dtypes
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError
+from hma_jax.convert import official_shapes, read_official, write_official
+from hma_jax.convert.table import flat, official_parts
+from hma_jax.convert.tensors import read_safetensors
+from hma_jax.model import declare_model
+from hma_jax.training.train import Run
+from tests.hma_jax.convert.fakes import (
+    CONTINUOUS,
+    DISCRETE,
+    make_checkpoint,
+    official_config,
+    random_tensors,
+    write_checkpoint,
+)
+from tests.tiny import TABLE, lively_params, model_config, random_batch, train_config
+
+ONE = [("push", 2, 1)]
+TWO = [("1x_humanoid", 7, 2), ("push", 2, 1)]
+FORTY = [(f"robot_{n}", n % 9 + 1, n % 5 + 1) for n in range(40)]
+
+
+def same_files(a: Path, b: Path) -> None:
+    before, after = (read_safetensors(x / "model.safetensors") for x in (a, b))
+    assert before.keys() == after.keys()
+    for name, tensor in before.items():
+        assert (tensor.shape, tensor.dtype) == (after[name].shape, after[name].dtype), name
+        assert tensor.read().tobytes() == after[name].read().tobytes(), name
+    contents = [json.loads((x / "config.json").read_text()) for x in (a, b)]
+    assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("robots", [ONE, TWO, FORTY], ids=["1", "2", "40"])
+@pytest.mark.parametrize("base", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_there_and_back_is_byte_identical(base, robots, tmp_path):
+    start = make_checkpoint(tmp_path / "a", base, robots)
+    run = read_official(start)
+    assert run.table.names == tuple(name for name, _, _ in robots)
+    assert [(e.action_dim, e.stride) for e in run.table.entries] == [
+        (dim, stride) for _, dim, stride in robots
+    ]
+    assert write_official(run, tmp_path / "b") == []
+    same_files(start, tmp_path / "b")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"action_network": "mlp"},
+        {"action_network": "modulate", "qkv_bias": True},
+        {"action_network": "concat", "proj_bias": False, "mlp_bias": False},
+        {"action_network": "cross_attention", "qk_norm": True},
+        {"use_mup": False, "image_vocab_size": 512, "num_factored_vocabs": 3, "factored_vocab_size": 999},
+    ],
+    ids=str,
+)
+def test_every_switch_of_the_release_goes_there_and_back(changes, tmp_path):
+    start = make_checkpoint(tmp_path / "a", DISCRETE, TWO, **changes)
+    write_official(read_official(start), tmp_path / "b")
+    same_files(start, tmp_path / "b")
+
+
+def test_half_precision_comes_back_as_it_was(tmp_path):
+    config = official_config(DISCRETE, ONE)
+    tensors = random_tensors(config, ONE)
+    tensors["out_x_proj.weight"] = tensors["out_x_proj.weight"].astype(np.float16)
+    tensors["pos_embed_TSC"] = tensors["pos_embed_TSC"].astype(ml_dtypes.bfloat16)
+    start = write_checkpoint(tmp_path / "a", config, tensors)
+    run = read_official(start)
+    assert {x.dtype for x in flat(run.params).values()} == {np.dtype(np.float32)}
+    write_official(run, tmp_path / "b")
+    same_files(start, tmp_path / "b")
+
+
+def test_a_trained_run_keeps_fields_we_have_no_use_for_and_says_what_changed(tmp_path):
+    start = make_checkpoint(tmp_path / "a", DISCRETE, ONE)
+    run = read_official(start)
+    trained = replace(run, train=replace(run.train, masking=replace(run.train.masking, non_mlm_ratio=0.5)))
+    write_official(trained, tmp_path / "b")
+    before, after = (json.loads((tmp_path / x / "config.json").read_text()) for x in "ab")
+    assert after == before | {"non_mlm_ratio": 0.5, "factored_vocab_size": 8}
+
+
+def test_a_model_that_never_was_official_becomes_one_that_computes_the_same(tmp_path):
+    """Another muP base width, no action heads: read-outs are rescaled, heads are zero."""
+    config = model_config(action_heads=False, frames=3)
+    declared, params = lively_params(config)
+    remarks = write_official(Run(config, train_config(), TABLE, params, 7, {}), tmp_path / "a")
+    assert any("0.125" in remark for remark in remarks) and any("zeros" in remark for remark in remarks)
+    back = read_official(tmp_path / "a")
+    assert back.table.names == TABLE.names and back.model.mup.base_width == 256
+    np.testing.assert_array_equal(back.table.statistics(), TABLE.statistics())
+    batch = random_batch(0, config, 2)
+
+    def logits(declared, params):
+        def apply(p):
+            return declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).frames
+
+        return jax.jit(apply)(params)
+
+    theirs = logits(declare_model(back.model, back.table), back.params)
+    np.testing.assert_allclose(logits(declared, params), theirs, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action_alignment": "causal"}, "action_alignment"),
+        ({"mup": replace(model_config().mup, attention_scale=4.0)}, "attention_scale 4"),
+        ({"mup": replace(model_config().mup, without=("attention",))}, "without"),
+    ],
+)
+def test_what_the_release_cannot_compute_is_refused_by_name(changes, message, tmp_path):
+    config = model_config(**changes)
+    run = Run(config, train_config(), TABLE, declare_model(config, TABLE).init(0), 0, {})
+    with pytest.raises(ConfigError, match=message):
+        write_official(run, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("base", [DISCRETE, CONTINUOUS], ids=["discrete", "continuous"])
+def test_missing_extra_and_misshapen_tensors_are_all_named(base, tmp_path):
+    config = official_config(base, TWO)
+    tensors = random_tensors(config, TWO)
+    del tensors["decoder.layers.1.mlp.fc1.weight"]
+    tensors["surprise.weight"] = np.zeros((2, 2), np.float32)
+    tensors["action_mlp.push.model.0.weight"] = np.zeros((16, 5), np.float32)
+    with pytest.raises(ConfigError) as caught:
+        read_official(write_checkpoint(tmp_path / "a", config, tensors))
+    said = str(caught.value)
+    assert "1 missing: decoder.layers.1.mlp.fc1.weight (64, 16)" in said
+    assert "1 not expected: surprise.weight (2, 2)" in said
+    assert "action_mlp.push.model.0.weight: expected (16, 2), found (16, 5)" in said
+
+
+def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
+    config = official_config(DISCRETE, ONE)
+    tensors = {name: x for name, x in random_tensors(config, ONE).items() if not name.startswith("decoder")}
+    with pytest.raises(ConfigError) as caught:
+        read_official(write_checkpoint(tmp_path / "a", config, tensors))
+    assert str(caught.value).count("decoder.layers") == 10 and "40 missing" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action_network": "resampler_concat"}, "action_network 'resampler_concat' is not supported.*mlp"),
+        ({"d_model": None}, "missing field.*d_model"),
+        ({"num_heads": 3}, "multiple of model.heads"),
+        ({"image_vocab_size": 65}, "65 is no product of 2 equal factors"),
+        ({"T": "three"}, "frames: expected int, got 'three'"),
+        ({"d_actions": [3]}, "1 action_domains but|d_actions 3 of push is no multiple of its 2"),
+        ({"action_domains": None}, "missing field.*action_domains"),
+    ],
+)
+def test_a_configuration_that_cannot_work_is_refused_by_name(changes, message, tmp_path):
+    config = official_config(DISCRETE, ONE)
+    folder = write_checkpoint(tmp_path / "a", config | changes, random_tensors(config, ONE))
+    with pytest.raises(ConfigError, match=message):
+        read_official(folder)
+
+
+def test_the_variant_is_told_by_configuration_and_tensors_alike(tmp_path):
+    config = official_config(DISCRETE, ONE)
+    other = random_tensors(official_config(CONTINUOUS, ONE), ONE)
+    with pytest.raises(ConfigError, match="config.json describes the discrete variant"):
+        read_official(write_checkpoint(tmp_path / "a", config, other))
+
+
+def test_what_is_no_checkpoint_is_said_so(tmp_path):
+    with pytest.raises(ConfigError, match=r"no .*config.json"):
+        read_official(tmp_path)
+    (tmp_path / "config.json").write_text("{not json")
+    with pytest.raises(ConfigError, match="is not JSON"):
+        read_official(tmp_path)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ConfigError, match="neither model.safetensors"):
+        read_official(tmp_path)
+    (tmp_path / "model.safetensors").write_bytes(b"\0" * 100)
+    with pytest.raises(ConfigError, match="no readable safetensors"):
+        read_official(tmp_path)
+
+
+def test_what_exists_is_not_overwritten_and_a_failure_leaves_nothing(tmp_path, monkeypatch):
+    run = read_official(make_checkpoint(tmp_path / "a", DISCRETE, ONE))
+    with pytest.raises(ConfigError, match="exists already"):
+        write_official(run, tmp_path / "a")
+
+    def break_down(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr("hma_jax.convert.official.write_safetensors", break_down)
+    with pytest.raises(OSError):
+        write_official(run, tmp_path / "b")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_the_table_covers_every_parameter_of_every_model_once():
+    for changes in ({}, {"conditioning": "cross_attention", "qk_norm": True}, {"conditioning": "add"}):
+        config = model_config(qkv_bias=True, **changes)
+        leaves = declare_model(config, TABLE).leaves()
+        parts = [part for own in official_parts(config, TABLE, leaves).values() for part in own]
+        assert len({part.name for part in parts}) == len(parts)
+        assert len(official_shapes(config, TABLE)) == len(parts) + 2 * TABLE.size
