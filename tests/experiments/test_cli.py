@@ -16,7 +16,8 @@ from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
 COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "tokenizer", "tokenizer train", "tokenize",
-            "train", "evaluate", "report")  # fmt: skip
+            "train", "evaluate", "report", "convert", "convert from-official", "convert to-official",
+            "convert to-safetensors", "convert from-safetensors", "convert to-stablehlo")  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -44,6 +45,11 @@ def test_help_needs_no_jax():
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
         (["report", "--out", "{empty}"], 2, "no study"),
         (["evaluate", "{empty}", "--preset", "smoke"], 2, "checkpoint"),
+        (["convert", "from-official", "{empty}", "--out", "{empty}/run"], 2, "{empty}/config.json"),
+        (["convert", "to-official", "{empty}", "--out", "{empty}/x"], 2, "{empty}/checkpoints"),
+        (["convert", "from-safetensors", "{empty}", "--out", "{empty}/x"], 2, "{empty}/model.json"),
+        (["convert", "to-safetensors", "{empty}", "--out", "{file}"], 2, "{file} exists already"),
+        (["convert", "to-stablehlo", "{empty}", "--out", "{empty}/x", "--prompt", "9"], 2, "exceed prompt"),
     ],
 )
 def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp_path, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -69,7 +70,8 @@ def _check_process(case: Case, label: str, process: Process, want: dict[str, Any
 
 
 def _diffusion(case: Case, label: str, want: dict[str, Any]) -> None:
-    _check_process(case, label, make_process(1000), want)
+    steps = 1000 if "index" in want else len(want["betas"])  # copies may be thinned
+    _check_process(case, label, make_process(steps), want)
 
 
 def _respaced(case: Case, label: str, want: dict[str, Any]) -> None:
@@ -214,14 +216,28 @@ def _initialisation(case: Case, label: str, want: dict[str, Any]) -> None:
 
 
 def _check_initial(case: Case, label: str, variant: str, want: dict[str, dict[str, Any]]) -> None:
+    shape = {name: one["shape"] for name, one in want.items()}
     first = next(name for name in want if name.endswith("model.0.weight"))
-    robot, chunk = first.split(".")[1], want[first]["shape"][1]
-    _, frames, _, width = want["pos_embed_TSC"]["shape"]
-    settings: dict[str, Any] = {"width": width, "frames": frames, "layers": 1}
+    robot, chunk = first.split(".")[1], shape[first][1]
+    _, frames, slots, width = shape["pos_embed_TSC"]
+    layers = sum(name.endswith("norm1.weight") for name in want)
+    settings: dict[str, Any] = {"width": width, "frames": frames, "layers": layers, "heads": 1}
     if variant == "continuous":
-        out = want["diffloss.net.final_layer.linear.weight"]["shape"]
-        settings |= {"diffusion": DiffusionConfig(width=out[1]), "qkv_bias": True, "mlp_bias": False}
-    model = ModelConfig(**settings)
+        channels = shape["mask_token"][-1]
+        diffusion = DiffusionConfig(
+            channels=channels,
+            patch=math.isqrt(shape["token_embed.weight"][1] // channels),
+            width=shape["diffloss.net.cond_embed.weight"][0],
+            depth=sum(name.startswith("diffloss") and name.endswith("in_ln.weight") for name in want),
+        )
+        tokens = shape["diffusion_pos_embed_learned"][1] // frames
+        settings |= {"diffusion": diffusion, "qkv_bias": True, "mlp_bias": False}
+        cells = tokens * diffusion.cells
+    else:
+        tables = [one for name, one in shape.items() if "factored_embeds" in name]
+        settings |= {"factors": len(tables), "factor_vocab": tables[0][0]}
+        cells = tokens = 256  # of what the trainer builds
+    model = ModelConfig(**settings, tokens=tokens, action_tokens=slots - cells)
     table = EmbodimentTable((Embodiment(robot, chunk, 1, (0.0,) * chunk, (1.0,) * chunk),))
     declared = declare_model(model, table)
     parts = official_parts(model, table, declared.leaves())

@@ -12,7 +12,6 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hma_jax.config import require
 from tests.golden import continuous, data, discrete, tables
 from tests.golden.case import Case
 
@@ -54,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("  not supported yet")
             skipped += 1
         elif kind not in KINDS:
-            print(f"  FAIL unknown kind; known are {', '.join((*KINDS, *NOT_YET))}")
+            print(f"  FAIL unknown; known kinds are {', '.join((*KINDS, *NOT_YET))}")
             failed += 1
         else:
             failed += not verify(case, kind)
@@ -82,8 +81,9 @@ def verify(case: Case, kind: str) -> bool:
 
 
 def kind_of(case: Case) -> str:
-    """As the case says, or by the file that only one kind has. Raises ConfigError if there is no folder."""
-    require(case.folder.is_dir(), f"{case.folder} is no folder")
+    """As the case says, or by the file that only one kind has."""
+    if not case.folder.is_dir():
+        return "no folder"
     if "kind" in case.info:
         return case.info["kind"]
     if {"discrete", "continuous"} <= case.settings.keys():
