@@ -287,7 +287,8 @@ def read_actions(
         shape = (*out.actions.shape[:2], model.table.action_width)
         # In training padding and dead dimensions are 0 also when noised.
         alive_BTU = jnp.asarray(model.table.alive())[embodiment_B][:, None]
-        network = lambda x, t: model.action_head(jnp.where(alive_BTU, x, 0), t, out.actions, embodiment_B)  # noqa: E731
+        head = model.action_head
+        network = lambda x, t: head(jnp.where(alive_BTU, x, 0), t, out.actions, embodiment_B)  # noqa: E731
         normalised = sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)
     else:
         normalised = model.action_head(out.actions, embodiment_B)

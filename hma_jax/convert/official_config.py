@@ -128,7 +128,17 @@ def _complete(config: Mapping[str, Any], where: str) -> dict[str, Any]:
     """With the release's defaults for absent fields. Raises ConfigError for those it has none for."""
     missing = [name for name in REQUIRED if config.get(name) is None]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
-    return {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
+    full = {**(CONTINUOUS_DEFAULTS if is_continuous(config) else DISCRETE_DEFAULTS), **config}
+    for name in ("S", "d_model", *(["patch_size"] if is_continuous(config) else [])):
+        require(_is_count(full[name]), f"{where}: {name} must be a positive integer, got {full[name]!r}")
+    for name, good in (("action_domains", lambda x: isinstance(x, str)), ("d_actions", _is_count)):
+        listed = isinstance(full[name], list) and all(map(good, full[name]))
+        require(listed, f"{where}: {name} must list one value per robot, got {full[name]!r}")
+    return full
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and value >= 1
 
 
 def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
@@ -159,7 +169,7 @@ def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
 
 def _root(vocab: int | None, factors: int, where: str) -> int:
     require(
-        isinstance(vocab, int) and isinstance(factors, int) and factors >= 1,
+        _is_count(vocab) and _is_count(factors),
         f"{where}: image_vocab_size {vocab!r} and num_factored_vocabs {factors!r} must be numbers",
     )
     root = round(vocab ** (1 / factors))

@@ -209,10 +209,9 @@ def from_official(
 
 def to_official(params: Params, parts: Mapping[str, list[Part]]) -> dict[str, np.ndarray]:
     """Official name -> array from our parameters, or from anything shaped like them (gradients)."""
-    arrays = flat(params)
-    return {
-        part.name: part.to_official(np.asarray(arrays[path])) for path, own in parts.items() for part in own
-    }
+    # Each parameter is fetched once: it may lie on an accelerator.
+    arrays = {path: np.asarray(x) for path, x in flat(params).items() if path in parts}
+    return {part.name: part.to_official(arrays[path]) for path, own in parts.items() for part in own}
 
 
 def check_names(

@@ -21,7 +21,7 @@ CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exis
 def keep_small_programs():
     """Comparisons are many small programs, which together are worth keeping compiled."""
     name = "jax_persistent_cache_min_compile_time_secs"
-    before = jax.config.read(name)
+    before = getattr(jax.config, name)
     jax.config.update(name, 0.0)
     yield
     jax.config.update(name, before)

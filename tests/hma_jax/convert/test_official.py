@@ -163,6 +163,8 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"T": "three"}, "frames: expected int, got 'three'"),
         ({"d_actions": [3]}, "1 action_domains but|d_actions 3 of push is no multiple of its 2"),
         ({"action_domains": None}, "missing field.*action_domains"),
+        ({"d_actions": ["2"]}, "d_actions must list one value per robot"),
+        ({"S": None}, "S must be a positive integer, got None"),
     ],
 )
 def test_a_configuration_that_cannot_work_is_refused_by_name(changes, message, tmp_path):
