@@ -1,4 +1,4 @@
-"""Shared by all tests: a persistent compilation cache, so that re-runs start fast."""
+"""Shared by all tests: a persistent compilation cache, so that re-runs start fast, and fast compilation."""
 
 from __future__ import annotations
 
@@ -12,4 +12,6 @@ CACHE = Path(__file__).parent.parent / ".jax_cache"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Tiny programs run once or twice: compiling them well costs more than it saves.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 keep_freed_memory()

@@ -120,8 +120,11 @@ def test_top_1_is_greedy():
     np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("alignment", ["released", "causal"])
-@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["discrete", "continuous"])
+@pytest.mark.parametrize(
+    "alignment, diffusion",
+    [("causal", None), pytest.param("released", DIFFUSION, marks=pytest.mark.slow)],
+    ids=["causal-discrete", "released-continuous"],
+)
 def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(alignment: str, diffusion):
     """The cached loop against whole-window calls of `predict_actions` and `rollout_naive`."""
     config = model_config(action_alignment=alignment, frames=5, diffusion=diffusion)
