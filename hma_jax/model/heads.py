@@ -41,8 +41,9 @@ class Denoiser(nnx.Module):
     """A residual MLP modulated by time and condition: noise and a variance fraction (section 2.4).
 
     Its width does not follow the trunk's: only the condition's input scales under muP, as a
-    read-out's. DIFFERS: modulation and last layer start at zero in every head; the release draws
-    them from N(0, 0.02) in the frames' head only, by the order of its constructors.
+    read-out's. DIFFERS: in every head modulation and last layer start at zero, time and condition
+    at N(0, 0.02), the rest at Xavier. The release draws all of the frames' head from N(0, 0.02), by
+    the order of its constructors, and the actions' with a Xavier gain of 0.1.
     """
 
     def __init__(self, config: ModelConfig, channels: int, axis: str = "C"):
