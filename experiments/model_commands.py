@@ -19,6 +19,12 @@ if TYPE_CHECKING:
     from hma_jax.training.train import Run
 
 
+SHOWN = (
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain"
+)  # fmt: skip
+"""Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all."""
+
+
 def train(setting: Setting, run: Path | None, mesh: MeshConfig) -> None:
     """Trains the study's reference trial by itself."""
     _prepare(setting)
@@ -97,8 +103,7 @@ def evaluate(setting: Setting, run: Path) -> None:
             trained.train.masking.setting,
             progress=lambda phase, done, total: update(done, total, phase),
         )
-    wanted = ("perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain")
-    metrics = [m for m in wanted if m in evaluation.overall]
+    metrics = [m for m in SHOWN if m in evaluation.overall]
     table = tidy_table(f"{short(run)}, step {trained.step:,}", "dataset", *metrics)
     for name, stats in [*evaluation.datasets.items(), ("overall", evaluation.overall)]:
         table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))

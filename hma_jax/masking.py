@@ -12,8 +12,8 @@ frames' tokens are masked and which actions are hidden:
     inverse   none            all                       hidden actions; attention is not causal
 
 With causal alignment no frame is shown the chunk that follows it, so that all of them can be
-predicted, not only the hidden ones. A robot without recorded actions has all of them hidden and none predicted; one whose video is
-no target has no token masked. Each trains what it can.
+predicted, not only the hidden ones. A robot without recorded actions has all of them hidden and
+none predicted; one whose video is no target has no token masked. Each trains what it can.
 """
 
 from __future__ import annotations

@@ -116,10 +116,10 @@ class CrossAttention(nnx.Module):
         """[B, ..., D] -> normalised [B, ..., H, I]."""
         x = normalise(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
         gain, offset = (
-            jnp.take(v.get_value(), embodiment_B, 0).astype(x.dtype).reshape(-1, *(1,) * (x.ndim - 2), x.shape[-1])
-            for v in (self.gain, self.bias)
+            jnp.take(v.get_value(), embodiment_B, 0).astype(x.dtype) for v in (self.gain, self.bias)
         )
-        return x * gain + offset
+        shape = (-1, *(1,) * (x.ndim - 2), x.shape[-1])
+        return x * gain.reshape(shape) + offset.reshape(shape)
 
 
 def _where_shown(action: ActionFeature, y: jax.Array) -> jax.Array:

@@ -93,7 +93,9 @@ class ActionDenoiser(nnx.Module):
     def __init__(self, config: ModelConfig, table: EmbodimentTable):
         self.robots = stack(lambda: Denoiser(config, table.action_width, "U"), table.size, axis="E")
 
-    def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+    def __call__(
+        self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, embodiment_B: jax.Array
+    ) -> jax.Array:
         """Normalised, noised chunks -> [B, T, 2 U], noise first."""
         graphdef, params = nnx.split(self.robots)
         own = jax.tree.map(lambda p: jnp.take(p, embodiment_B, axis=0), params)

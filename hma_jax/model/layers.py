@@ -70,8 +70,9 @@ class EmbodimentLinear(nnx.Module):
 
     def __call__(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
+        y = per_example(x, self.kernel, embodiment_B)
         offset = jnp.take(self.bias.get_value(), embodiment_B, axis=0).astype(x.dtype)
-        return per_example(x, self.kernel, embodiment_B) + offset.reshape(-1, *(1,) * (x.ndim - 2), offset.shape[-1])
+        return y + offset.reshape(-1, *(1,) * (x.ndim - 2), y.shape[-1])
 
 
 def per_example(x: jax.Array, kernel: nnx.Param, embodiment_B: jax.Array) -> jax.Array:

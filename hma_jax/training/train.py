@@ -52,8 +52,8 @@ def train_model(
     """Trains to `config.steps`, resuming what is in `run_dir`.
 
     `make_batches(start)` yields this process's rows of the global batches from step `start`
-    on. A new run starts from `initial` parameters, or from a draw. `provenance` says what data the batches come from; resuming on other data is refused.
-    Raises ConfigError, CheckpointError, DivergedError, Interrupted.
+    on. A new run starts from `initial` parameters, or from a draw. `provenance` says what data
+    the batches come from; resuming on other data is refused. Raises ConfigError, CheckpointError, DivergedError, Interrupted.
     """
     declared = declare_model(model, table)
     device_mesh = make_mesh(mesh)
