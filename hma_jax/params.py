@@ -101,7 +101,7 @@ def normal(std: float) -> Initializer:
     return lambda rng, shape: np.float32(std) * rng.standard_normal(shape, np.float32)
 
 
-def xavier_uniform(fan_in: int, fan_out: int, gain: float = 1.0) -> Initializer:
+def xavier_uniform(fan_in: float, fan_out: float, gain: float = 1.0) -> Initializer:
     """Uniform in +-gain * sqrt(6 / (fan_in + fan_out)).
 
     Fans are given, not read off the shape: a fused, stacked or per-embodiment array has more

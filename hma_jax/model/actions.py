@@ -14,8 +14,9 @@ from flax import nnx
 
 from hma_jax.config import ModelConfig
 from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.initial import hidden_init, input_fan_out
 from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear, normalise
-from hma_jax.params import bias, ones, param, uniform, xavier_uniform
+from hma_jax.params import bias, ones, param, uniform
 
 
 class Stem(nnx.Module):
@@ -30,14 +31,15 @@ class Stem(nnx.Module):
             # stay so, because padded inputs are zero.
             chunk_E = np.array([entry.chunk for entry in table.entries])[:, None, None]
             own = np.arange(shape[1])[:, None] < chunk_E
-            return uniform(rng, shape, np.where(own, config.stem_gain * np.sqrt(6 / (chunk_E + width)), 0.0))
+            bound = config.stem_gain * np.sqrt(6 / (chunk_E + input_fan_out(config)))
+            return uniform(rng, shape, np.where(own, bound, 0.0))
 
         self.into = EmbodimentLinear(
             size, (table.action_width, width), ("U", "D"), init=first_layer, role="input"
         )
         self.gain = param((size, width), ("E", "D"), ones, role="vector")
         self.bias = bias((size, width), ("E", "D"))
-        init = xavier_uniform(width, width, config.stem_gain)
+        init = hidden_init(config, width, width, config.stem_gain)
         self.out = EmbodimentLinear(size, (width, width), ("D", "D_out"), init=init, role="hidden")
 
     def __call__(self, actions_BTU: jax.Array, embodiment_B: jax.Array, dtype: jnp.dtype) -> jax.Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import DiffusionConfig, ModelConfig
-from hma_jax.model.initial import readout_init, trunk_init
+from hma_jax.model.initial import input_fan_out, readout_init, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
 from hma_jax.params import normal, param, used, xavier_uniform, zeros
 
@@ -78,7 +78,7 @@ class LatentEmbed(nnx.Module):
     def __init__(self, config: ModelConfig):
         self.diffusion = config.diffusion
         c, d = config.diffusion.token_channels, config.width
-        self.kernel = param((c, d), ("C", "D"), xavier_uniform(c, d), role="input")
+        self.kernel = param((c, d), ("C", "D"), xavier_uniform(c, input_fan_out(config)), role="input")
         self.mask = param((config.diffusion.channels,), (None,), zeros, role="vector")
 
     def __call__(self, tokens: jax.Array, masked: jax.Array | None, dtype: jnp.dtype) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Initialisers that depend on the configuration: what muP says of the trunk and of read-outs."""
+"""Initialisers that depend on the configuration: what muP says of each role."""
 
 from __future__ import annotations
 
@@ -8,16 +8,34 @@ from hma_jax.params import Initializer, xavier_uniform
 READOUT_GAIN = 0.01
 
 
-def trunk_init(config: ModelConfig, fan_in: int, fan_out: int) -> Initializer:
-    """Xavier, whose variance falls with the width of either side, as muP wants of hidden matrices.
-
-    DIFFERS: the release's continuous variant draws them from N(0, 0.02) at every width, which is
-    `trunk_gain` 0.32 at width 256.
-    """
+def hidden_init(config: ModelConfig, fan_in: int, fan_out: int, gain: float) -> Initializer:
+    """Xavier, whose variance falls with the width of either side, as muP wants of hidden matrices."""
     missing = config.width_multiplier / config.mup_multiplier("init")
-    return xavier_uniform(fan_in, fan_out, config.trunk_gain * missing**0.5)
+    return xavier_uniform(fan_in, fan_out, gain * missing**0.5)
+
+
+def trunk_init(config: ModelConfig, fan_in: int, fan_out: int) -> Initializer:
+    """A hidden matrix of the trunk.
+
+    DIFFERS: the release's continuous variant draws them from N(0, 0.02) at every width, which for
+    square matrices of width 256 is `trunk_gain` 0.32.
+    """
+    return hidden_init(config, fan_in, fan_out, config.trunk_gain)
+
+
+def input_fan_out(config: ModelConfig) -> float:
+    """The width that Xavier counts as fan-out of matrices from a fixed size.
+
+    DIFFERS: always the base width, so that what they hold stays as large as biases and embeddings,
+    which learn at the same rate. The release counts the true one: features shrink as 1 / sqrt(D).
+    """
+    return config.width / config.mup_multiplier("init")
 
 
 def readout_init(config: ModelConfig, fan_out: int) -> Initializer:
-    """Xavier times sqrt(m): a read-out's input is divided by m instead."""
-    return xavier_uniform(config.width, fan_out, READOUT_GAIN * config.mup_multiplier("readout") ** 0.5)
+    """Xavier of the base width at every width: a read-out's input is divided by m instead.
+
+    DIFFERS: the release multiplies Xavier of the true width by sqrt(m), which is the same only where
+    the width is far above `fan_out`.
+    """
+    return xavier_uniform(config.width / config.mup_multiplier("readout"), fan_out, READOUT_GAIN)
