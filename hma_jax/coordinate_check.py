@@ -1,0 +1,196 @@
+"""Whether activations keep their size as the model widens: the coordinate check of muP.
+
+Models of several widths take the same few training steps on one fixed batch. Before every step
+the sizes (root mean square) of what flows through them are noted. Under muP no size grows with
+width, and no change that training makes grows or fades (Tensor Programs V, appendix D.1). It
+takes a large learning rate: a small one hides what is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+
+from hma_jax.config import ModelConfig, TrainConfig, require
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.masking import Masked, mask_batch
+from hma_jax.model import HMA, declare_model
+from hma_jax.objectives import draw_noise
+from hma_jax.training.state import TrainState
+from hma_jax.training.step import Batch, init_state, make_train_step
+
+
+class Size(NamedTuple):
+    """How large `quantity` is after `step` training steps, and how large its change since step 0."""
+
+    quantity: str
+    width: int
+    seed: int
+    step: int
+    size: float
+    change: float
+
+
+class Slope(NamedTuple):
+    """The power of the width with which a quantity, and its change since step 0, grow."""
+
+    size: float
+    change: float
+
+
+# --- Measuring -------------------------------------------------------------------------------
+
+
+class _WatchedTrunk:
+    """Stands in for a trunk: runs its blocks one by one, not in a scan, and notes what they do."""
+
+    def __init__(self, model: HMA, note: Callable[[str, jax.Array], None]):
+        self.blocks, self.layers, self.note = model.trunk.blocks, model.config.layers, note
+
+    def __call__(self, x: jax.Array, *rest: Any) -> tuple[jax.Array, None]:
+        block_def, layers = nnx.split(self.blocks)
+        logits = []
+        for index in range(self.layers):
+            block = nnx.merge(block_def, jax.tree.map(lambda p, i=index: p[i], layers))
+            for attention, pairs in ((block.space, "btphi,btshi->bthps"), (block.time, "btphi,bsphi->bphts")):
+                _watch(attention, "project", lambda qkv, p=pairs: logits.append(jnp.einsum(p, *qkv[:2])))
+            x, _ = block(x, *rest[:3], None)
+        self.note("attention logits", jnp.concatenate([y.ravel() for y in logits]))
+        self.note("residual stream", x)
+        return x, None
+
+
+def _watch(module: Any, name: str, note: Callable[[Any], None]) -> None:
+    """From now on `note` is given whatever this module's `name` returns."""
+    inner = getattr(module, name)
+
+    def watched(*args: Any) -> Any:
+        result = inner(*args)
+        note(result)
+        return result
+
+    setattr(module, name, watched)
+
+
+def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
+    """Activations of one pass over a batch masked as in training, by name.
+
+    "attention logits" (all of them, also to what is not visible), "residual stream" after the last
+    block, "logits" or "conditions" of the frames, then "denoiser condition" and "denoiser" (fixed
+    noise and times) in the continuous variant, and "actions" where there is an action head.
+    """
+    seen: dict[str, jax.Array] = {}
+    note = seen.__setitem__
+    model.trunk = _WatchedTrunk(model, note)
+    hidden = model.align_hidden(masked.hidden_T)
+    embodiment_B = batch["embodiment"]
+    out = model(
+        masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden
+    )
+    diffusion = model.config.diffusion
+    note("conditions" if diffusion else "logits", out.frames)
+    if diffusion:
+        key = jax.random.key(0)
+        time, noise = draw_noise(key, batch["tokens"].shape, diffusion)
+        _watch(model.denoiser, "condition", lambda y: note("denoiser condition", y))
+        note("denoiser", model.denoiser(noise, time, out.frames))
+    if model.action_head is not None and out.actions is not None:
+        args = draw_noise(key, batch["actions"].shape, diffusion)[::-1] if diffusion else ()
+        note("actions", model.action_head(*args, out.actions, embodiment_B))
+    return seen
+
+
+def measure(
+    model: ModelConfig,
+    train: TrainConfig,
+    table: EmbodimentTable,
+    batch: Batch,
+    widths: Sequence[int],
+    seeds: Sequence[int] = (0,),
+    compiler_options: dict[str, Any] | None = None,
+) -> list[Size]:
+    """The table of sizes for `model` at each of `widths`, over `train.steps` steps from 0.
+
+    `seeds` draw parameters only; masks, noise and the batch are the same for all. Rows are in
+    the order width, seed, step. `compiler_options` are `jax.jit`'s: for tiny models compiling takes
+    nearly all the time.
+    """
+    mask = jax.jit(
+        lambda key: mask_batch(key, batch["tokens"], batch["embodiment"], model, train.masking, table)
+    )
+    masked = mask(jax.random.key(train.seed))
+    rows = []
+    for width in widths:
+        config = replace(model, width=width)
+        declared = declare_model(config, table)
+        train_step = make_train_step(declared, table, config, train)
+
+        def body(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+            return train_step(state, batch)[0], observe(declared.merge(state.params), masked, batch)
+
+        run = jax.jit(
+            lambda state: jax.lax.scan(body, state, length=train.steps + 1)[1],
+            compiler_options=compiler_options,
+        )
+        for seed in seeds:
+            seen = jax.device_get(run(init_state(declared, table, seed)))
+            rows += [
+                Size(quantity, width, seed, step, _rms(values[step]), _rms(values[step] - values[0]))
+                for step in range(train.steps + 1)
+                for quantity, values in seen.items()
+            ]
+    return rows
+
+
+def _rms(x: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(x, dtype=np.float64))))
+
+
+# --- Judging ---------------------------------------------------------------------------------
+
+
+def slopes(rows: Sequence[Size]) -> dict[str, Slope]:
+    """Every quantity's slopes of log size over log width, fitted to the second half of the steps.
+
+    Before that, what training adds is small beside the random start, which may fade with width.
+    Not a number where a size is zero or not finite.
+    """
+    widths = {row.width for row in rows}
+    require(len(widths) > 1, f"a coordinate check needs at least two widths, got {sorted(widths)}")
+    last = max(row.step for row in rows)
+    late = [row for row in rows if row.step > last / 2]
+    fitted = {}
+    for quantity in dict.fromkeys(row.quantity for row in late):
+        mine = [row for row in late if row.quantity == quantity]
+        x = np.log([row.width for row in mine])
+        x -= x.mean()
+        with np.errstate(all="ignore"):
+            sizes = np.log([[row.size, row.change] for row in mine])
+            fitted[quantity] = Slope(*map(float, x @ sizes / (x @ x)))
+    return fitted
+
+
+def check_coordinates(rows: Sequence[Size], grow: float = 0.2, fade: float = 0.4) -> list[str]:
+    """What is wrong, a line for each finding; empty where width transfer can be expected.
+
+    Neither a size nor its change by training may grow faster than width^grow, nor the change fade
+    faster than width^-fade. Fading has more room: while learning has not outgrown it, what the
+    random start does fades as width^-0.5 also where all is well. Passing is necessary for transfer,
+    not sufficient.
+    """
+    findings = []
+    for quantity, slope in slopes(rows).items():
+        if not np.isfinite(slope).all():
+            findings.append(f"{quantity}: zero or not finite at some width")
+            continue
+        if slope.size > grow:
+            findings.append(f"{quantity}: grows as width^{slope.size:.2f}")
+        if slope.change > grow or slope.change < -fade:
+            findings.append(f"{quantity}: its change by training goes as width^{slope.change:.2f}")
+    return findings
