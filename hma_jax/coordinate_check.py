@@ -88,7 +88,7 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     seen: dict[str, jax.Array] = {}
     note = seen.__setitem__
     model.trunk = _WatchedTrunk(model, note)
-    hidden = model.align_hidden(masked.hidden_T)
+    hidden = model.align_hidden(masked.hidden_T, masked.hidden_T.shape)
     embodiment_B = batch["embodiment"]
     out = model(
         masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden

@@ -60,11 +60,7 @@ def without(config: ModelConfig, ingredient: str) -> ModelConfig:
 
 
 def windows(config: ModelConfig) -> dict[str, np.ndarray]:
-    batch = random_batch(0, config, TRAIN.batch)
-    if config.diffusion:
-        shape = (*batch["tokens"].shape, config.diffusion.token_channels)
-        batch["tokens"] = np.random.default_rng(1).normal(size=shape).astype(np.float32)
-    return batch
+    return random_batch(0, config, TRAIN.batch)
 
 
 @functools.cache
