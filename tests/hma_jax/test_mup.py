@@ -1,6 +1,5 @@
 """muP in both variants: what each parameter is to the width, and what becomes of activations."""
 
-import functools
 from dataclasses import replace
 
 import jax
@@ -63,9 +62,8 @@ def windows(config: ModelConfig) -> dict[str, np.ndarray]:
     return random_batch(0, config, TRAIN.batch)
 
 
-@functools.cache
-def measured(config: ModelConfig, widths: tuple[int, ...]) -> list[Size]:
-    return measure(config, TRAIN, TABLE, windows(config), widths, range(6), FAST_TO_COMPILE)
+def measured(config: ModelConfig, seeds: int) -> list[Size]:
+    return measure(config, TRAIN, TABLE, windows(config), (BASE, WIDE), range(seeds), FAST_TO_COMPILE)
 
 
 # --- Parameters ------------------------------------------------------------------------------
@@ -113,13 +111,13 @@ def test_at_the_base_width_mup_is_the_standard_parametrisation_bit_for_bit(name)
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_activations_and_what_training_changes_keep_their_size_at_every_width(name):
-    rows = measured(variant(name), (BASE, WIDE))
+    rows = measured(variant(name), 6)
     assert check_coordinates(rows) == [], slopes(rows)
 
 
 INGREDIENTS = ("init", "learning_rate", "readout", "attention", "everything")
-# What acts in the trunk, which both variants share, is taken from one of them in the fast tests.
-FAST = {("discrete", i) for i in INGREDIENTS[:4]} | {("continuous", "init"), ("continuous", "readout")}
+# All four are in the trunk that both variants share; the rest takes minutes to compile.
+FAST = {("discrete", ingredient) for ingredient in INGREDIENTS[:4]}
 
 
 @pytest.mark.parametrize(
@@ -131,8 +129,8 @@ FAST = {("discrete", i) for i in INGREDIENTS[:4]} | {("continuous", "init"), ("c
     ],
 )
 def test_each_ingredient_is_needed(name, ingredient):
-    rows = measured(without(variant(name), ingredient), (BASE, WIDE))
-    assert check_coordinates(rows), slopes(rows)
+    rows = measured(without(variant(name), ingredient), 6 if ingredient == "attention" else 2)
+    assert check_coordinates(rows) != [], slopes(rows)
 
 
 def test_findings_name_what_grows_fades_and_overflows():
