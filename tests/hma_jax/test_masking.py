@@ -113,8 +113,8 @@ def poison_hidden(data, masked):
     [
         ("concat+modulate", "released"),
         ("concat+modulate", "causal"),
-        ("concat", "released"),
-        ("add", "causal"),
+        pytest.param("concat", "released", marks=pytest.mark.slow),
+        pytest.param("add", "causal", marks=pytest.mark.slow),
         ("cross_attention", "released"),
     ],
 )
@@ -146,7 +146,7 @@ def test_hidden_actions_are_predicted_without_being_seen():
     "setting, diffusion",
     [
         ("full", None),
-        ("full", DIFFUSION),
+        pytest.param("full", DIFFUSION, marks=pytest.mark.slow),
         pytest.param("forward", DIFFUSION, marks=pytest.mark.slow),
         pytest.param("policy", None, marks=pytest.mark.slow),
         pytest.param("inverse", None, marks=pytest.mark.slow),

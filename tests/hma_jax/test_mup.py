@@ -93,7 +93,7 @@ def test_hidden_matrices_start_and_learn_smaller_in_wider_models_and_nothing_els
         assert wide == pytest.approx(narrow / m**0.5 if hidden else narrow, rel=0.12), path
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", ["discrete", pytest.param("continuous", marks=pytest.mark.slow)])
 def test_at_the_base_width_mup_is_the_standard_parametrisation_bit_for_bit(name):
     config = variant(name)
     programs, starts = [], []
