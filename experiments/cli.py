@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
@@ -24,7 +23,6 @@ from experiments.cli_convert import HELP, convert_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.host_memory import keep_freed_memory
 
 Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous"]
 Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]

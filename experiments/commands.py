@@ -5,7 +5,6 @@ Every command ends by saying what it wrote and what to run next.
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from collections.abc import Sequence
@@ -22,11 +21,10 @@ from experiments import (
     scale_width,
     transfer_lr,
 )
-from experiments.atomic import write_atomically
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
 from experiments.program import PROGRAM
-from experiments.progress import SweepMonitor, console, step, tidy_table
+from experiments.progress import SweepMonitor, console, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import titles, unique_trials
