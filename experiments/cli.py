@@ -18,8 +18,7 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands, model_commands
-from experiments.cli_convert import HELP, convert_app
+from experiments import cli_bench, cli_convert, commands, model_commands
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
@@ -183,7 +182,8 @@ def report(out: Path) -> None:
 
 app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
-app.command(convert_app, name="convert", help=HELP)
+app.command(cli_convert.convert_app, name="convert", help=cli_convert.HELP)
+app.command(cli_bench.bench_app, name="bench", help=cli_bench.HELP)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
