@@ -19,6 +19,7 @@ from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
 from experiments import cli_bench, cli_convert, commands, model_commands
+from experiments.cli_fit import fit
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
@@ -180,6 +181,7 @@ def report(out: Path) -> None:
     commands.draw_again(out)
 
 
+app.command(fit, name="fit")
 app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 app.command(cli_convert.convert_app, name="convert", help=cli_convert.HELP)

@@ -59,13 +59,21 @@ class Subject:
         return jax.device_put({"tokens": tokens, "actions": actions, "embodiment": robots})
 
 
+def make_shape(
+    name: str, dtype: str, robots: int = 1, layers: int | None = None, remat: bool = False
+) -> tuple[ModelConfig, EmbodimentTable]:
+    """Configuration and robots. Raises ConfigError for a name that is not in the table."""
+    require(name in MODELS, f"unknown model {name!r}; known: {', '.join(MODELS)}")
+    model = MODELS[name]
+    one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
+    table = EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
+    return replace(model, compute_dtype=dtype, layers=layers or model.layers, remat=remat), table
+
+
 def make_subject(
     name: str, dtype: str, robots: int = 1, seed: int = 0, layers: int | None = None, remat: bool = False
 ) -> Subject:
-    """Raises ConfigError for a name that is not in the table."""
-    require(name in MODELS, f"unknown model {name!r}; known: {', '.join(MODELS)}")
-    config = replace(MODELS[name], compute_dtype=dtype, layers=layers or MODELS[name].layers, remat=remat)
-    one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
-    table = EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
+    """As `make_shape`, with weights."""
+    config, table = make_shape(name, dtype, robots, layers, remat)
     declared = declare_model(config, table)
     return Subject(config, table, declared, declared.init(seed), seed)

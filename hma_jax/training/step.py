@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from einops import rearrange
 
 from hma_jax.config import ModelConfig, TrainConfig, require
@@ -69,7 +70,7 @@ def make_train_step(
     multipliers = jax.tree.map(
         lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
     )
-    trained_E = jnp.array([name in (config.only or table.names) for name in table.names])
+    trained_E = np.array([name in (config.only or table.names) for name in table.names])
     require(
         not set(config.only) - set(table.names),
         f"train.only names {', '.join(config.only)}; the embodiments are {', '.join(table.names)}",

@@ -1,0 +1,153 @@
+"""Does a model fit? The real training step, compiled for devices that need not be there.
+
+For a TPU topology XLA compiles ahead of time on any machine (extra `tpu`), and says what every
+device would hold. The same report comes from the devices at hand.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from hma_jax.config import ConfigError, MeshConfig, ModelConfig, TrainConfig
+from hma_jax.embodiments import EmbodimentTable
+from hma_jax.flops import train_flops_per_window
+from hma_jax.model import declare_model
+from hma_jax.params import Declared, is_spec
+from hma_jax.sharding import audit_sharding, batch_sharding, make_mesh, plan_sharding
+from hma_jax.training.optimizer import init_adam
+from hma_jax.training.state import TrainState
+from hma_jax.training.step import make_train_step
+from hma_jax.training.train import state_shardings
+
+COLLECTIVES = ("all-gather", "all-reduce", "reduce-scatter", "all-to-all", "collective-permute")
+LOCAL = "local"
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What one device holds while it trains; bytes. Without memory figures it does not fit."""
+
+    parameters: int
+    devices: int
+    mesh: tuple[int, int, int]
+    compile_seconds: float
+    flops_per_step: float  # of the model, by formula, all devices together
+    arguments: int = 0  # parameters, moments and this device's rows
+    temporary: int = 0
+    peak: int = 0
+    collectives: tuple[tuple[str, int], ...] = ()  # in the program's text; a scan's body counts once
+    refusal: str = ""  # the compiler's words when it does not fit
+
+
+def find_devices(topology: str) -> list[Any]:
+    """The devices of a TPU topology such as v5e:2x4, or those at hand (`local`).
+
+    Raises ConfigError for a topology that the compiler does not know or without the extra.
+    """
+    if topology == LOCAL:
+        return jax.devices()
+    from jax.experimental import topologies
+
+    jax.config.update("jax_enable_compilation_cache", False)  # its entries for absent devices cannot be written
+    try:
+        return list(topologies.get_topology_desc(platform="tpu", topology_name=topology).devices)
+    except (RuntimeError, ValueError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"no topology {topology!r} ({reason}); give one such as v5e:2x4, v5e:8x8, v5p:4x4x4 or v6e:8x8, and "
+            "install the TPU compiler with pip install -e '.[tpu]'"
+        ) from error
+
+
+def check_fit(
+    model: ModelConfig, table: EmbodimentTable, train: TrainConfig, mesh_config: MeshConfig, devices: list[Any]
+) -> Fit:
+    """Compiles the training step for `devices`. Raises ConfigError if the mesh does not suit them."""
+    declared = declare_model(model, table)
+    mesh = make_mesh(mesh_config, devices)
+    audit_sharding(plan_sharding(declared, mesh, mesh_config), mesh)
+    split = mesh.shape["data"] * mesh.shape["fsdp"]
+    if train.batch % split:
+        raise ConfigError(f"a batch of {train.batch} does not divide over {split} devices; change --batch or --mesh")
+    state, batch = abstract_inputs(declared, table, model, train, mesh_config, mesh)
+    facts = dict(
+        parameters=declared.count(),
+        devices=len(devices),
+        mesh=tuple(mesh.shape.values()),
+        flops_per_step=train.batch * train_flops_per_window(model, table),
+    )
+    began = time.perf_counter()
+    with jax.set_mesh(mesh):
+        shardings = jax.tree.map(lambda x: x.sharding, state)
+        step = jax.jit(
+            make_train_step(declared, table, model, train), donate_argnums=0, out_shardings=(shardings, None)
+        )
+        lowered = step.trace(state, batch).lower(lowering_platforms=(devices[0].platform,))
+        try:
+            compiled = lowered.compile()
+        except jax.errors.JaxRuntimeError as error:
+            if "exceed" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            return Fit(**facts, compile_seconds=time.perf_counter() - began, refusal=_refusal(str(error)))
+    memory = compiled.memory_analysis()
+    return Fit(
+        **facts,
+        compile_seconds=time.perf_counter() - began,
+        arguments=int(memory.argument_size_in_bytes),
+        temporary=int(memory.temp_size_in_bytes),
+        peak=int(memory.peak_memory_in_bytes),
+        collectives=count_collectives(compiled.as_text()),
+    )
+
+
+def abstract_inputs(
+    declared: Declared,
+    table: EmbodimentTable,
+    model: ModelConfig,
+    train: TrainConfig,
+    mesh_config: MeshConfig,
+    mesh: Mesh,
+) -> tuple[TrainState, dict[str, jax.ShapeDtypeStruct]]:
+    """State and batch of the training step: shapes, types and shardings, no arrays."""
+    params = jax.tree.map(
+        lambda spec: jax.ShapeDtypeStruct(spec.shape, jnp.float32), declared.specs, is_leaf=is_spec
+    )
+    moments = jax.eval_shape(lambda p: init_adam(p, table.size), params)
+    whole = TrainState(jax.ShapeDtypeStruct((), jnp.int32), params, moments)
+
+    def place(sharding: Any, part: Any) -> Any:
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), part)
+
+    state = jax.tree.map(place, state_shardings(declared, mesh, mesh_config), whole)
+    shape = (train.batch, model.frames, model.tokens)
+    tokens = (shape, jnp.int32)
+    if model.diffusion:
+        tokens = ((*shape, model.diffusion.token_channels), jnp.float32)
+    rows = {
+        "tokens": tokens,
+        "actions": ((*shape[:2], table.action_width), jnp.float32),
+        "embodiment": (shape[:1], jnp.int32),
+    }
+    lying = batch_sharding(mesh)
+    return state, {name: jax.ShapeDtypeStruct(*of, sharding=lying) for name, of in rows.items()}
+
+
+def count_collectives(text: str) -> tuple[tuple[str, int], ...]:
+    """How often each kind of communication stands in a compiled program's text."""
+    pattern = rf"= [^=]*? ({'|'.join(COLLECTIVES)})(?:-start)?\("
+    found = Counter(match.group(1) for match in re.finditer(pattern, text))
+    return tuple((name, found[name]) for name in COLLECTIVES if found[name])
+
+
+def _refusal(message: str) -> str:
+    lines = [line.strip() for line in message.splitlines() if line.strip()]
+    telling = [line for line in lines if "exceed" in line or "Ran out" in line]
+    return (telling or lines)[0]
