@@ -138,7 +138,7 @@ class BaseTokenizer(abc.ABC):
             f"the tokenizer encodes uint8 images [B, {', '.join(map(str, shape))}], "
             f"got {images.dtype} {list(images.shape)}",
         )
-        return in_pieces(lambda piece: self._encode(self._placed, piece), images, self._at_once)
+        return in_pieces(lambda piece: self._encode(self._placed, piece), images, self.at_once)
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
         """Tokens [B, S] or [B, S, C] -> uint8 [B, H, W, 3].
@@ -146,7 +146,7 @@ class BaseTokenizer(abc.ABC):
         Raises ConfigError for another shape or type, and for values that are no tokens.
         """
         tokens = self._checked(np.asarray(tokens))
-        return in_pieces(lambda piece: self._decode(self._placed, piece), tokens, self._at_once)
+        return in_pieces(lambda piece: self._decode(self._placed, piece), tokens, self.at_once)
 
     def _decode_to_uint8(self, params: Params, tokens: jax.Array) -> jax.Array:
         # DIFFERS: the release truncates, which darkens every image by half a grey level.
@@ -182,7 +182,7 @@ class BaseTokenizer(abc.ABC):
     # --- Devices -----------------------------------------------------------------------------
 
     @property
-    def _at_once(self) -> int:
+    def at_once(self) -> int:
         """Images of one call."""
         return self.piece * self._mesh.size
 
