@@ -183,8 +183,8 @@ def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:
     kinds = {True: "latents", False: "ids"}
     require(
         latents == wanted,
-        f"the tokenizer makes {kinds[latents]}, the model of preset {study.name} takes {kinds[wanted]}; start "
-        f"from a preset {'that ends' if latents else 'that does not end'} in -continuous",
+        f"the tokenizer makes {kinds[latents]}, the model of preset {study.name} takes {kinds[wanted]}; "
+        f"start from a preset {'that ends' if latents else 'that does not end'} in -continuous",
     )
     if not latents:
         sizes = {"factors": tokenizer.factors, "factor_vocab": tokenizer.factor_vocab}

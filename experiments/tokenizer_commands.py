@@ -52,4 +52,5 @@ def _write(tokenizer: BaseTokenizer, out: Path) -> None:
         f"{tokenizer.kind} {tokenizer.identity}: {side} x {side} pixels to {tokenizer.tokens} tokens, {what}",
         soft_wrap=True,
     )
-    wrote(out, then=f"hma tokenize --tokenizer {shlex.quote(short(out))} with the --preset, --data and --out you want")
+    then = f"hma tokenize --tokenizer {shlex.quote(short(out))} with the --preset and --data of a study"
+    wrote(out, then=then)

@@ -38,7 +38,7 @@ class Square:
     def _check_size(self, name: str) -> None:
         require(
             self.image_size >= 1 and self.image_size % self.token_size == 0,
-            f"{name}.image_size {self.image_size} is not a multiple of {self.token_size}, the side of a token",
+            f"{name}.image_size {self.image_size} is not a multiple of {self.token_size}, a token's side",
         )
 
 

@@ -119,8 +119,8 @@ def _read_description(directory: Path) -> dict[str, Any]:
         description = json.loads(path.read_text())
     except FileNotFoundError:
         raise ConfigError(
-            f"no tokenizer at {directory} ({DESCRIPTION} is missing); train one with `hma tokenizer train` or "
-            "make one of published weights with `hma tokenizer import`"
+            f"no tokenizer at {directory} ({DESCRIPTION} is missing); train one with `hma tokenizer train` "
+            "or make one of published weights with `hma tokenizer import`"
         ) from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read ({error}); {AGAIN}") from error

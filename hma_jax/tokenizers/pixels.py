@@ -6,6 +6,8 @@ pixels it began with, also from float16, as the token store keeps latents.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 from flax import nnx
 
@@ -22,7 +24,7 @@ class PixelTokenizer(BaseTokenizer):
     kind = "pixels"
     config_class = PixelsConfig
 
-    def __init__(self, config: PixelsConfig, params: Params | None = None, **placement):
+    def __init__(self, config: PixelsConfig, params: Params | None = None, **placement: Any):
         super().__init__(config, params or {}, **placement)
 
     @classmethod

@@ -75,7 +75,7 @@ class SvdVaeTokenizer(BaseTokenizer):
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
         mean, _ = self._declared.merge(params).moments(normalise(images))
-        return patchify(mean * self.config.scale, self.config.patch)
+        return self.tokens_of(mean)
 
     def decode_fn(self, params: Params, tokens: jax.Array, frames: int = 1) -> jax.Array:
         """Pure: latents [B, S, C] -> float32 [B, H, W, 3] in 0..255.
@@ -105,6 +105,10 @@ class SvdVaeTokenizer(BaseTokenizer):
 
         return self._shared_out(decode)
 
+    def tokens_of(self, cells: jax.Array) -> jax.Array:
+        """Unscaled latents [..., h, w, c], which the release stores channels first -> tokens [..., S, C]."""
+        return patchify(cells * self.config.scale, self.config.patch)
+
     def cells(self, tokens: jax.Array) -> jax.Array:
-        """Tokens [..., S, C] -> unscaled latents [..., h, w, c]; the release stores those, channels first."""
+        """The inverse of `tokens_of`."""
         return unpatchify(tokens, self.config.patch, self.grid) / self.config.scale
