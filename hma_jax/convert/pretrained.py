@@ -22,7 +22,7 @@ from hma_jax.convert.table import check_names, nested
 from hma_jax.convert.tensors import Stored, read_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.params import Declared, Params, ParamSpec
-from hma_jax.tokenizers.config import Dtype, Magvit2Config, SvdVaeConfig
+from hma_jax.tokenizers.config import Dtype, Magvit2Config
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 from hma_jax.tokenizers.shared import BaseTokenizer
 

@@ -39,7 +39,7 @@ def check_pixels(case: Case, output: str, images: jax.Array) -> None:
         return
     error = np.abs(got.astype(int) - want.astype(int))
     off = int((error > 0).sum())
-    good = error.max(initial=0) <= 1 and off <= max(1, SINGLE_PIXELS * error.size)
+    good = bool(error.max(initial=0) <= 1 and off <= max(1, SINGLE_PIXELS * error.size))
     case.add(Finding(output, good, note=f"{off} of {want.size} differ, by {error.max(initial=0)} at most"))
 
 
