@@ -20,6 +20,7 @@ from tyro.extras import SubcommandApp
 
 from experiments import cli_bench, cli_convert, commands, model_commands
 from experiments.cli_fit import fit
+from experiments.cli_tokenizer import tokenizer_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
@@ -40,7 +41,7 @@ class Where:
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
     """Your RLDS directories, instead of the simulated suite. Their names must be in the registry."""
     tokenizer: Path | None = None
-    """Directory of a trained tokenizer to use, instead of training one on the data."""
+    """Directory of a tokenizer to use, instead of training one on the data. The model's tokens follow it."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
     """Change one setting, such as --set model.frames=4 --set train.steps=100; may be repeated."""
 
@@ -64,7 +65,6 @@ class How:
 
 app = SubcommandApp()
 data_app = SubcommandApp()
-tokenizer_app = SubcommandApp()
 
 
 @app.command(name="study")

@@ -25,7 +25,7 @@ from experiments.presets import get_preset
 from experiments.program import command_line
 from experiments.progress import SweepMonitor, console, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
-from experiments.study import Study, on_user_data, override
+from experiments.study import Study, on_tokenizer, on_user_data, override
 from experiments.sweep import titles, unique_trials
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
 from hma_jax.config import ConfigError, MeshConfig, to_dict
@@ -63,12 +63,16 @@ def make_setting(
     settings: Sequence[str],
     tokenizer: Path | None = None,
 ) -> Setting:
-    """The preset, on the user's data if given, with overrides. Touches no file but `data`."""
+    """The preset, on the user's data and tokenizer if given, with overrides. Touches no other file."""
     study = get_preset(preset)
     if data:
         from experiments.pipeline import name_datasets
 
         study = on_user_data(study, name_datasets(data))
+    if tokenizer is not None:
+        from hma_jax.tokenizers.io import load_config
+
+        study = on_tokenizer(study, load_config(tokenizer))
     study = override(study, settings)
     directories = tuple(str(Path(d).absolute()) for d in data)
     workspace = Workspace((out or Path("runs") / study.name).absolute())

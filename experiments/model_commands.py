@@ -16,6 +16,7 @@ from hma_jax.config import ConfigError, MeshConfig, require
 
 if TYPE_CHECKING:
     from experiments.trial import Materials, Trial
+    from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.train import Run
 
 
@@ -131,8 +132,31 @@ def check_fits(trained: Run, materials: Materials) -> None:
 
 
 def _check_tokenizer(trained: Run, materials: Materials, advice: str) -> None:
+    """A model that was converted does not know its tokenizer: then the form of its tokens decides."""
+    if "official" in trained.provenance and "tokenizer" not in trained.provenance:
+        _check_form(trained, materials.tokenizer, advice)
+        return
     tokenizer, here = trained.provenance.get("tokenizer"), materials.tokenizer.identity
     if tokenizer != here:
         raise ConfigError(
             f"the model was trained on tokens of tokenizer {tokenizer}, the study here uses {here}{advice}"
         )
+
+
+def _check_form(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
+    model = trained.model
+    if model.diffusion:
+        takes = (model.tokens, 0, 0, model.diffusion.token_channels)
+    else:
+        takes = (model.tokens, model.factors, model.factor_vocab, 0)
+    makes = (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels)
+    if takes != makes:
+        words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
+        raise ConfigError(
+            f"the model takes {words.format(*takes)}, the tokenizer here makes {words.format(*makes)}{advice}"
+        )
+    console.print(
+        f"note: the model comes from the official release and does not say on which tokens it was trained; "
+        f"taken for those of the tokenizer here, {tokenizer.identity}",
+        soft_wrap=True,
+    )

@@ -23,7 +23,7 @@ from experiments.provenance import Provenance, source_hash
 from experiments.study import StoreConfig, Study
 from experiments.trial import CHECKPOINTS
 from experiments.workspace import Workspace
-from hma_jax.config import require, stable_hash, to_dict
+from hma_jax.config import TokenizerConfig, require, stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
@@ -114,6 +114,10 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
     from hma_jax.training.loop import LoopOptions
 
     config, train, settings = study.tokenizer, study.tokenizer_train, study.store
+    require(
+        isinstance(config, TokenizerConfig),
+        "the study's tokenizer is not one that is trained here; give its directory with --tokenizer",
+    )
     inputs = {
         "config": to_dict(config),
         "train": to_dict(train),

@@ -24,6 +24,7 @@ from hma_jax.config import (
     require,
     to_dict,
 )
+from hma_jax.tokenizers.config import AnyTokenizerConfig, Latents
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Study:
     dataset_counts: tuple[int, ...]
     trajectory_counts: tuple[int, ...]  # per dataset
     widths: tuple[int, ...]
-    tokenizer: TokenizerConfig = field(default_factory=TokenizerConfig)
+    tokenizer: AnyTokenizerConfig = field(default_factory=TokenizerConfig)
     tokenizer_train: TokenizerTrainConfig = field(default_factory=TokenizerTrainConfig)
     suite: SuiteConfig = field(default_factory=SuiteConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
@@ -126,7 +127,7 @@ class Study:
         """Raises ConfigError unless the model takes the tokens that the tokenizer makes."""
         tokenizer, diffusion, channels = self.tokenizer, self.model.diffusion, self.tokenizer.token_channels
         wanted = {"tokens": tokenizer.tokens}
-        if tokenizer.quantise:
+        if not channels:
             wanted |= {"factors": tokenizer.factors, "factor_vocab": tokenizer.factor_vocab}
         for name, want in wanted.items():
             require(
@@ -134,7 +135,7 @@ class Study:
                 f"model.{name} is {getattr(self.model, name)} but the tokenizer makes {want}; "
                 f"set model.{name}={want} or change the tokenizer",
             )
-        if tokenizer.quantise:
+        if not channels:
             require(
                 diffusion is None,
                 "model.diffusion is set, so the model takes latents, but the tokenizer makes ids; set "
@@ -171,6 +172,30 @@ def on_user_data(study: Study, names: Sequence[str]) -> Study:
     """The same study on the user's datasets: counts beyond what there is are cut to it."""
     counts = tuple(sorted({min(c, len(names)) for c in study.dataset_counts} | {len(names)}))
     return replace(study, datasets=tuple(names), dataset_counts=counts)
+
+
+def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:
+    """The same study on the tokens of a given tokenizer: what the model takes follows from it.
+
+    Raises ConfigError when one of the two is made for ids and the other for latents.
+    """
+    latents, wanted = tokenizer.token_channels > 0, study.model.diffusion is not None
+    kinds = {True: "latents", False: "ids"}
+    require(
+        latents == wanted,
+        f"the tokenizer makes {kinds[latents]}, the model of preset {study.name} takes {kinds[wanted]}; "
+        f"start from a preset {'that ends' if latents else 'that does not end'} in -continuous",
+    )
+    if not latents:
+        sizes = {"factors": tokenizer.factors, "factor_vocab": tokenizer.factor_vocab}
+    elif study.model.diffusion.token_channels == tokenizer.token_channels:
+        sizes = {}
+    else:
+        patch = tokenizer.patch if isinstance(tokenizer, Latents) else 1
+        cells = tokenizer.token_channels // patch**2
+        sizes = {"diffusion": replace(study.model.diffusion, channels=cells, patch=patch)}
+    model = replace(study.model, tokens=tokenizer.tokens, **sizes)
+    return replace(study, tokenizer=tokenizer, model=model)
 
 
 def override(study: Study, settings: Sequence[str]) -> Study:

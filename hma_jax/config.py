@@ -1,7 +1,8 @@
 """Configuration: frozen dataclasses, validated when made, JSON both ways, with a stable hash.
 
-A default lives here and nowhere else. Named instances live in `presets`. A config holds
-what determines a result; paths, clocks and verbosity belong to the code that calls.
+A default lives here and nowhere else; those of tokenizers that are not trained here are in
+`tokenizers.config`. Named instances live in `presets`. A config holds what determines a result;
+paths, clocks and verbosity belong to the code that calls.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         if value is None:
             return None
         options = [a for a in typing.get_args(hint) if a is not type(None)]
-        return _decode(options[0], value, where)
+        return _decode(_by_kind(options, value, where), value, where)
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)
     if origin is Literal:
@@ -89,6 +90,15 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
         require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
         return hint(value)
     return value
+
+
+def _by_kind(options: list[Any], value: Any, where: str) -> Any:
+    """Of several configs the one whose `kind` is `value`'s; the first of them has none."""
+    if len(options) == 1 or not isinstance(value, dict) or "kind" not in value:
+        return options[0]
+    kinds = {option.kind: option for option in options if hasattr(option, "kind")}
+    require(value["kind"] in kinds, f"{where}: unknown kind {value['kind']!r}; known: {', '.join(kinds)}")
+    return kinds[value["kind"]]
 
 
 def to_json(config: Any) -> str:

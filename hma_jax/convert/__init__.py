@@ -1,19 +1,24 @@
 """Checkpoints to and from other formats: the official release's, safetensors, StableHLO.
 
-Everything meets in a `training.train.Run`: readers return one, writers take one.
+Models meet in a `training.train.Run`: readers return one, writers take one. Readers of pretrained
+tokenizers return one that `tokenizers.io` saves.
 """
 
 from hma_jax.convert.aside import require_free
 from hma_jax.convert.neutral import read_neutral, write_neutral
 from hma_jax.convert.official import official_shapes, read_official, write_official
+from hma_jax.convert.pretrained import find_reader, read_magvit2, read_svd_vae
 from hma_jax.convert.run_directory import write_run
 from hma_jax.convert.stablehlo import ProgramConfig, write_stablehlo
 
 __all__ = [
     "ProgramConfig",
+    "find_reader",
     "official_shapes",
+    "read_magvit2",
     "read_neutral",
     "read_official",
+    "read_svd_vae",
     "require_free",
     "write_neutral",
     "write_official",

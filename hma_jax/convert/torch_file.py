@@ -2,7 +2,8 @@
 
 Such a file is a zip: `data.pkl` describes the tensors, `data/KEY` holds their elements. A pickle
 is a program; this reader knows the few names that a state dict of tensors needs and refuses every
-other by name, before anything is called.
+other by name, before anything is called. In the checkpoint of a whole training run the state dict is
+one entry among others; what a trainer keeps there is passed over without being made.
 """
 
 from __future__ import annotations
@@ -35,6 +36,13 @@ STORAGES = {
 }
 
 
+BOOKKEEPING = ("lightning", "lightning_fabric", "omegaconf", "pytorch_lightning", "typing")
+"""Packages whose objects trainers keep beside the weights. An `_Ignored` stands for each."""
+
+CONTAINERS = ("bool", "dict", "float", "int", "list", "set", "str", "tuple")
+"""Of builtins: types that those objects name."""
+
+
 @dataclass(frozen=True, slots=True)
 class _StorageType:
     dtype: np.dtype
@@ -50,12 +58,36 @@ class _Refused(ConfigError):
     """Not wrapped by what reports damaged files."""
 
 
-class _Reader(pickle.Unpickler):
-    """Knows ordered dictionaries, storages and how a tensor is made of one."""
+class _Ignored:
+    """Takes whatever a pickle does to an object, and keeps nothing of it."""
 
-    def __init__(self, path: Path, archive: zipfile.ZipFile, root: str):
+    def __new__(cls, *args: Any, **kwargs: Any) -> _Ignored:
+        del args, kwargs
+        return super().__new__(cls)
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        del args, kwargs
+
+    def __setstate__(self, state: Any) -> None:
+        del state
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        del key, value
+
+    def append(self, item: Any) -> None:
+        del item
+
+    def extend(self, items: Any) -> None:
+        del items
+
+
+class _Reader(pickle.Unpickler):
+    """Knows ordered dictionaries, storages and how a tensor is made of one; and what of a `whole`
+    training run is passed over."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile, root: str, whole: bool):
         super().__init__(archive.open(f"{root}data.pkl"))
-        self.path, self.root = path, root
+        self.path, self.root, self.whole = path, root, whole
         self.bytes = {info.filename: info.file_size for info in archive.infolist()}
 
     def find_class(self, module: str, name: str) -> Any:
@@ -65,6 +97,9 @@ class _Reader(pickle.Unpickler):
             return self._rebuild
         if module == "torch" and name in STORAGES:
             return _StorageType(np.dtype(STORAGES[name]))
+        known = module.partition(".")[0] in BOOKKEEPING or module == "builtins" and name in CONTAINERS
+        if self.whole and known:
+            return _Ignored
         raise _Refused(
             f"{self.path} asks for {module}.{name}, which a plain state dict of tensors does not need; it is "
             "not read. Save the tensors alone, best as model.safetensors"
@@ -99,8 +134,11 @@ class _Reader(pickle.Unpickler):
         return Stored(tuple(shape), storage.dtype, read)
 
 
-def read_torch(path: Path) -> dict[str, Stored]:
-    """name -> tensor. Raises ConfigError for whatever is not a plain state dict, naming what it is."""
+def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
+    """name -> tensor. Raises ConfigError for whatever is not a plain state dict, naming what it is.
+
+    `within` is the entry of a training run's checkpoint that holds the state dict, if it is one.
+    """
     advice = "; save it with torch.save(model.state_dict(), ...) or as model.safetensors"
     try:
         with zipfile.ZipFile(path) as archive:
@@ -111,7 +149,7 @@ def read_torch(path: Path) -> dict[str, Stored]:
                 require(
                     archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little"
                 )
-            state = _Reader(path, archive, root).load()
+            state = _Reader(path, archive, root, whole=within is not None).load()
     except _Refused:
         raise
     except zipfile.BadZipFile as error:
@@ -128,6 +166,8 @@ def read_torch(path: Path) -> dict[str, Stored]:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path}: its description of tensors cannot be read ({error}){advice}") from error
+    if within is not None and isinstance(state, dict) and isinstance(state.get(within), dict):
+        state = state[within]
     plain = isinstance(state, dict) and all(
         isinstance(name, str) and isinstance(tensor, Stored) for name, tensor in state.items()
     )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import islice
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,8 +30,9 @@ class ContinuousTokenizer(AutoencoderTokenizer):
 
     kind = "continuous"
     ignored = ("quantise", "factors", "entropy_weight", "entropy_temperature", "commitment_weight")
+    measured = ("latent_std",)
 
-    def __init__(self, config: TokenizerConfig, params: Params, latent_std: float):
+    def __init__(self, config: TokenizerConfig, params: Params, latent_std: float, **placement: Any):
         """`latent_std`: of the encoder's own output.
 
         Raises ConfigError if `params` are not those that `config` declares, or if it is no scale.
@@ -42,10 +44,7 @@ class ContinuousTokenizer(AutoencoderTokenizer):
             "whose latents do not vary has learnt nothing",
         )
         self.latent_std = latent_std
-        super().__init__(config, params)
-
-    def _measured(self) -> tuple[float, ...]:
-        return (self.latent_std,)
+        super().__init__(config, params, **placement)
 
     def _from_latents(self, z: jax.Array) -> jax.Array:
         return z / self.latent_std
@@ -54,17 +53,6 @@ class ContinuousTokenizer(AutoencoderTokenizer):
         # The encoder stays within +-1, so a value outside is an error of the generative model;
         # the nearest value inside is never further from the truth.
         return jnp.clip(tokens * self.latent_std, -1.0, 1.0)
-
-    def _checked(self, tokens: np.ndarray) -> np.ndarray:
-        shape = (self.tokens, self.channels)
-        require(
-            tokens.dtype.kind == "f" and tokens.ndim == 3 and tokens.shape[1:] == shape,
-            f"the tokenizer decodes latents, float [B, {self.tokens}, {self.channels}], "
-            f"got {tokens.dtype} {list(tokens.shape)}",
-        )
-        tokens = tokens.astype(np.float32)
-        require(bool(np.isfinite(tokens).all()), "latents are not finite; did the model diverge?")
-        return tokens
 
 
 def make_continuous(

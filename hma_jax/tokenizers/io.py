@@ -1,7 +1,7 @@
-"""Tokenizers on disk: `tokenizer.json` and `weights.npz`.
+"""Tokenizers on disk, of every kind: `tokenizer.json` and `weights.npz`.
 
-The JSON holds kind, configuration, identity and, of a continuous one, the scale of its latents.
-The JSON file is written last, so a directory holds a whole tokenizer or none.
+The JSON holds kind, configuration, identity and what was measured beside the weights, such as the
+scale of latents. It is written last, so a directory holds a whole tokenizer or none.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +18,36 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from hma_jax.config import ConfigError, TokenizerConfig, diff, from_dict, require, to_dict
+from hma_jax.config import ConfigError, diff, from_dict, require, to_dict
 from hma_jax.params import Params, path_name
-from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
-from hma_jax.tokenizers.base import Tokenizer
+from hma_jax.tokenizers.config import AnyTokenizerConfig
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
+from hma_jax.tokenizers.pixels import PixelTokenizer
+from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
+from hma_jax.tokenizers.shared import BaseTokenizer
 
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
-SCALE = "latent_std"
-KINDS = (LfqTokenizer.kind, ContinuousTokenizer.kind)
+KINDS: dict[str, type[BaseTokenizer]] = {
+    cls.kind: cls
+    for cls in (LfqTokenizer, ContinuousTokenizer, Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)
+}
+AGAIN = "train, import or copy the tokenizer again"
 UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
 """What numpy raises for a damaged archive: RuntimeError when a flipped bit claims encryption or an
 unknown compression, EOFError for an empty file."""
 
 
-def save_tokenizer(tokenizer: AutoencoderTokenizer, directory: Path) -> None:
+def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:
     """Writes into `directory`, replacing a tokenizer that is there. Raises ConfigError if it cannot."""
     directory = Path(directory)
     description = {
         "kind": tokenizer.kind,
         "config": to_dict(tokenizer.config),
         "identity": tokenizer.identity,
+        **{name: getattr(tokenizer, name) for name in tokenizer.measured},
     }
-    if isinstance(tokenizer, ContinuousTokenizer):
-        description[SCALE] = tokenizer.latent_std
     arrays = {path_name(p): np.asarray(x) for p, x in jax.tree.leaves_with_path(tokenizer.params)}
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -60,34 +65,52 @@ def save_tokenizer(tokenizer: AutoencoderTokenizer, directory: Path) -> None:
         ) from error
 
 
-def load_tokenizer(directory: Path, expect: TokenizerConfig | None = None) -> Tokenizer:
-    """The tokenizer in `directory`.
+def load_tokenizer(
+    directory: Path,
+    expect: AnyTokenizerConfig | None = None,
+    *,
+    devices: Sequence[jax.Device] | None = None,
+    piece: int | None = None,
+) -> BaseTokenizer:
+    """The tokenizer in `directory`. `devices` and `piece` are explained at `BaseTokenizer`.
 
     Raises ConfigError if none is there, if a file is damaged, or if its configuration is not
     `expect` (when given), naming every field that differs.
     """
     directory = Path(directory)
     description = _read_description(directory)
-    config = from_dict(TokenizerConfig, description["config"], where=f"{directory / DESCRIPTION}: config")
+    kind = KINDS[description["kind"]]
+    config = _config(directory, description)
     if expect is not None and config != expect:
         raise ConfigError(
             f"the tokenizer at {directory} has another configuration; give another directory or "
             "change these fields:\n  " + "\n  ".join(diff(config, expect))
         )
     weights = _read_weights(directory)
+    measured = {name: description[name] for name in kind.measured}
     try:
-        if description["kind"] == LfqTokenizer.kind:
-            tokenizer: AutoencoderTokenizer = LfqTokenizer(config, weights)
-        else:
-            tokenizer = ContinuousTokenizer(config, weights, description[SCALE])
+        tokenizer = kind(config, weights, **measured, devices=devices, piece=piece)
     except ConfigError as error:
-        raise ConfigError(f"{directory}: {error}; train or copy the tokenizer again") from error
+        raise ConfigError(f"{directory}: {error}; {AGAIN}") from error
     require(
         tokenizer.identity == description["identity"],
         f"{directory / WEIGHTS} is not the file {DESCRIPTION} describes (identity "
-        f"{tokenizer.identity}, expected {description['identity']}); train or copy the tokenizer again",
+        f"{tokenizer.identity}, expected {description['identity']}); {AGAIN}",
     )
     return tokenizer
+
+
+def load_config(directory: Path) -> AnyTokenizerConfig:
+    """The configuration of the tokenizer in `directory`; its weights are not read.
+
+    Raises ConfigError if none is there or its description is damaged.
+    """
+    return _config(Path(directory), _read_description(Path(directory)))
+
+
+def _config(directory: Path, description: dict[str, Any]) -> AnyTokenizerConfig:
+    config_class = KINDS[description["kind"]].config_class
+    return from_dict(config_class, description["config"], where=f"{directory / DESCRIPTION}: config")
 
 
 def _read_description(directory: Path) -> dict[str, Any]:
@@ -96,22 +119,25 @@ def _read_description(directory: Path) -> dict[str, Any]:
         description = json.loads(path.read_text())
     except FileNotFoundError:
         raise ConfigError(
-            f"no tokenizer at {directory} ({DESCRIPTION} is missing); train one with `hma tokenizer train`"
+            f"no tokenizer at {directory} ({DESCRIPTION} is missing); train one with `hma tokenizer train` "
+            "or make one of published weights with `hma tokenizer import`"
         ) from None
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); train or copy the tokenizer again") from error
+        raise ConfigError(f"{path} cannot be read ({error}); {AGAIN}") from error
     require(
         isinstance(description, dict),
-        f"{path} cannot be read (not a JSON object); train or copy the tokenizer again",
+        f"{path} cannot be read (not a JSON object); {AGAIN}",
     )
     missing = {"kind", "config", "identity"} - set(description)
     require(not missing, f"{path}: missing field(s) {', '.join(sorted(missing))}")
-    kind, scale = description["kind"], description.get(SCALE)
-    require(kind in KINDS, f"{path}: unknown tokenizer kind {kind!r}; known: {', '.join(KINDS)}")
+    kind = description["kind"]
     require(
-        kind != ContinuousTokenizer.kind or isinstance(scale, float),
-        f"{path}: {SCALE} should be a number, got {scale!r}; train or copy the tokenizer again",
+        isinstance(kind, str) and kind in KINDS,
+        f"{path}: unknown tokenizer kind {kind!r}; known: {', '.join(KINDS)}",
     )
+    for name in KINDS[kind].measured:
+        value = description.get(name)
+        require(isinstance(value, float), f"{path}: {name} should be a number, got {value!r}; {AGAIN}")
     return description
 
 
@@ -121,7 +147,7 @@ def _read_weights(directory: Path) -> Params:
         with np.load(path, allow_pickle=False) as file:
             flat = {tuple(name.split("/")): jnp.asarray(file[name]) for name in file.files}
     except FileNotFoundError:
-        raise ConfigError(f"{path} is missing; train or copy the tokenizer again") from None
+        raise ConfigError(f"{path} is missing; {AGAIN}") from None
     except UNREADABLE as error:
-        raise ConfigError(f"{path} is damaged ({error}); train or copy the tokenizer again") from error
+        raise ConfigError(f"{path} is damaged ({error}); {AGAIN}") from error
     return nnx.traversals.unflatten_mapping(flat)

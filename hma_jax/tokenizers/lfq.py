@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -18,29 +20,16 @@ class LfqTokenizer(AutoencoderTokenizer):
     kind = "lfq"
     ignored = ("quantise", "latent_noise")
 
-    def __init__(self, config: TokenizerConfig, params: Params):
+    def __init__(self, config: TokenizerConfig, params: Params, **placement: Any):
         """Raises ConfigError if `params` are not those that `config` declares."""
         require(config.quantise, "a tokenizer of ids needs tokenizer.quantise=true")
-        super().__init__(config, params)
+        super().__init__(config, params, **placement)
 
     def _from_latents(self, z: jax.Array) -> jax.Array:
         return latents_to_ids(z)
 
     def _to_latents(self, tokens: jax.Array) -> jax.Array:
         return ids_to_codes(tokens, self.config.bits)
-
-    def _checked(self, tokens: np.ndarray) -> np.ndarray:
-        require(
-            tokens.ndim == 2 and tokens.shape[1] == self.tokens,
-            f"the tokenizer decodes ids [B, {self.tokens}], got {list(tokens.shape)}",
-        )
-        low, high = int(tokens.min(initial=0)), int(tokens.max(initial=0))
-        require(
-            low >= 0 and high < self.vocab_size,
-            f"token ids must lie in [0, {self.vocab_size}), got {low} to {high}; "
-            "is a mask id left, or were they made by another tokenizer?",
-        )
-        return tokens.astype(np.int32)
 
 
 def code_usage(tokenizer: Tokenizer, images: np.ndarray) -> tuple[float, ...]:

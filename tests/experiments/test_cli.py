@@ -15,9 +15,10 @@ from experiments.runner import read_states
 from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
-COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "tokenizer", "tokenizer train", "tokenize",
-            "train", "evaluate", "report", "convert", "convert from-official", "convert to-official",
-            "convert to-safetensors", "convert from-safetensors", "convert to-stablehlo")  # fmt: skip
+COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "tokenizer", "tokenizer train",
+            "tokenizer import", "tokenizer pixels", "tokenize", "train", "evaluate", "report", "convert",
+            "convert from-official", "convert to-official", "convert to-safetensors",
+            "convert from-safetensors", "convert to-stablehlo")  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -45,6 +46,12 @@ def test_help_needs_no_jax():
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
         (["report", "--out", "{empty}"], 2, "no study"),
         (["evaluate", "{empty}", "--preset", "smoke"], 2, "checkpoint"),
+        (["tokenizer", "import", "{empty}", "--out", "{empty}/t"], 2, "{empty}/config.json"),
+        (["tokenizer", "import", "{empty}/no.ckpt", "--out", "{empty}/t"], 2, "at {empty}/no.ckpt"),
+        (["tokenizer", "import", "{file}", "--out", "{empty}/t"], 2, "{file}: no zip file"),
+        (["tokenizer", "pixels", "--out", "{file}"], 2, "{file} exists already"),
+        (["tokenizer", "pixels", "--out", "{empty}/t", "--patch", "7"], 2, "64 is not a multiple of 7"),
+        (["tokenize", "--preset", "smoke", "--tokenizer", "{empty}"], 2, "hma tokenizer import"),
         (["convert", "from-official", "{empty}", "--out", "{empty}/run"], 2, "{empty}/config.json"),
         (["convert", "to-official", "{empty}", "--out", "{empty}/x"], 2, "{empty}/checkpoints"),
         (["convert", "from-safetensors", "{empty}", "--out", "{empty}/x"], 2, "{empty}/model.json"),

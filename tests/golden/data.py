@@ -17,6 +17,7 @@ from data_pipelines.windows import cut_actions, cut_frames, train_windows
 from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.convert.official import official_shapes
 from hma_jax.convert.official_config import read_model
+from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, tokenizer_shapes
 from hma_jax.embodiments import Embodiment, EmbodimentTable
 from hma_jax.evaluation import metrics
 from hma_jax.masking import MaskingDraws, corrupt, mask_tokens
@@ -204,7 +205,7 @@ def check_metrics(case: Case) -> None:
 
 # --- Names and shapes --------------------------------------------------------------------------
 
-TOKENIZERS = ("magvit2", "svd_vae")
+TOKENIZERS = {"magvit2": MAGVIT2, "svd_vae": SVD_VAE}
 
 
 def check_key_shapes(case: Case) -> None:
@@ -214,16 +215,23 @@ def check_key_shapes(case: Case) -> None:
         if path.stem == "parameter_counts":
             _check_counts(case, content)
         elif path.stem in TOKENIZERS:
-            case.add(Finding(path.stem, None, note="not supported yet: another part's tensors"))
+            source = TOKENIZERS[path.stem]
+            declared = source.tokenizer.declare(source.config(content["config"], path.stem))
+            _compare_shapes(case, path.stem, tokenizer_shapes(source, declared), content)
         else:
-            _check_shapes(case, path.stem, content)
+            _compare_shapes(case, path.stem, _model_shapes(path.stem, content), content)
 
 
-def _check_shapes(case: Case, label: str, content: dict[str, Any]) -> None:
+def _model_shapes(label: str, content: dict[str, Any]) -> dict[str, tuple[int, ...]]:
     dim, stride = content["action_dim"], content["stride"]
     table = EmbodimentTable((Embodiment(content["domain"], dim, stride, (0.0,) * dim, (1.0,) * dim),))
     names = {"action_domains": [content["domain"]], "d_actions": [dim * stride]}
-    got = official_shapes(read_model({**content["config"], **names}, label), table)
+    return official_shapes(read_model({**content["config"], **names}, label), table)
+
+
+def _compare_shapes(
+    case: Case, label: str, got: dict[str, tuple[int, ...]], content: dict[str, Any]
+) -> None:
     listed = content["shapes"]
     want = {name: tuple(shape) for name, shape in listed.items()}
     wrong = sorted({n for n in got.keys() | want.keys() if got.get(n) != want.get(n)})

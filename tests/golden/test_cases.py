@@ -92,15 +92,41 @@ def test_what_is_not_compared_fails(copy, capsys):
     assert "FAIL not compared: mystery" in said(capsys)
 
 
-def test_unknown_and_unsupported_kinds_are_named(tmp_path, capsys):
-    for kind in ("tokenizer", "telepathy"):
-        (tmp_path / kind).mkdir()
-        (tmp_path / kind / "case.json").write_text(json.dumps({"kind": kind}))
-    assert verify.main([str(tmp_path / "tokenizer")]) == 1
-    assert "not supported yet" in said(capsys)
-    assert verify.main([str(tmp_path / "tokenizer"), "--skip-unsupported"]) == 0
-    assert verify.main([str(tmp_path / "telepathy"), "--skip-unsupported"]) == 1
+def test_unknown_kinds_are_named(tmp_path, capsys):
+    (tmp_path / "telepathy").mkdir()
+    (tmp_path / "telepathy" / "case.json").write_text(json.dumps({"kind": "telepathy"}))
+    assert verify.main([str(tmp_path / "telepathy")]) == 1
     assert "FAIL unknown" in said(capsys)
+
+
+@pytest.mark.parametrize(
+    ("name", "weight"),
+    [
+        ("09b_tokenizer_five_levels", "encoder.down.3.downsample.bias"),
+        ("10b_vae_decoder_32groups", "decoder.up_blocks.1.resnets.2.time_mixer.mix_factor"),
+    ],
+)
+def test_other_weights_of_a_tokenizer_fail(name, weight, copy, capsys):
+    case = copy(name)
+    path = case / "model.safetensors"
+    tensors = {name: tensor.read() for name, tensor in read_safetensors(path).items()}
+    tensors[weight] = tensors[weight] + np.float32(0.5)
+    write_safetensors(path, tensors)
+    assert verify.main([str(case)]) == 1
+    out = said(capsys)
+    assert "FAIL pre_quantised__images" in out or "FAIL decoded_num_frames2" in out
+
+
+def test_pixels_off_by_more_than_rounding_fail(copy, capsys):
+    case = copy("10a_vae")
+
+    def change(arrays):
+        pixels = arrays["decoded_uint8_num_frames1"]
+        pixels[0, 0, 3, 3] = (int(pixels[0, 0, 3, 3]) + 2) % 256
+
+    rewrite(case / "outputs.npz", change)
+    assert verify.main([str(case)]) == 1
+    assert "FAIL decoded_uint8_num_frames1" in said(capsys)
 
 
 def test_a_broken_case_does_not_stop_the_others(copy, capsys):

@@ -12,7 +12,7 @@ import pytest
 from hma_jax.config import ConfigError, TokenizerConfig
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
-from hma_jax.tokenizers.io import DESCRIPTION, SCALE, WEIGHTS, load_tokenizer, save_tokenizer
+from hma_jax.tokenizers.io import DESCRIPTION, WEIGHTS, load_tokenizer, save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 
 CONFIG = TokenizerConfig(
@@ -159,7 +159,7 @@ def test_archive_that_claims_what_numpy_never_writes(copy, field, value):
 def test_scale_that_is_none(scale, tmp_path):
     save_tokenizer(make(CONTINUOUS), tmp_path)
     values = json.loads((tmp_path / DESCRIPTION).read_text())
-    (tmp_path / DESCRIPTION).write_text(json.dumps(values | {SCALE: scale}))
+    (tmp_path / DESCRIPTION).write_text(json.dumps(values | {"latent_std": scale}))
     assert "again" in refusal(tmp_path)
 
 

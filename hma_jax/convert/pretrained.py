@@ -1,0 +1,212 @@
+"""Tokenizers that others trained, read from the files they are published in.
+
+The 1X / Open-MAGVIT2 tokenizer comes as `magvit2.ckpt`, a torch file of a training run, or its tensors
+as safetensors; a directory with a config.json beside them may have other sizes. The VAE of Stable
+Video Diffusion comes as a directory of the diffusers library. Reading is strict: a tensor too few,
+too many or of another shape is refused by name, and no code of a file is run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import from_dict, require
+from hma_jax.convert.official import read_config
+from hma_jax.convert.table import check_names, nested
+from hma_jax.convert.tensors import Stored, read_safetensors
+from hma_jax.convert.torch_file import read_torch
+from hma_jax.params import Declared, Params, ParamSpec
+from hma_jax.tokenizers.config import Dtype, Magvit2Config
+from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
+from hma_jax.tokenizers.shared import BaseTokenizer
+
+IGNORED = ("loss.", "model_ema.")
+"""What a training run of the MAGVIT2 tokenizer keeps besides: discriminator and averaged weights, of
+which the release uses neither."""
+
+FILES = (
+    "diffusion_pytorch_model.safetensors",
+    "diffusion_pytorch_model.fp16.safetensors",
+    "diffusion_pytorch_model.bin",
+    "model.safetensors",
+    "magvit2.safetensors",
+    "magvit2.ckpt",
+)
+"""Where weights lie in a directory; the first that is there is read."""
+
+FLOATS = ("float32", "float16", "bfloat16", "float64")
+
+
+@dataclass(frozen=True)
+class Source:
+    """How one kind is published."""
+
+    tokenizer: type[BaseTokenizer]
+    fields: Mapping[str, str]  # official field of config.json -> ours
+    required: tuple[str, ...]  # official fields without which a config.json is not one of this kind
+    fixed: Mapping[str, tuple[Any, ...]]  # official field -> values that are supported
+    shortcut: str  # official name of the 1x1 convolution beside a residual block
+
+    def config(self, official: Mapping[str, Any], where: str, **ours: Any) -> Any:
+        """Our configuration. Raises ConfigError naming the field that is missing or not supported."""
+        missing = [name for name in self.required if official.get(name) is None]
+        require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
+        for name, good in self.fixed.items():
+            value = official.get(name, good[0])
+            require(value in good, f"{where}: {name} is {value!r}, supported is {good[0]!r}")
+        known = {ours_: official[theirs] for theirs, ours_ in self.fields.items() if theirs in official}
+        return from_dict(self.tokenizer.config_class, known | ours, where)
+
+    def official_name(self, path: str) -> str:
+        """'decoder.conv_in.weight' of 'decoder/conv_in/kernel'."""
+        renamed = {"kernel": "weight", "gain": "weight", "shortcut": self.shortcut}
+        return ".".join(renamed.get(part, part) for part in path.split("/"))
+
+
+MAGVIT2 = Source(
+    Magvit2Tokenizer,
+    {
+        "base_channels": "channels",
+        "ch_mult": "multipliers",
+        "num_res_blocks": "res_blocks",
+        "z_channels": "bits",
+        "norm_num_groups": "groups",  # no official field: 32 there
+    },
+    ("base_channels", "ch_mult", "num_res_blocks", "z_channels"),
+    {"in_channels": (3,), "out_channels": (3,), "num_codebooks": (1,), "token_factorization": (False,)},
+    "nin_shortcut",
+)
+
+SVD_VAE = Source(
+    SvdVaeTokenizer,
+    {
+        "block_out_channels": "channels",
+        "layers_per_block": "layers",
+        "latent_channels": "latent_channels",
+        "scaling_factor": "scale",
+        "norm_num_groups": "groups",  # no official field: 32 there
+    },
+    ("block_out_channels", "layers_per_block", "latent_channels"),
+    {"in_channels": (3,), "out_channels": (3,)},
+    "conv_shortcut",
+)
+
+
+# --- Names and layouts ---------------------------------------------------------------------------
+
+
+def official_shape(spec: ParamSpec) -> tuple[int, ...]:
+    """In PyTorch's layout: outputs, inputs, then the window."""
+    # A kernel over time is one over time and space there, with a window of one pixel.
+    window = (1, 1) if len(spec.shape) == 3 else ()
+    return tuple(spec.shape[i] for i in _reversed(spec)) + window
+
+
+def _reversed(spec: ParamSpec) -> tuple[int, ...]:
+    """Our order of a kernel's axes, (window, inputs, outputs), as (outputs, inputs, window)."""
+    last = len(spec.shape) - 1
+    return (0,) if last == 0 else (last, last - 1, *range(last - 1))
+
+
+def tokenizer_shapes(source: Source, declared: Declared) -> dict[str, tuple[int, ...]]:
+    """Official name -> shape of every tensor that makes a network."""
+    return {source.official_name(path): official_shape(spec) for path, spec in declared.leaves().items()}
+
+
+def tokenizer_params(
+    source: Source, declared: Declared, tensors: Mapping[str, Stored], where: str
+) -> Params:
+    """Our parameters, float32. Raises ConfigError naming tensors that are missing, too many, of another
+    shape or no floats."""
+    check_names(tokenizer_shapes(source, declared), {n: t.shape for n, t in tensors.items()}, where)
+    foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
+    require(not foreign, f"{where}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
+
+    def read(path: str, spec: ParamSpec) -> jnp.ndarray:
+        values = tensors[source.official_name(path)].read().astype(np.float32)
+        order = _reversed(spec)
+        return jnp.asarray(values.reshape([spec.shape[i] for i in order]).transpose(np.argsort(order)))
+
+    return nested({path: read(path, spec) for path, spec in declared.leaves().items()})
+
+
+# --- Files -----------------------------------------------------------------------------------
+
+
+def read_magvit2(
+    path: Path, *, image_size: int = 256, compute_dtype: Dtype = "float32"
+) -> Magvit2Tokenizer:
+    """From `magvit2.ckpt`, a safetensors file, or a directory of either with config.json.
+
+    Raises ConfigError naming what of the file is not as it should be.
+    """
+    path = Path(path)
+    ours: dict[str, Any] = {"image_size": image_size, "compute_dtype": compute_dtype}
+    config = Magvit2Config(**ours)
+    if path.is_dir():
+        official = read_config(path)
+        # Odd numbers of bits do not make two factors.
+        ours["factors"] = 1 if official.get("z_channels", 0) % 2 else config.factors
+        config = MAGVIT2.config(official, str(path / "config.json"), **ours)
+    tensors = read_tensors(path)
+    kept = {name: t for name, t in tensors.items() if not name.startswith(IGNORED)}
+    declared = Magvit2Tokenizer.declare(config)
+    return Magvit2Tokenizer(config, tokenizer_params(MAGVIT2, declared, kept, str(path)))
+
+
+def read_svd_vae(
+    directory: Path, *, image_size: int = 256, patch: int = 2, compute_dtype: Dtype = "float32"
+) -> SvdVaeTokenizer:
+    """From a directory of the diffusers library: config.json and diffusion_pytorch_model.safetensors.
+
+    Raises ConfigError naming what of the files is not as it should be.
+    """
+    directory = Path(directory)
+    config = SVD_VAE.config(
+        read_config(directory),
+        str(directory / "config.json"),
+        image_size=image_size,
+        patch=patch,
+        compute_dtype=compute_dtype,
+    )
+    declared = SvdVaeTokenizer.declare(config)
+    params = tokenizer_params(SVD_VAE, declared, read_tensors(directory), str(directory))
+    return SvdVaeTokenizer(config, params)
+
+
+def read_tensors(path: Path) -> dict[str, Stored]:
+    """name -> tensor of a weight file, or of the one in a directory. Raises ConfigError if there is none."""
+    if path.is_dir():
+        found = [path / name for name in FILES if (path / name).is_file()]
+        require(bool(found), f"{path} has none of {', '.join(FILES)}")
+        path = found[0]
+    require(path.is_file(), f"no file or directory at {path}")
+    if path.suffix == ".safetensors":
+        return read_safetensors(path)
+    return read_torch(path, within="state_dict")
+
+
+def find_reader(path: Path) -> Callable[..., BaseTokenizer]:
+    """`read_svd_vae` for a directory whose config.json is of that VAE, else `read_magvit2`.
+
+    Raises ConfigError for a directory of anything else.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return read_magvit2
+    config = read_config(path)
+    name = config.get("_class_name")
+    if name == "AutoencoderKLTemporalDecoder":
+        return read_svd_vae
+    require(
+        name is None and "ch_mult" in config,
+        f"{path / 'config.json'} describes {name or 'no tokenizer'}; supported are the "
+        "AutoencoderKLTemporalDecoder of diffusers and the MAGVIT2 tokenizer (ch_mult, z_channels, ...)",
+    )
+    return read_magvit2

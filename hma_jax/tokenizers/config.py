@@ -1,0 +1,188 @@
+"""Configurations of the tokenizers that are not trained here: two pretrained ones, and pixels.
+
+The trainable one is `hma_jax.config.TokenizerConfig`. All say how large an image is and what its
+tokens are; `kind` tells them apart where a configuration may be any of them. Nothing here imports
+JAX.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hma_jax.config import TokenizerConfig, require
+
+Dtype = Literal["float32", "bfloat16"]
+
+
+class Square:
+    """What follows from `image_size` and `token_size`: tokens on a square grid."""
+
+    image_size: int
+
+    @property
+    def token_size(self) -> int:
+        """Pixels along one side of a token."""
+        raise NotImplementedError
+
+    @property
+    def grid(self) -> int:
+        """Tokens along one side of the image."""
+        return self.image_size // self.token_size
+
+    @property
+    def tokens(self) -> int:
+        """S: tokens per frame."""
+        return self.grid**2
+
+    def _check_size(self, name: str) -> None:
+        require(
+            self.image_size >= 1 and self.image_size % self.token_size == 0,
+            f"{name}.image_size {self.image_size} is not a multiple of {self.token_size}, a token's side",
+        )
+
+
+class Ids(Square):
+    """Tokens are ids of `bits` binary channels, split evenly into `factors`."""
+
+    bits: int
+    factors: int
+
+    @property
+    def token_channels(self) -> int:
+        return 0
+
+    @property
+    def factor_vocab(self) -> int:
+        """V: entries per factor."""
+        return 2 ** (self.bits // self.factors)
+
+    @property
+    def vocab_size(self) -> int:
+        """V^Q."""
+        return 2**self.bits
+
+
+class Latents(Square):
+    """Tokens are `patch` x `patch` cells of `cell_channels` values each, flattened row by row."""
+
+    patch: int
+    factors = 0
+    factor_vocab = 0
+    vocab_size = 0
+
+    @property
+    def cell_channels(self) -> int:
+        raise NotImplementedError
+
+    @property
+    def token_channels(self) -> int:
+        """C: values per token."""
+        return self.patch**2 * self.cell_channels
+
+
+@dataclass(frozen=True)
+class Magvit2Config(Ids):
+    """The 1X / Open-MAGVIT2 image tokenizer; defaults are the published one (2^18 codes).
+
+    Reference, appendix A. Every level but the last halves the image.
+    """
+
+    kind: Literal["magvit2"] = "magvit2"
+    image_size: int = 256
+    channels: int = 128  # of the first level
+    multipliers: tuple[int, ...] = (1, 1, 2, 2, 4)  # of `channels`, level by level
+    res_blocks: int = 2  # per level, and in the middle
+    bits: int = 18
+    groups: int = 32  # of the normalisations
+    factors: int = 2
+    # DIFFERS: the release encodes in bfloat16, where latents near zero change their bit.
+    compute_dtype: Dtype = "float32"
+
+    def __post_init__(self):
+        require(len(self.multipliers) >= 1, "magvit2.multipliers is empty; give one per level")
+        _check_levels("magvit2", [self.channels * m for m in self.multipliers], self.groups)
+        require(self.channels % self.groups == 0, f"magvit2.channels {self.channels} do not fit its groups")
+        require(self.res_blocks >= 1, f"magvit2.res_blocks must be at least 1, got {self.res_blocks}")
+        require(
+            self.factors >= 1 and self.bits >= 1 and self.bits % self.factors == 0,
+            f"magvit2.bits {self.bits} do not split into {self.factors} equal factors",
+        )
+        require(self.bits <= 24, f"magvit2.bits must be at most 24, got {self.bits}")
+        self._check_size("magvit2")
+
+    @property
+    def token_size(self) -> int:
+        return 2 ** (len(self.multipliers) - 1)
+
+
+@dataclass(frozen=True)
+class SvdVaeConfig(Latents):
+    """The VAE of Stable Video Diffusion (AutoencoderKLTemporalDecoder); defaults are the published one.
+
+    An image of 256 pixels becomes 32 x 32 cells of 4 channels, and as released 2 x 2 cells make one
+    token. Tokens are the posterior mean times `scale`, what released models see: about unit
+    deviation. (The release stores the mean itself and multiplies when it loads.)
+    """
+
+    kind: Literal["svd-vae"] = "svd-vae"
+    image_size: int = 256
+    channels: tuple[int, ...] = (128, 256, 512, 512)  # level by level; all but the last halve the image
+    layers: int = 2  # residual blocks per level; the decoder has one more
+    latent_channels: int = 4
+    groups: int = 32
+    scale: float = 0.18215
+    patch: int = 2  # cells along one side of a token
+    compute_dtype: Dtype = "float32"
+
+    def __post_init__(self):
+        require(len(self.channels) >= 1, "svd-vae.channels is empty; give one number per level")
+        _check_levels("svd-vae", self.channels, self.groups)
+        for name in ("layers", "latent_channels", "patch"):
+            require(getattr(self, name) >= 1, f"svd-vae.{name} must be at least 1, got {getattr(self, name)}")
+        require(self.scale > 0, f"svd-vae.scale must be positive, got {self.scale}")
+        self._check_size("svd-vae")
+
+    @property
+    def cell_channels(self) -> int:
+        return self.latent_channels
+
+    @property
+    def token_size(self) -> int:
+        return 2 ** (len(self.channels) - 1) * self.patch
+
+
+@dataclass(frozen=True)
+class PixelsConfig(Latents):
+    """No network: a token is a patch of pixels, in -1..1 divided by `std`."""
+
+    kind: Literal["pixels"] = "pixels"
+    image_size: int = 64
+    patch: int = 8
+    std: float = 0.5  # of pixels in -1..1, about that of natural images
+
+    def __post_init__(self):
+        require(self.patch >= 1, f"pixels.patch must be at least 1, got {self.patch}")
+        require(self.std > 0, f"pixels.std must be positive, got {self.std}")
+        self._check_size("pixels")
+
+    @property
+    def cell_channels(self) -> int:
+        return 3
+
+    @property
+    def token_size(self) -> int:
+        return self.patch
+
+
+AnyTokenizerConfig = TokenizerConfig | Magvit2Config | SvdVaeConfig | PixelsConfig
+
+
+def _check_levels(name: str, widths: list[int] | tuple[int, ...], groups: int) -> None:
+    """Raises ConfigError unless every level's channels split into groups of normalisation."""
+    require(groups >= 1, f"{name}.groups must be at least 1, got {groups}")
+    for width in widths:
+        require(
+            width >= 1 and width % groups == 0,
+            f"{name}: a level of {width} channels does not split into {groups} groups",
+        )

@@ -1,0 +1,39 @@
+"""No tokenizer at all: tokens are the pixels themselves, patch by patch.
+
+Store, model and decoding are the same as for latents. Nothing is lost: the way back ends at the
+pixels it began with, also from float16, as the token store keeps latents.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from flax import nnx
+
+from hma_jax.model.frames import patchify, unpatchify
+from hma_jax.params import Declared, Params, declare
+from hma_jax.tokenizers.config import PixelsConfig
+from hma_jax.tokenizers.network import normalise, to_pixels
+from hma_jax.tokenizers.shared import BaseTokenizer
+
+
+class PixelTokenizer(BaseTokenizer):
+    """Tokens are float32 [B, S, 3 patch^2]: a patch row by row, each pixel's channels together."""
+
+    kind = "pixels"
+    config_class = PixelsConfig
+
+    def __init__(self, config: PixelsConfig, params: Params | None = None, **placement: Any):
+        super().__init__(config, params or {}, **placement)
+
+    @classmethod
+    def declare(cls, config: PixelsConfig) -> Declared:
+        del config
+        return declare(nnx.Module)  # no parameters
+
+    def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
+        return patchify(normalise(images) / self.config.std, self.config.patch)
+
+    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        return to_pixels(unpatchify(tokens, self.config.patch, self.grid) * self.config.std)

@@ -1,0 +1,202 @@
+"""What every tokenizer here shares: checked weights, identity, equal pieces over the devices.
+
+What a token is, and the way there and back, is up to the kinds.
+"""
+
+from __future__ import annotations
+
+import abc
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from hma_jax.config import ConfigError, MeshConfig, require, to_dict
+from hma_jax.params import Declared, Params, path_name
+from hma_jax.sharding import RULES, make_mesh
+from hma_jax.tokenizers.base import PIECE, in_pieces
+
+
+class BaseTokenizer(abc.ABC):
+    """Implements `base.Tokenizer` but for the meaning of a token.
+
+    `piece` images at a time go through the network on each device. With more devices a call takes
+    more pieces, and each device still sees `piece` images: tokens do not depend on how many there are.
+    """
+
+    kind: ClassVar[str]
+    config_class: ClassVar[type]
+    ignored: ClassVar[tuple[str, ...]] = ()
+    """Settings that mean nothing for this kind: they are no part of the identity."""
+    measured: ClassVar[tuple[str, ...]] = ()
+    """Numbers beside the weights that the tokens depend on: attributes, and arguments by name."""
+
+    def __init__(
+        self,
+        config: Any,
+        params: Params,
+        *,
+        devices: Sequence[jax.Device] | None = None,
+        piece: int | None = None,
+    ):
+        """`devices` share every batch; default: all of this process.
+
+        Raises ConfigError if `params` are not those that `config` declares.
+        """
+        declared = self.declare(config)
+        expected = {name: spec.shape for name, spec in declared.leaves().items()}
+        given = {path_name(p): tuple(x.shape) for p, x in jax.tree.leaves_with_path(params)}
+        for name in sorted(expected.keys() | given.keys()):
+            if expected.get(name) != given.get(name):
+                raise ConfigError(
+                    f"tokenizer weights do not fit their configuration: {name} should be "
+                    f"{expected.get(name, 'absent')} but is {given.get(name, 'absent')}"
+                )
+        self.config = config
+        self.params = params
+        self.piece = self.default_piece(config) if piece is None else piece
+        self._declared = declared
+        self._mesh = make_mesh(MeshConfig(), list(devices or jax.local_devices()))
+        self._encode = self._shared_out(self.encode_fn)
+        self._decode = self._shared_out(self._decode_to_uint8)
+
+    @classmethod
+    @abc.abstractmethod
+    def declare(cls, config: Any) -> Declared:
+        """The network's parameters, without arrays."""
+
+    @classmethod
+    def default_piece(cls, config: Any) -> int:
+        del config
+        return PIECE
+
+    # --- Facts -------------------------------------------------------------------------------
+
+    @property
+    def image_size(self) -> int:
+        return self.config.image_size
+
+    @property
+    def grid(self) -> int:
+        return self.config.grid
+
+    @property
+    def tokens(self) -> int:
+        return self.config.tokens
+
+    @property
+    def channels(self) -> int:
+        return self.config.token_channels
+
+    @property
+    def vocab_size(self) -> int:
+        return self.config.vocab_size
+
+    @property
+    def factors(self) -> int:
+        return 0 if self.channels else self.config.factors
+
+    @property
+    def factor_vocab(self) -> int:
+        return self.config.factor_vocab
+
+    @cached_property
+    def identity(self) -> str:
+        settings = {k: v for k, v in to_dict(self.config).items() if k not in self.ignored}
+        named = [self.kind, settings, *(getattr(self, name) for name in self.measured)]
+        digest = hashlib.sha256(json.dumps(named, sort_keys=True).encode())
+        for path, array in jax.tree.leaves_with_path(self.params):
+            digest.update(path_name(path).encode())
+            digest.update(np.ascontiguousarray(array, "<f4").tobytes())
+        return digest.hexdigest()[:16]
+
+    # --- Images in and out -------------------------------------------------------------------
+
+    @abc.abstractmethod
+    def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
+        """Pure: images [B, H, W, 3] in 0..255 -> tokens, int32 [B, S] or float32 [B, S, C]."""
+
+    @abc.abstractmethod
+    def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure: tokens [B, S] or [B, S, C] -> float32 [B, H, W, 3] in 0..255."""
+
+    def encode(self, images: np.ndarray) -> np.ndarray:
+        """uint8 [B, H, W, 3] -> int32 [B, S] or float32 [B, S, C].
+
+        Raises ConfigError for another shape or type.
+        """
+        images = np.asarray(images)
+        shape = (self.image_size, self.image_size, 3)
+        require(
+            images.dtype == np.uint8 and images.ndim == 4 and images.shape[1:] == shape,
+            f"the tokenizer encodes uint8 images [B, {', '.join(map(str, shape))}], "
+            f"got {images.dtype} {list(images.shape)}",
+        )
+        return in_pieces(lambda piece: self._encode(self._placed, piece), images, self.at_once)
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """Tokens [B, S] or [B, S, C] -> uint8 [B, H, W, 3].
+
+        Raises ConfigError for another shape or type, and for values that are no tokens.
+        """
+        tokens = self._checked(np.asarray(tokens))
+        return in_pieces(lambda piece: self._decode(self._placed, piece), tokens, self.at_once)
+
+    def _decode_to_uint8(self, params: Params, tokens: jax.Array) -> jax.Array:
+        # DIFFERS: the release truncates, which darkens every image by half a grey level.
+        return jnp.round(self.decode_fn(params, tokens)).astype(jnp.uint8)
+
+    def _checked(self, tokens: np.ndarray) -> np.ndarray:
+        """`tokens` in the type that is decoded; ConfigError if they cannot be."""
+        if self.channels:
+            return self._checked_latents(tokens)
+        require(
+            tokens.ndim == 2 and tokens.shape[1] == self.tokens,
+            f"the tokenizer decodes ids [B, {self.tokens}], got {list(tokens.shape)}",
+        )
+        low, high = int(tokens.min(initial=0)), int(tokens.max(initial=0))
+        require(
+            low >= 0 and high < self.vocab_size,
+            f"token ids must lie in [0, {self.vocab_size}), got {low} to {high}; "
+            "is a mask id left, or were they made by another tokenizer?",
+        )
+        return tokens.astype(np.int32)
+
+    def _checked_latents(self, tokens: np.ndarray) -> np.ndarray:
+        shape = (self.tokens, self.channels)
+        require(
+            tokens.dtype.kind == "f" and tokens.ndim == 3 and tokens.shape[1:] == shape,
+            f"the tokenizer decodes latents, float [B, {self.tokens}, {self.channels}], "
+            f"got {tokens.dtype} {list(tokens.shape)}",
+        )
+        tokens = tokens.astype(np.float32)
+        require(bool(np.isfinite(tokens).all()), "latents are not finite; did the model diverge?")
+        return tokens
+
+    # --- Devices -----------------------------------------------------------------------------
+
+    @property
+    def at_once(self) -> int:
+        """Images of one call."""
+        return self.piece * self._mesh.size
+
+    def _shared_out(self, function: Callable[[Params, jax.Array], jax.Array]) -> Callable:
+        """`function` compiled; every device applies it to its own rows of the batch."""
+        if self._mesh.size == 1:
+            return jax.jit(function)
+        whole, rows = PartitionSpec(), PartitionSpec(RULES["B"])
+        # One program per device, of the shape that a single one has: the same rounding on any number.
+        return jax.jit(jax.shard_map(function, mesh=self._mesh, in_specs=(whole, rows), out_specs=rows))
+
+    @cached_property
+    def _placed(self) -> Params:
+        """The parameters where the devices need them."""
+        if self._mesh.size == 1:
+            return self.params
+        return jax.device_put(self.params, NamedSharding(self._mesh, PartitionSpec()))

@@ -1,0 +1,127 @@
+"""Tokenizers that are not trained here, through the commands: made, adopted by a study, evaluated with."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_pipelines.evalset import eval_batches
+from data_pipelines.registry import get_spec
+from experiments.cli import main
+from experiments.presets import get_preset
+from experiments.study import on_tokenizer, override
+from experiments.trial import open_materials
+from experiments.workspace import Workspace
+from hma_jax.config import ConfigError, TokenizerConfig, from_json, to_json
+from hma_jax.tokenizers.config import Magvit2Config, PixelsConfig, SvdVaeConfig
+from hma_jax.tokenizers.io import load_tokenizer
+from tests.data_pipelines.fakes import write_rlds
+from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensors, write_checkpoint
+from tests.hma_jax.pretrained import write_published
+
+ARM = get_spec("two_link_arm_joint_targets")
+LENGTHS = [10, 11, 12, 13, 14, 15]
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory) -> str:
+    return str(write_rlds(tmp_path_factory.mktemp("rlds"), ARM, LENGTHS))
+
+
+def hma(*arguments: object) -> int:
+    return main([str(a) for a in arguments])
+
+
+def imported(root: Path, kind: str) -> Path:
+    source = write_published(root / "published", kind)
+    assert hma("tokenizer", "import", source, "--out", root / "tokenizer", "--image-size", 16) == 0
+    return root / "tokenizer"
+
+
+def released(folder: Path, vocab: int) -> Path:
+    """A checkpoint of the official release for 64 tokens of the arm; its weights mean nothing."""
+    robots = [(ARM.name, ARM.action_dim, ARM.stride)]
+    config = official_config(DISCRETE, robots, S=64, image_vocab_size=vocab, T=4)
+    tensors = random_tensors(config, robots)
+    small = {name: x if "preprocessor" in name else np.float32(0.02) * x for name, x in tensors.items()}
+    return write_checkpoint(folder, config, small)
+
+
+def test_released_model_is_evaluated_on_ids_of_an_imported_tokenizer(arm, tmp_path, capsys):
+    """Random weights in both; but for their sizes, all is as with the published ones."""
+    tokenizer, out = imported(tmp_path, "magvit2"), tmp_path / "out"
+    common = ("--preset", "smoke", "--out", out, "--data", arm, "--tokenizer", tokenizer)
+    assert hma("tokenize", *common) == 0
+    assert hma("convert", "from-official", released(tmp_path / "a", 64), "--out", tmp_path / "run") == 0
+    capsys.readouterr()
+    assert hma("evaluate", tmp_path / "run", *common) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"taken for those of the tokenizer here, {load_tokenizer(tokenizer).identity}" in said
+    evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert evaluation[ARM.name]["perplexity"]["mean"] == pytest.approx(64, rel=0.3)
+
+    assert hma("convert", "from-official", released(tmp_path / "b", 256), "--out", tmp_path / "run2") == 0
+    assert hma("evaluate", tmp_path / "run2", *common) == 2
+    assert "2 factors with 16 entries" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["svd-vae", "pixels"])
+def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind, arm, tmp_path):
+    if kind == "pixels":
+        tokenizer = tmp_path / "tokenizer"
+        assert hma("tokenizer", "pixels", "--out", tokenizer, "--image-size", 16, "--patch", 4) == 0
+    else:
+        tokenizer = imported(tmp_path, kind)
+    common = ("--preset", "smoke-continuous", "--out", tmp_path / "out", "--data", arm)
+    assert hma("tokenize", *common, "--tokenizer", tokenizer) == 0
+    materials = open_materials(Workspace(tmp_path / "out"))
+    assert materials.tokenizer.identity == load_tokenizer(tokenizer).identity
+    table = materials.store.embodiment_table([ARM.name])
+    batch = next(eval_batches(materials.store, table, materials.manifest, 2))
+    model = on_tokenizer(get_preset("smoke-continuous"), materials.tokenizer.config).model
+    assert batch["tokens"].shape == (2, 4, model.tokens, model.diffusion.token_channels)
+    frames = materials.tokenizer.decode(batch["tokens"][0])
+    assert frames.shape == batch["frames"][0].shape
+    if kind == "pixels":  # nothing is lost on the way through the store
+        assert np.array_equal(frames, batch["frames"][0])
+
+
+def test_importing_again_overwrites_nothing(tmp_path, capsys):
+    tokenizer = imported(tmp_path, "svd-vae")
+    before = (tokenizer / "weights.npz").read_bytes()
+    assert hma("tokenizer", "import", tmp_path / "published", "--out", tokenizer) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert (tokenizer / "weights.npz").read_bytes() == before
+
+
+# --- Studies -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("preset", "tokenizer", "expected"),
+    [
+        ("smoke", Magvit2Config(), {"tokens": 256, "factors": 2, "factor_vocab": 512}),
+        ("paper", Magvit2Config(), {"tokens": 256, "factors": 2, "factor_vocab": 512}),
+        ("cpu", TokenizerConfig(image_size=64, bits=8), {"tokens": 64, "factors": 2, "factor_vocab": 16}),
+        ("smoke-continuous", SvdVaeConfig(), {"tokens": 256, "channels": 4, "patch": 2}),
+        ("smoke-continuous", SvdVaeConfig(patch=1), {"tokens": 1024, "channels": 4, "patch": 1}),
+        ("smoke-continuous", PixelsConfig(), {"tokens": 64, "channels": 3, "patch": 8}),
+    ],
+)
+def test_the_model_takes_what_the_given_tokenizer_makes(preset, tokenizer, expected):
+    study = on_tokenizer(get_preset(preset), tokenizer)
+    fields = {**vars(study.model), **(vars(study.model.diffusion) if study.model.diffusion else {})}
+    fields["tokens"] = study.model.tokens
+    assert {name: fields[name] for name in expected} == expected
+    assert from_json(type(study), to_json(study)) == study
+    assert override(study, ["train.steps=7"]).tokenizer == tokenizer
+
+
+def test_ids_and_latents_do_not_mix():
+    with pytest.raises(ConfigError, match="makes latents, the model of preset smoke takes ids"):
+        on_tokenizer(get_preset("smoke"), SvdVaeConfig())
+    with pytest.raises(ConfigError, match="makes ids, the model of preset smoke-continuous takes latents"):
+        on_tokenizer(get_preset("smoke-continuous"), Magvit2Config())
