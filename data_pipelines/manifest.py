@@ -7,7 +7,7 @@ the same way gives the same manifest, and its hash identifies the data of a run.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from data_pipelines.errors import DataError
@@ -17,6 +17,8 @@ from hma_jax.embodiments import Embodiment
 
 FILE = "manifest.json"
 SPLITS = ("train", "val")
+FORMAT = 2
+"""Of the store's layout; 1 had one file per split."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,21 @@ class SplitFacts:
     episodes: tuple[int, ...] = ()  # index in the source
     steps: tuple[int, ...] = ()  # native frames N
     content: str = ""  # hash over all records
+    parts: tuple[int, ...] = ()  # episodes in each part; there is no file for 0
 
     @property
     def native_frames(self) -> int:
         return sum(self.steps)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Episodes that could not be used."""
+
+    reason: str
+    file: str = ""  # name of the shard or file they lie in
+    offset: int = -1  # of the record's first byte there; -1: unknown
+    episodes: int = 1
 
 
 @dataclass(frozen=True)
@@ -78,8 +91,10 @@ class Manifest:
     action_std: tuple[float, ...]
     train: SplitFacts
     val: SplitFacts
-    skipped: dict[str, int] = field(default_factory=dict)  # reason -> episodes left out
-    format: int = 1
+    action_min: tuple[float, ...] = ()
+    action_max: tuple[float, ...] = ()
+    skipped: tuple[Loss, ...] = ()  # what was left out
+    format: int = FORMAT
 
     @property
     def stride(self) -> int:
@@ -90,6 +105,11 @@ class Manifest:
     def frame_step(self) -> int:
         """Native frames per stored frame."""
         return self.settings.frame_step
+
+    @property
+    def lost(self) -> int:
+        """Episodes left out."""
+        return sum(loss.episodes for loss in self.skipped)
 
     def split(self, name: str) -> SplitFacts:
         require(name in SPLITS, f"split must be 'train' or 'val', got {name!r}")
@@ -116,13 +136,20 @@ class Manifest:
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def part_name(split: str, part: int, parts: int) -> str:
+    """The file with a part's episodes of one split."""
+    return f"{split}-{part:05d}-of-{parts:05d}.array_record"
+
+
 def load_manifest(path: Path) -> Manifest:
     """Reads a manifest. Raises DataError if it is missing, damaged or of another format."""
     advice = "Remove the dataset from the store and tokenise it again."
     try:
         values = json.loads(path.read_text())
-        if values.get("format") != 1:
-            raise DataError(f"{path}: manifest format {values.get('format')!r}; this reads 1. {advice}")
+        if values.get("format") != FORMAT:
+            raise DataError(
+                f"{path}: manifest format {values.get('format')!r}; this reads {FORMAT}. {advice}"
+            )
         return from_dict(Manifest, values)
     except OSError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
