@@ -16,42 +16,19 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from data_pipelines.errors import DataError
 from data_pipelines.manifest import FILE, SPLITS, Loss, Manifest, SplitFacts, load_manifest
 from data_pipelines.moments import merge_all
-from data_pipelines.order import stream_seed
 from data_pipelines.part import FACTS, Made, Part, PartFacts, read_part, sync, write_part
 from data_pipelines.scratch import scratch
+from data_pipelines.share import Share
 from hma_jax.config import ConfigError, diff, require, stable_hash
 
 Progress = Callable[[int, int], None]
 """Called with the episodes done and all, of this process's share."""
-
-
-@dataclass(frozen=True)
-class Share:
-    """Process `process` of `processes` that work on the same store."""
-
-    process: int = 0
-    processes: int = 1
-
-    def __post_init__(self):
-        require(self.processes >= 1, f"processes must be at least 1, got {self.processes}")
-        require(
-            0 <= self.process < self.processes,
-            f"process must lie in [0, {self.processes}), got {self.process}",
-        )
-
-    def of(self, parts: Sequence[Part], name: str) -> list[Part]:
-        """The parts of dataset `name` that are this process's.
-
-        Datasets start at different processes: many of one part each are spread too.
-        """
-        first = stream_seed("share", name)
-        return [part for part in parts if (first + part.number) % self.processes == self.process]
 
 
 def write_dataset(

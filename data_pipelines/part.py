@@ -14,7 +14,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -147,20 +148,28 @@ class _SplitWriter:
 
     def add(self, episode: StoredEpisode) -> None:
         record = encode_episode(episode)
-        if self._writer is None:
-            self._writer = array_record_module.ArrayRecordWriter(str(self._path), self._options)
-        self._writer.write(record)
+        with self._errors():
+            if self._writer is None:
+                self._writer = array_record_module.ArrayRecordWriter(str(self._path), self._options)
+            self._writer.write(record)
         self._content.update(record)
         self._episodes.append(episode.episode)
         self._steps.append(len(episode.actions))
 
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """ArrayRecord reports a full disk, or a directory that is gone, as RuntimeError."""
+        try:
+            yield
+        except RuntimeError as error:
+            kind = OSError if self._path.parent.is_dir() else FileNotFoundError
+            raise kind(str(error)) from error
+
     def close(self) -> PartSplit:
         size = 0
         if self._writer is not None:
-            try:
+            with self._errors():
                 self._writer.close()
-            except RuntimeError as error:  # how ArrayRecord reports a full disk, if only here
-                raise OSError(str(error)) from error
             sync(self._path)
             size = self._path.stat().st_size
         digest = self._content.hexdigest()[:32]

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from data_pipelines.dataset_writer import Progress, Share, cut_parts, write_dataset
+from data_pipelines.dataset_writer import Progress, cut_parts, write_dataset
 from data_pipelines.episode_record import StoredEpisode, token_dtype
 from data_pipelines.errors import EpisodeError
 from data_pipelines.images import fit_image
@@ -27,6 +27,7 @@ from data_pipelines.part import Made, Part
 from data_pipelines.read_ahead import Begin, End, frames_ahead
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds import MAX_SKIPPED, RldsDataset
+from data_pipelines.share import Share
 from data_pipelines.splits import held_out
 from hma_jax.config import require
 

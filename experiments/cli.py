@@ -40,7 +40,8 @@ class Where:
     out: Path | None = None
     """Directory for everything that is written; runs/PRESET if not given."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
-    """Your RLDS directories, instead of the simulated suite. Their names must be in the registry."""
+    """Your RLDS directories, paths or URLs such as gs://..., instead of the simulated suite. Their names must
+    be in the registry."""
     tokenizer: Path | None = None
     """Directory of a trained tokenizer to use, instead of training one on the data."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
@@ -118,9 +119,27 @@ def tokenizer_train(where: OmitArgPrefixes[Where]) -> None:
 
 
 @app.command(name="tokenize")
-def tokenize(where: OmitArgPrefixes[Where]) -> None:
-    """Prepare everything up to training: suite, tokenizer, token store, evaluation windows."""
-    commands.tokenize(where.setting())
+def tokenize(
+    where: OmitArgPrefixes[Where],
+    process: int | None = None,
+    processes: int | None = None,
+    batch: int | None = None,
+    threads: int | None = None,
+) -> None:
+    """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
+
+    Killed at any point, the same command goes on and ends with the same bytes. Several processes
+    or machines share the work if each gets its number; SLURM's arrays and tasks are understood by
+    themselves. The tokenizer must be there then: --tokenizer, or `hma tokenizer train` before.
+
+    Args:
+        where: Study, data, output directory and settings. The output must be shared by all processes.
+        process: Number of this process, from 0 on.
+        processes: How many processes share the work; 1 for all of it, whatever SLURM says.
+        batch: Frames encoded at a time; 256 if not given. Changes no token.
+        threads: Threads that decode frames; one per core up to 8 if not given.
+    """
+    commands.tokenize(where.setting(), process, processes, batch, threads)
 
 
 @app.command(name="train")

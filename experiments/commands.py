@@ -6,6 +6,7 @@ Every command ends by saying what it wrote and what to run next.
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -30,8 +31,8 @@ from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import titles, unique_trials
-from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
-from hma_jax.config import ConfigError, MeshConfig, to_dict
+from experiments.workspace import Busy, Record, Workspace, load_record, merge_axes, save_record
+from hma_jax.config import ConfigError, MeshConfig, require, to_dict
 
 AXES = {
     "datasets": scale_datasets.plan,
@@ -67,13 +68,14 @@ def make_setting(
     tokenizer: Path | None = None,
 ) -> Setting:
     """The preset, on the user's data if given, with overrides. Touches no file but `data`."""
-    study = get_preset(preset)
+    study, directories = get_preset(preset), ()
     if data:
+        from data_pipelines.location import absolute
         from experiments.pipeline import name_datasets
 
         study = on_user_data(study, name_datasets(data))
+        directories = tuple(map(absolute, data))
     study = override(study, settings)
-    directories = tuple(str(Path(d).absolute()) for d in data)
     workspace = Workspace((out or Path("runs") / study.name).absolute())
     return Setting(study, directories, workspace, tokenizer and tokenizer.absolute())
 
@@ -224,12 +226,77 @@ def train_tokenizer(setting: Setting) -> None:
     wrote(workspace.tokenizer, then=next_command("tokenize", setting))
 
 
-def tokenize(setting: Setting) -> None:
-    from experiments.pipeline import prepare
+def tokenize(
+    setting: Setting,
+    process: int | None = None,
+    processes: int | None = None,
+    batch: int | None = None,
+    threads: int | None = None,
+) -> None:
+    """Everything up to training, or this process's share of the tokens."""
+    from data_pipelines.share import find_share
+    from experiments.pipeline import find_sources, find_suite, make_store, prepare
 
-    with setting.workspace.claimed():
-        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer)
-    wrote(setting.workspace.store, setting.workspace.manifest, then=next_command("train", setting))
+    study, workspace = setting.study, setting.workspace
+    share = find_share(process, processes, os.environ)
+    if share.processes > 1:
+        if share.told_by:
+            console.print(f"process {share.process} of {share.processes}, says {share.told_by}")
+        tokenizer = setting.tokenizer or workspace.tokenizer
+        require(
+            tokenizer.is_dir(),
+            f"{tokenizer}: no tokenizer. Make it before the work is shared: {next_command('tokenizer train', setting)}",
+        )
+        sources = find_sources(study, setting.data) if setting.data else find_suite(study, workspace)
+        unfinished = make_store(
+            study, workspace, sources, tokenizer=tokenizer, share=share, batch=batch, threads=threads
+        )
+        if unfinished:
+            console.print(
+                f"this share is done; {', '.join(unfinished)} will be complete when the others are. The last "
+                "process to end completes the store; the same command makes up for one that was lost",
+                soft_wrap=True,
+            )
+            return
+    try:
+        with workspace.claimed():
+            prepare(study, workspace, setting.data, setting.tokenizer, batch=batch, threads=threads)
+    except Busy:
+        if share.processes == 1:
+            raise
+        return  # another process of this job is doing it
+    show_store(workspace)
+    wrote(workspace.store, workspace.manifest, then=next_command("train", setting))
+
+
+def show_store(workspace: Workspace) -> None:
+    """What the token store holds, per dataset."""
+    import numpy as np
+
+    from data_pipelines.store import TokenStore
+
+    store = TokenStore(workspace.store)
+    columns = ("dataset", "train", "held out", "lost", "frames", "shortest", "median", "longest", "Hz", "stride")
+    table = tidy_table("The token store: episodes, native frames, lengths of training episodes", *columns)
+    for name in store.names:
+        manifest = store.manifest(name)
+        steps = manifest.train.steps
+        table.add_row(
+            name,
+            f"{len(steps)}",
+            f"{len(manifest.val.steps)}",
+            f"{manifest.lost}",
+            f"{manifest.train.native_frames + manifest.val.native_frames}",
+            f"{min(steps)}",
+            f"{np.median(steps):g}",
+            f"{max(steps)}",
+            f"{manifest.spec.hz:g}",
+            f"{manifest.stride}",
+        )
+    console.print(table)
+    for name in store.names:
+        for loss in store.manifest(name).skipped:
+            console.print(f"[yellow]lost[/] {name}: {escape(loss.reason)}", soft_wrap=True)
 
 
 def draw_again(out: Path) -> None:
