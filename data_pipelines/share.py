@@ -45,8 +45,8 @@ class Share:
 def find_share(process: int | None, processes: int | None, environ: Mapping[str, str]) -> Share:
     """As given, otherwise from SLURM (array jobs, tasks of srun, or both) or JAX_PROCESS_ID.
 
-    An array is taken to be 0, 1, ... in equal steps, as `--array=0-7` makes it. Raises
-    ConfigError for half an answer, and for an array with gaps.
+    Raises ConfigError for half an answer, and for an array that is not all of 0, 1, ... N: tasks
+    3 and 5 started again do not tell how many there were.
     """
     if processes == 1 and process is None:
         return Share()
@@ -82,14 +82,12 @@ def _array(environ: Mapping[str, str]) -> tuple[int, int, str] | None:
         return None
     values = {k: _number(environ, f"SLURM_ARRAY_TASK_{k}") for k in ("ID", "COUNT", "MIN", "MAX")}
     first, last, count = values["MIN"], values["MAX"], values["COUNT"]
-    step = (last - first) // max(count - 1, 1) or 1
-    index, rest = divmod(values["ID"] - first, step)
     require(
-        first == 0 and last == step * (count - 1) and rest == 0,
+        first == 0 and last == count - 1,
         f"a SLURM array of {count} tasks from {first} to {last} does not tell which share of the work "
         f"task {values['ID']} has: only --array=0-N does. {ADVICE}",
     )
-    return index, count, name
+    return values["ID"], count, name
 
 
 def _number(environ: Mapping[str, str], name: str) -> int:

@@ -51,4 +51,12 @@ if __name__ == "__main__":
     from hma_jax.tokenizers.io import load_tokenizer
 
     rlds, store, directory = map(Path, sys.argv[1:])
-    run(rlds, store, load_tokenizer(directory), part_size=60_000, batch=64)
+    tokenizer = load_tokenizer(directory)
+    tokenizer.encode(np.zeros((64, tokenizer.image_size, tokenizer.image_size, 3), np.uint8))  # compiled
+    said = []
+
+    def progress(done: int, total: int) -> None:
+        if not said:
+            said.append(print("at work", flush=True))
+
+    run(rlds, store, tokenizer, part_size=60_000, batch=64, progress=progress)
