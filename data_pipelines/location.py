@@ -56,7 +56,8 @@ def locate(text: str | Path | UPath) -> Location:
             "pip install 'hma-jax[remote]', or copy the dataset to a disk."
         ) from error
     except ValueError as error:
-        raise ConfigError(f"{text}: no location that fsspec knows ({error}). Correct its protocol.") from error
+        message = f"{text}: no location that fsspec knows ({error}). Correct its protocol."
+        raise ConfigError(message) from error
     return location
 
 

@@ -113,7 +113,8 @@ class _Reader:
         self._episodes, self._open_episode, self._fit = episodes, open_episode, fit
         self._frame_bytes, self._step = frame_bytes, frame_step
         self._budget = _Budget(AHEAD)
-        self._out: queue.SimpleQueue[Begin | End | tuple[Future, int] | BaseException | None] = queue.SimpleQueue()
+        # Begin, End, a frame as (future, its cost), an error to raise, or None at the end.
+        self._out: queue.SimpleQueue = queue.SimpleQueue()
         self._decoders = ThreadPoolExecutor(threads, "decode")
         self._openers = ThreadPoolExecutor(min(OPEN_AHEAD, threads), "open")
         self._thread = threading.Thread(target=self._run, name="read", daemon=True)

@@ -80,7 +80,8 @@ def dataset_name(directory: str | Location) -> str:
     try:
         return str(json.loads(path.read_text())["name"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path}: it does not name the dataset ({error}). Restore it as tfds wrote it.") from error
+        message = f"{path}: it does not name the dataset ({error}). Restore it as tfds wrote it."
+        raise DataError(message) from error
 
 
 def read_metadata(directory: Location, split: str) -> SplitMetadata:

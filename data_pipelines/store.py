@@ -19,6 +19,8 @@ from data_pipelines.manifest import FILE, SPLITS, Manifest, load_manifest, part_
 from hma_jax.config import ConfigError, stable_hash
 from hma_jax.embodiments import EmbodimentTable
 
+_File = tuple[str, str, int]  # dataset, split, part
+
 READ_OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 
 MOST_OPEN = 512
@@ -94,7 +96,7 @@ class TokenStore:
             for split in SPLITS
         }
         self._lock = threading.Lock()
-        self._readers: OrderedDict[tuple[str, str, int], array_record_module.ArrayRecordReader] = OrderedDict()
+        self._readers: OrderedDict[_File, array_record_module.ArrayRecordReader] = OrderedDict()
 
     def _locate(self, name: str, split: str, i: int) -> tuple[int, int]:
         """(part, position in it) of an episode."""

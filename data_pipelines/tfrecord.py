@@ -153,13 +153,13 @@ def open_record(path: str | Location, offset: int, length: int) -> Iterator[byte
         yield read_record(path, offset, length)
         return
     with open_ranges(path) as file:
+        footer = _read(file, path, offset, offset + HEADER + length, FOOTER)
         if not is_remote(path):
-            _verify(_stream(file, path, offset, length, None), _footer(file, path, offset, length), path, offset)
+            _verify(_stream(file, path, offset, length, None), footer, path, offset)
             yield FileView(file, offset + HEADER, length)
             return
         with tempfile.TemporaryFile() as copy:
-            crc = _stream(file, path, offset, length, copy)
-            _verify(crc, _footer(file, path, offset, length), path, offset)
+            _verify(_stream(file, path, offset, length, copy), footer, path, offset)
             copy.flush()
             yield FileView(DiskFile(copy.fileno()), 0, length)
 
@@ -205,10 +205,6 @@ def _read(file: Ranges, path: Location, record: int, at: int, length: int) -> by
     if len(data) < length:
         raise CorruptRecordError(path, record, "the file has become shorter since it was indexed")
     return data
-
-
-def _footer(file: Ranges, path: Location, offset: int, length: int) -> bytes:
-    return _read(file, path, offset, offset + HEADER + length, FOOTER)
 
 
 def _stream(file: Ranges, path: Location, offset: int, length: int, copy) -> int:

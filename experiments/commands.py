@@ -243,10 +243,8 @@ def tokenize(
         if share.told_by:
             console.print(f"process {share.process} of {share.processes}, says {share.told_by}")
         tokenizer = setting.tokenizer or workspace.tokenizer
-        require(
-            tokenizer.is_dir(),
-            f"{tokenizer}: no tokenizer. Make it before the work is shared: {next_command('tokenizer train', setting)}",
-        )
+        advice = f"Make it before the work is shared: {next_command('tokenizer train', setting)}"
+        require(tokenizer.is_dir(), f"{tokenizer}: no tokenizer. {advice}")
         sources = find_sources(study, setting.data) if setting.data else find_suite(study, workspace)
         unfinished = make_store(
             study, workspace, sources, tokenizer=tokenizer, share=share, batch=batch, threads=threads
@@ -276,8 +274,9 @@ def show_store(workspace: Workspace) -> None:
     from data_pipelines.store import TokenStore
 
     store = TokenStore(workspace.store)
-    columns = ("dataset", "train", "held out", "lost", "frames", "shortest", "median", "longest", "Hz", "stride")
-    table = tidy_table("The token store: episodes, native frames, lengths of training episodes", *columns)
+    lengths = ("shortest", "median", "longest")
+    title = "The token store: episodes, native frames, lengths of training episodes"
+    table = tidy_table(title, "dataset", "train", "held out", "lost", "frames", *lengths, "Hz", "stride")
     for name in store.names:
         manifest = store.manifest(name)
         steps = manifest.train.steps

@@ -92,8 +92,8 @@ def tokenize(root: Path) -> None:
     frames = manifest.train.native_frames + manifest.val.native_frames
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size = sum(p.stat().st_size for p in root.iterdir()) / 1e6
-    print(f"peak {peak:.0f} MB for {size:.0f} MB in {len(manifest.train.steps) + len(manifest.val.steps)} records, "
-          f"{frames} frames, {seconds:.1f} s")  # fmt: skip
+    records = len(manifest.train.steps) + len(manifest.val.steps)
+    print(f"peak {peak:.0f} MB for {size:.0f} MB in {records} records, {frames} frames, {seconds:.1f} s")
 
 
 if __name__ == "__main__":

@@ -127,9 +127,10 @@ def hold(root: Path) -> None:
 def test_publishing_is_cleaned_up_after(rlds, undisturbed, tmp_path):
     """As if the process had been killed between its last two steps."""
     run(rlds, tmp_path)
-    plan = run(rlds, tmp_path / "other", share=Share(0, 2)) is None and work_directory(tmp_path / "other").name
-    (tmp_path / f"{plan}.aside").mkdir()
-    (tmp_path / f"{plan}.aside" / "rest").touch()
+    assert run(rlds, tmp_path / "other", share=Share(0, 2)) is None
+    aside = tmp_path / f"{work_directory(tmp_path / 'other').name}.aside"
+    aside.mkdir()
+    (aside / "rest").touch()
     assert run(rlds, tmp_path) is not None
     assert {k: v for k, v in contents(tmp_path).items() if not k.startswith("other")} == undisturbed
 

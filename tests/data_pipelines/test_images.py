@@ -75,7 +75,7 @@ def resize_and_crop(image: np.ndarray, size: int) -> np.ndarray:
 @pytest.mark.parametrize("size", [64, 96])
 @pytest.mark.parametrize(
     "shape",
-    [(480, 640), (640, 480), (720, 1280), (1280, 720), (1080, 1920), (97, 211), (64, 1500), (50, 41), (33, 33)],
+    [(480, 640), (640, 480), (720, 1280), (1280, 720), (1080, 1920), (97, 211), (64, 1500), (50, 41), (9, 9)],
 )
 def test_resizing_equals_its_definition_at_every_aspect(shape, size):
     """Portrait, landscape, beyond the 1024 pixels where the release distorts, odd margins, enlarged."""

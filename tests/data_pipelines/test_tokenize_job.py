@@ -101,7 +101,8 @@ def test_statistics_are_over_native_train_actions(tmp_path, rlds):
     rows = [(e, t, 0) for e in manifest.train.episodes for t in range(5 + e)]
     np.testing.assert_allclose(manifest.action_mean, np.mean(rows, axis=0), rtol=1e-12)
     np.testing.assert_allclose(manifest.action_std, np.std(rows, axis=0), rtol=1e-12)
-    assert manifest.action_min == tuple(np.min(rows, axis=0)) and manifest.action_max == tuple(np.max(rows, axis=0))
+    assert manifest.action_min == tuple(np.min(rows, axis=0))
+    assert manifest.action_max == tuple(np.max(rows, axis=0))
 
 
 def test_all_phases_can_be_stored(tmp_path, rlds):
