@@ -131,7 +131,7 @@ class RldsDataset:
         self.check_keys(image_key, action_keys)
         image_key, action_keys = step_key(image_key), [step_key(k) for k in action_keys]
         with self._open(i, [image_key, *action_keys, SUCCESS_KEY]) as record:
-            encoded = record.get(image_key, [])
+            encoded = self._frames_of(i, record, image_key)
             actions = self._actions(i, record, action_keys, steps=len(encoded))
             success = record.get(SUCCESS_KEY)
             known = success is not None and len(success) == 1
@@ -161,9 +161,7 @@ class RldsDataset:
         self.check_keys(image_key, ())
         image_key = step_key(image_key)
         with self._open(i, [image_key]) as record:
-            encoded = record.get(image_key, [])
-            if not len(encoded):
-                raise self._unusable(i, f"it has no frames in {image_key!r}; leave it out")
+            encoded = self._frames_of(i, record, image_key)
             chosen = choose(len(encoded))
             return [self._image(i, image_key, t, self._encoded(i, image_key, t, encoded)) for t in chosen]
 
@@ -282,6 +280,12 @@ class RldsDataset:
         path, offset, _ = self._place(i)
         where = f"{self.name}, episode {i} ({path.name}, byte {offset})"
         return EpisodeError(f"{where}: {what}").at(path, offset)
+
+    def _frames_of(self, i: int, record: dict[str, Feature], key: str) -> Sequence[bytes]:
+        encoded = record.get(key, ())
+        if not len(encoded):
+            raise self._unusable(i, f"it has no frames in {key!r}; leave it out with corrupt='skip'")
+        return encoded
 
     def _encoded(self, i: int, key: str, step: int, encoded: Sequence[bytes]) -> bytes:
         try:
