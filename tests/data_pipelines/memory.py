@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import json
-import resource
+import re
 import subprocess
 import sys
 import time
@@ -75,7 +75,7 @@ def _features(episode: int, frames: int) -> dict:
 
 
 def tokenize(root: Path) -> None:
-    """Tokenises and prints the peak, in MB."""
+    """Tokenises and prints the peak, in MB (of the kernel: ru_maxrss counts the parent's too)."""
     from data_pipelines.tokenize_job import tokenize_dataset
     from hma_jax.config import TokenizerConfig
     from hma_jax.host_memory import keep_freed_memory
@@ -90,7 +90,7 @@ def tokenize(root: Path) -> None:
     manifest = tokenize_dataset(SPEC, root, tokenizer, store, min_val=1)
     seconds = time.monotonic() - began
     frames = manifest.train.native_frames + manifest.val.native_frames
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    peak = int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
     size = sum(p.stat().st_size for p in root.iterdir()) / 1e6
     records = len(manifest.train.steps) + len(manifest.val.steps)
     print(f"peak {peak:.0f} MB for {size:.0f} MB in {records} records, {frames} frames, {seconds:.1f} s")

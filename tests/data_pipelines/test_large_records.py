@@ -108,7 +108,7 @@ def test_frames_under_way_are_bounded_in_bytes(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "records, size, bound",
     [
-        (3, 60, 700),
+        (2, 150, 700),
         pytest.param(7, 300, 1500, marks=pytest.mark.slow),  # 2 GB; needs as much disk, and minutes
     ],
 )
