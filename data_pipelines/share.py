@@ -43,7 +43,10 @@ class Share:
 
 
 def find_share(process: int | None, processes: int | None, environ: Mapping[str, str]) -> Share:
-    """As given, otherwise from SLURM (array jobs, tasks of srun, or both) or JAX_PROCESS_ID.
+    """As given, otherwise from SLURM (array jobs, tasks of srun, or both) or Open MPI.
+
+    These are the variables that jax.distributed reads; the processes of this job need not be
+    connected, so it is not asked itself.
 
     Raises ConfigError for half an answer, and for an array that is not all of 0, 1, ... N: tasks
     3 and 5 started again do not tell how many there were.
@@ -58,7 +61,7 @@ def find_share(process: int | None, processes: int | None, environ: Mapping[str,
         return Share(process, processes)
     array, told_by = _array(environ), []
     tasks = _pair(environ, "SLURM_PROCID", "SLURM_STEP_NUM_TASKS")
-    tasks = tasks or _pair(environ, "JAX_PROCESS_ID", "JAX_NUM_PROCESSES")
+    tasks = tasks or _pair(environ, "OMPI_COMM_WORLD_RANK", "OMPI_COMM_WORLD_SIZE")
     process, processes = 0, 1
     for name, pair in (("SLURM_ARRAY_TASK_ID", array), (tasks[2] if tasks else "", tasks)):
         if pair and pair[1] > 1:

@@ -24,7 +24,9 @@ _File = tuple[str, str, int]  # dataset, split, part
 READ_OPTIONS = "readahead_buffer_size:0,max_parallelism:0"  # for random access
 
 MOST_OPEN = 512
-"""Files kept open; opening one again costs about as much as reading ten windows."""
+"""Files kept open. Opening one again takes about as long as two windows: mixed from 40 datasets of
+one part each, 72 thousand frames are read per second on one core, of 25 parts each 44 thousand.
+"""
 
 
 class TokenStore:

@@ -3,6 +3,9 @@
 Owns what is made of an episode: which are held out, which frames are kept, how frames of many
 episodes are put through the tokenizer in equal pieces. Reading ahead is in `read_ahead`; parts,
 restarts, several processes and publishing are in `dataset_writer`.
+DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written,
+and everything behind it is misaligned (reference section 5.1). Here an episode is stored whole,
+or recorded as lost with its file and offset.
 """
 
 from __future__ import annotations

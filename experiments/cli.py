@@ -129,8 +129,8 @@ def tokenize(
     """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
 
     Killed at any point, the same command goes on and ends with the same bytes. Several processes
-    or machines share the work if each gets its number; SLURM's arrays and tasks are understood by
-    themselves. The tokenizer must be there then: --tokenizer, or `hma tokenizer train` before.
+    or machines share the work if each gets its number; SLURM's arrays and tasks, and Open MPI's, are
+    understood by themselves. The tokenizer must be there then: --tokenizer, or `hma tokenizer train` before.
 
     Args:
         where: Study, data, output directory and settings. The output must be shared by all processes.

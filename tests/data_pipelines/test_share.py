@@ -24,7 +24,7 @@ def srun(task: int, tasks: int) -> dict[str, str]:
         (srun(2, 4), (2, 4)),
         (array(3, 8) | srun(2, 4), (14, 32)),
         (array(0, 1), (0, 1)),
-        ({"JAX_PROCESS_ID": "1", "JAX_NUM_PROCESSES": "2"}, (1, 2)),
+        ({"OMPI_COMM_WORLD_RANK": "1", "OMPI_COMM_WORLD_SIZE": "2"}, (1, 2)),
         # a batch script runs once, whatever its job may start with srun later
         ({"SLURM_PROCID": "0", "SLURM_NTASKS": "8"}, (0, 1)),
     ],
