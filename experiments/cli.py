@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands, model_commands
+from experiments import commands, model_commands, tokenize_commands
 from experiments.cli_convert import HELP, convert_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -139,7 +139,7 @@ def tokenize(
         batch: Frames encoded at a time; 256 if not given. Changes no token.
         threads: Threads that decode frames; one per core up to 8 if not given.
     """
-    commands.tokenize(where.setting(), process, processes, batch, threads)
+    tokenize_commands.tokenize(where.setting(), process, processes, batch, threads)
 
 
 @app.command(name="train")

@@ -6,7 +6,6 @@ Every command ends by saying what it wrote and what to run next.
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -31,8 +30,8 @@ from experiments.progress import SweepMonitor, console, step, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import titles, unique_trials
-from experiments.workspace import Busy, Record, Workspace, load_record, merge_axes, save_record
-from hma_jax.config import ConfigError, MeshConfig, require, to_dict
+from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
+from hma_jax.config import ConfigError, MeshConfig, to_dict
 
 AXES = {
     "datasets": scale_datasets.plan,
@@ -224,78 +223,6 @@ def train_tokenizer(setting: Setting) -> None:
         sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace)
         make_tokenizer(study, workspace, sources)
     wrote(workspace.tokenizer, then=next_command("tokenize", setting))
-
-
-def tokenize(
-    setting: Setting,
-    process: int | None = None,
-    processes: int | None = None,
-    batch: int | None = None,
-    threads: int | None = None,
-) -> None:
-    """Everything up to training, or this process's share of the tokens."""
-    from data_pipelines.share import find_share
-    from experiments.pipeline import find_sources, find_suite, make_store, prepare
-
-    study, workspace = setting.study, setting.workspace
-    share = find_share(process, processes, os.environ)
-    if share.processes > 1:
-        if share.told_by:
-            console.print(f"process {share.process} of {share.processes}, says {share.told_by}")
-        tokenizer = setting.tokenizer or workspace.tokenizer
-        advice = f"Make it before the work is shared: {next_command('tokenizer train', setting)}"
-        require(tokenizer.is_dir(), f"{tokenizer}: no tokenizer. {advice}")
-        sources = find_sources(study, setting.data) if setting.data else find_suite(study, workspace)
-        unfinished = make_store(
-            study, workspace, sources, tokenizer=tokenizer, share=share, batch=batch, threads=threads
-        )
-        if unfinished:
-            console.print(
-                f"this share is done; {', '.join(unfinished)} will be complete when the others are. The last "
-                "process to end completes the store; the same command makes up for one that was lost",
-                soft_wrap=True,
-            )
-            return
-    try:
-        with workspace.claimed():
-            prepare(study, workspace, setting.data, setting.tokenizer, batch=batch, threads=threads)
-    except Busy:
-        if share.processes == 1:
-            raise
-        return  # another process of this job is doing it
-    show_store(workspace)
-    wrote(workspace.store, workspace.manifest, then=next_command("train", setting))
-
-
-def show_store(workspace: Workspace) -> None:
-    """What the token store holds, per dataset."""
-    import numpy as np
-
-    from data_pipelines.store import TokenStore
-
-    store = TokenStore(workspace.store)
-    lengths = ("shortest", "median", "longest")
-    title = "The token store: episodes, native frames, lengths of training episodes"
-    table = tidy_table(title, "dataset", "train", "held out", "lost", "frames", *lengths, "Hz", "stride")
-    for name in store.names:
-        manifest = store.manifest(name)
-        steps = manifest.train.steps
-        table.add_row(
-            name,
-            f"{len(steps)}",
-            f"{len(manifest.val.steps)}",
-            f"{manifest.lost}",
-            f"{manifest.train.native_frames + manifest.val.native_frames}",
-            f"{min(steps)}",
-            f"{np.median(steps):g}",
-            f"{max(steps)}",
-            f"{manifest.spec.hz:g}",
-            f"{manifest.stride}",
-        )
-    console.print(table)
-    for name in store.names:
-        for loss in store.manifest(name).skipped:
-            console.print(f"[yellow]lost[/] {name}: {escape(loss.reason)}", soft_wrap=True)
 
 
 def draw_again(out: Path) -> None:
