@@ -23,6 +23,7 @@ from data_pipelines.example import encode_example
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.tfrecord import write_shard
 
+BATCH = 256
 FRAME = 480 * 640 * 3
 SPEC = DatasetSpec("large", "observation/image", ("action",), (7,), hz=2)
 
@@ -75,7 +76,7 @@ def _features(episode: int, frames: int) -> dict:
 
 
 def tokenize(root: Path) -> None:
-    """Tokenises and prints the peak, in MB (of the kernel: ru_maxrss counts the parent's too)."""
+    """Tokenises and prints the peak of memory, in MB, and how much of it came with the records."""
     from data_pipelines.tokenize_job import tokenize_dataset
     from hma_jax.config import TokenizerConfig
     from hma_jax.host_memory import keep_freed_memory
@@ -85,15 +86,22 @@ def tokenize(root: Path) -> None:
     keep_freed_memory()
     config = TokenizerConfig(image_size=256, downsample=16, channels=32)
     tokenizer = LfqTokenizer(config, declare_tokenizer(config).init(0))
+    tokenizer.encode(np.zeros((BATCH, 256, 256, 3), np.uint8))
+    at_rest = _peak()
     began = time.monotonic()
     store = root.parent.parent / "store"
-    manifest = tokenize_dataset(SPEC, root, tokenizer, store, min_val=1)
+    manifest = tokenize_dataset(SPEC, root, tokenizer, store, min_val=1, batch=BATCH, threads=2)
     seconds = time.monotonic() - began
     frames = manifest.train.native_frames + manifest.val.native_frames
-    peak = int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
     size = sum(p.stat().st_size for p in root.iterdir()) / 1e6
     records = len(manifest.train.steps) + len(manifest.val.steps)
-    print(f"peak {peak:.0f} MB for {size:.0f} MB in {records} records, {frames} frames, {seconds:.1f} s")
+    peak = _peak()
+    print(f"peak {peak:.0f} MB, growth {peak - at_rest:.0f} MB, for {size:.0f} MB in {records} records, {frames} frames, {seconds:.1f} s")
+
+
+def _peak() -> float:
+    """Of this process alone: ru_maxrss begins with its parent's."""
+    return int(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1]) / 1024
 
 
 if __name__ == "__main__":

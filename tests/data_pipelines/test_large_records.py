@@ -19,6 +19,9 @@ SPEC = make_spec(hz=4)
 KEYS = (SPEC.image_key, SPEC.action_keys)
 
 
+GROWTH = 250  # MB: read_ahead.AHEAD, and as much again for copies
+
+
 class Bytes:
     """A file in memory that counts what is read."""
 
@@ -106,15 +109,13 @@ def test_frames_under_way_are_bounded_in_bytes(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "records, size, bound",
-    [
-        (2, 150, 700),
-        pytest.param(7, 300, 1500, marks=pytest.mark.slow),  # 2 GB; needs as much disk, and minutes
-    ],
+    "records, size",
+    [(2, 150), pytest.param(7, 300, marks=pytest.mark.slow)],  # the second 2 GB, of disk too
 )
-def test_memory_does_not_grow_with_records(tmp_path, records, size, bound):
-    """Peak memory of a process that tokenises, JAX and the tokenizer included."""
+def test_memory_does_not_grow_with_records(tmp_path, records, size):
+    """Peak memory of a process that tokenises, JAX and the tokenizer included; and its growth by
+    frames that are under way, but not by whole records (434 MB for the larger ones)."""
     command = [sys.executable, "-m", "tests.data_pipelines.memory", str(tmp_path), str(records), str(size)]
     shown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    peak = float(shown.split("peak")[1].split()[0])
-    assert 100 < peak < bound, shown
+    peak, growth = (float(shown.split(word)[1].split()[0]) for word in ("peak", "growth"))
+    assert 100 < peak < 1500 and growth < GROWTH, shown
