@@ -13,8 +13,24 @@ class DataError(Exception):
     """Data that cannot be used."""
 
 
+class UnreachableError(DataError):
+    """A store that does not answer. No damage of data, so no policy leaves anything out for it."""
+
+
 class EpisodeError(DataError):
-    """One episode is unusable; the policy corrupt='skip' may leave it out."""
+    """One episode is unusable; the policy corrupt='skip' may leave it out.
+
+    Attributes, where they are known: `path` of the file it lies in, `offset` of its first byte
+    there.
+    """
+
+    path: Path | None = None
+    offset: int | None = None
+
+    def at(self, path: Path, offset: int) -> EpisodeError:
+        """The same error, with its place."""
+        self.path, self.offset = path, offset
+        return self
 
 
 class CorruptRecordError(EpisodeError):
@@ -24,7 +40,7 @@ class CorruptRecordError(EpisodeError):
     """
 
     def __init__(self, path: str | Path, offset: int, reason: str):
-        self.path = Path(path)
+        self.path = Path(path) if isinstance(path, str) else path
         self.offset = offset
         self.reason = reason
         super().__init__(

@@ -2,7 +2,8 @@
 
 Owns the wire format of that one message, nothing of RLDS. Only the wanted features are
 decoded and long lists go through numpy, which is faster than a general protobuf message
-when an episode's record holds cameras and embeddings that nobody asked for.
+when an episode's record holds cameras and embeddings that nobody asked for; of a record that
+is a view into a file, the others are not even read.
 
 Message (protobuf field numbers): Example{1: Features}, Features{1: map entries {1: key,
 2: Feature}}, Feature{1: BytesList | 2: FloatList | 3: Int64List}, each list {1: values}.
@@ -11,24 +12,45 @@ Message (protobuf field numbers): Example{1: Features}, Features{1: map entries 
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from data_pipelines.errors import DataError
 
-Feature = np.ndarray | list[bytes]
+if TYPE_CHECKING:
+    from data_pipelines.tfrecord import FileView
+
+Feature = np.ndarray | Sequence[bytes]
 
 _BYTES, _FLOAT, _INT = 1, 2, 3  # field numbers inside Feature
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5  # wire types
 
 
-def parse_example(data: bytes, keys: Collection[str] | None = None) -> dict[str, Feature]:
+class LazyBytes(Sequence[bytes]):
+    """The n values of a bytes feature, each cut from the record when it is asked for."""
+
+    def __init__(self, data: bytes | FileView, spans: Sequence[tuple[int, int]]):
+        self._data, self._spans = data, spans
+
+    def __len__(self) -> int:
+        return len(self._spans)
+
+    def __getitem__(self, i: int) -> bytes:
+        start, end = self._spans[i]
+        return self._data[start:end]
+
+
+def parse_example(
+    data: bytes | FileView, keys: Collection[str] | None = None, lazy: bool = False
+) -> dict[str, Feature]:
     """The features of a serialized tf.train.Example, by flat key.
 
     A float feature is float32 [n], an integer feature int64 [n], a bytes feature a list of
     n `bytes`. A feature without a value is an empty list. With `keys`, other features are
-    skipped unread; a wanted key that the record lacks is absent from the result.
+    skipped unread; a wanted key that the record lacks is absent from the result. With `lazy`,
+    bytes features are `LazyBytes`, which need `data` as long as they live.
 
     Raises DataError if `data` is not such a message.
     """
@@ -48,7 +70,7 @@ def parse_example(data: bytes, keys: Collection[str] | None = None) -> dict[str,
                     elif field == 2:
                         value = (a, b)
                 if wanted is None or key in wanted:
-                    found[key.decode()] = _parse_feature(data, *value)
+                    found[key.decode()] = _parse_feature(data, *value, lazy)
     except (IndexError, ValueError, struct.error) as error:
         raise DataError(f"the record is not a tf.train.Example ({error})") from error
     return found
@@ -71,7 +93,7 @@ def encode_example(features: Mapping[str, np.ndarray | list[bytes]]) -> bytes:
 # --- reading ---------------------------------------------------------------------------------
 
 
-def _varint(data: bytes, at: int) -> tuple[int, int]:
+def _varint(data: bytes | FileView, at: int) -> tuple[int, int]:
     """(value, next position) of the varint at `at`."""
     byte = data[at]
     at += 1
@@ -89,7 +111,7 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
             raise ValueError(f"a varint longer than 10 bytes at byte {at}")
 
 
-def _messages(data: bytes, at: int, end: int):
+def _messages(data: bytes | FileView, at: int, end: int):
     """(field number, start, end) of each length-delimited field in data[at:end]."""
     while at < end:
         tag, at = _varint(data, at)
@@ -105,7 +127,7 @@ def _messages(data: bytes, at: int, end: int):
             at = _skip(data, at, wire)
 
 
-def _skip(data: bytes, at: int, wire: int) -> int:
+def _skip(data: bytes | FileView, at: int, wire: int) -> int:
     if wire == _VARINT:
         return _varint(data, at)[1]
     if wire == _FIXED64:
@@ -115,7 +137,7 @@ def _skip(data: bytes, at: int, wire: int) -> int:
     raise ValueError(f"unknown wire type {wire} at byte {at}")
 
 
-def _parse_feature(data: bytes, start: int, end: int) -> Feature:
+def _parse_feature(data: bytes | FileView, start: int, end: int, lazy: bool) -> Feature:
     kind, parts = 0, []
     for number, a, b in _messages(data, start, end):
         if number != kind:  # a oneof: the last kind wins, pieces of one kind are joined
@@ -125,7 +147,8 @@ def _parse_feature(data: bytes, start: int, end: int) -> Feature:
         return _join([piece for a, b in parts for piece in _floats(data, a, b)], np.float32)
     if kind == _INT:
         return _join([piece for a, b in parts for piece in _ints(data, a, b)], np.int64)
-    return [data[x:y] for a, b in parts for number, x, y in _messages(data, a, b) if number == 1]
+    spans = [(x, y) for a, b in parts for number, x, y in _messages(data, a, b) if number == 1]
+    return LazyBytes(data, spans) if lazy else [data[x:y] for x, y in spans]
 
 
 def _join(pieces: list[np.ndarray], dtype: type) -> np.ndarray:
@@ -134,7 +157,7 @@ def _join(pieces: list[np.ndarray], dtype: type) -> np.ndarray:
     return np.concatenate(pieces) if pieces else np.zeros(0, dtype)
 
 
-def _floats(data: bytes, at: int, end: int):
+def _floats(data: bytes | FileView, at: int, end: int):
     while at < end:
         tag, at = _varint(data, at)
         if tag == (1 << 3 | _LENGTH):  # packed, what every writer does
@@ -142,28 +165,28 @@ def _floats(data: bytes, at: int, end: int):
             _check_inside(at + length, end)
             if length % 4:
                 raise ValueError(f"a list of floats at byte {at} is {length} bytes long")
-            yield np.frombuffer(data, "<f4", length // 4, at)
+            yield np.frombuffer(data[at : at + length], "<f4")
             at += length
         elif tag == (1 << 3 | _FIXED32):
             _check_inside(at + 4, end)
-            yield np.frombuffer(data, "<f4", 1, at)
+            yield np.frombuffer(data[at : at + 4], "<f4")
             at += 4
         else:
             at = _skip(data, at, tag & 7)
 
 
-def _ints(data: bytes, at: int, end: int):
+def _ints(data: bytes | FileView, at: int, end: int):
     while at < end:
         tag, at = _varint(data, at)
         if tag == (1 << 3 | _LENGTH):
             length, at = _varint(data, at)
             _check_inside(at + length, end)
-            yield _varints(np.frombuffer(data, np.uint8, length, at))
+            yield _varints(np.frombuffer(data[at : at + length], np.uint8))
             at += length
         elif tag == (1 << 3 | _VARINT):
             start = at
             _, at = _varint(data, at)
-            yield _varints(np.frombuffer(data, np.uint8, at - start, start))
+            yield _varints(np.frombuffer(data[start:at], np.uint8))
         else:
             at = _skip(data, at, tag & 7)
 

@@ -25,8 +25,10 @@ def decode_image(data: bytes) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(data)) as image:
             return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, OSError) as error:
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
         raise ValueError(f"{len(data)} bytes that are neither JPEG nor PNG") from error
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"{len(data)} bytes of an image too large to be a frame ({error})") from error
 
 
 def fit_image(image: np.ndarray, size: int) -> np.ndarray:

@@ -6,9 +6,12 @@ the same way gives the same manifest, and its hash identifies the data of a run.
 
 from __future__ import annotations
 
+import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
@@ -17,6 +20,11 @@ from hma_jax.embodiments import Embodiment
 
 FILE = "manifest.json"
 SPLITS = ("train", "val")
+LISTS = ("episodes", "steps")
+"""Lists with an entry per episode: up to millions, so no code looks at them one by one."""
+
+FORMAT = 2
+"""Of the store's layout; 1 had one file per split."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +67,21 @@ class SplitFacts:
     episodes: tuple[int, ...] = ()  # index in the source
     steps: tuple[int, ...] = ()  # native frames N
     content: str = ""  # hash over all records
+    parts: tuple[int, ...] = ()  # episodes in each part; there is no file for 0
 
     @property
     def native_frames(self) -> int:
         return sum(self.steps)
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Episodes that could not be used."""
+
+    reason: str
+    file: str = ""  # name of the shard or file they lie in
+    offset: int = -1  # of the record's first byte there; -1: unknown
+    episodes: int = 1
 
 
 @dataclass(frozen=True)
@@ -78,8 +97,10 @@ class Manifest:
     action_std: tuple[float, ...]
     train: SplitFacts
     val: SplitFacts
-    skipped: dict[str, int] = field(default_factory=dict)  # reason -> episodes left out
-    format: int = 1
+    action_min: tuple[float, ...] = ()
+    action_max: tuple[float, ...] = ()
+    skipped: tuple[Loss, ...] = ()  # what was left out
+    format: int = FORMAT
 
     @property
     def stride(self) -> int:
@@ -91,9 +112,19 @@ class Manifest:
         """Native frames per stored frame."""
         return self.settings.frame_step
 
+    @property
+    def lost(self) -> int:
+        """Episodes left out."""
+        return sum(loss.episodes for loss in self.skipped)
+
     def split(self, name: str) -> SplitFacts:
         require(name in SPLITS, f"split must be 'train' or 'val', got {name!r}")
         return self.train if name == "train" else self.val
+
+    def _without_lists(self) -> Manifest:
+        """Small, however many episodes there are."""
+        empty = dict.fromkeys(LISTS, ())
+        return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
     def embodiment(self) -> Embodiment:
         """The model's view of this dataset's actions."""
@@ -107,13 +138,22 @@ class Manifest:
         )
 
     def hash(self) -> str:
-        return stable_hash(self)
+        lists = (getattr(self.split(s), name) for s in SPLITS for name in LISTS)
+        digests = [hashlib.sha256(np.asarray(x, "<i8").tobytes()).hexdigest() for x in lists]
+        return stable_hash([self._without_lists(), digests])
 
     def to_text(self) -> str:
         """Deterministic JSON, long lists on one line."""
-        values = to_dict(self)
+        values = to_dict(self._without_lists())
+        for split in SPLITS:
+            values[split] |= {name: getattr(self.split(split), name) for name in LISTS}
         lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]
         return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def part_name(split: str, part: int, parts: int) -> str:
+    """The file with a part's episodes of one split."""
+    return f"{split}-{part:05d}-of-{parts:05d}.array_record"
 
 
 def load_manifest(path: Path) -> Manifest:
@@ -121,12 +161,22 @@ def load_manifest(path: Path) -> Manifest:
     advice = "Remove the dataset from the store and tokenise it again."
     try:
         values = json.loads(path.read_text())
-        if values.get("format") != 1:
-            raise DataError(f"{path}: manifest format {values.get('format')!r}; this reads 1. {advice}")
-        return from_dict(Manifest, values)
+        if values.get("format") != FORMAT:
+            raise DataError(
+                f"{path}: manifest format {values.get('format')!r}; this reads {FORMAT}. {advice}"
+            )
+        lists = {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in LISTS} for s in SPLITS}
+        manifest = from_dict(Manifest, values)
+        return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
     except OSError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
-    except (ValueError, AttributeError, TypeError) as error:
+    except (ValueError, AttributeError, TypeError, KeyError) as error:
         if isinstance(error, ConfigError):
             raise DataError(f"{path}: not a manifest of this program: {error}. {advice}") from error
         raise DataError(f"{path}: the manifest is damaged ({error}). {advice}") from error
+
+
+def _integers(values: list, name: str) -> tuple[int, ...]:
+    array = np.asarray(values or np.zeros(0, np.int64))
+    require(array.ndim == 1 and array.dtype.kind == "i", f"{name}: expected a list of integers")
+    return tuple(array.tolist())

@@ -2,25 +2,31 @@
 
 Owns reading what tfds wrote: schema, shards, records, one camera and the action of an
 episode. Knows neither tokenizers nor windows nor which dataset has which camera (see
-`registry`). tfds is asked for metadata only; records go through `tfrecord` and `example`.
+`registry`). tfds is asked for metadata only; records go through `tfrecord` and `example`,
+and lie on a disk or in a remote store (see `location`).
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
 from data_pipelines.example import Feature, parse_example
 from data_pipelines.images import decode_image
+from data_pipelines.location import REMOTE_READS, is_remote
 from data_pipelines.schema import closest, listing, read_metadata, resolve_version, step_key
-from data_pipelines.tfrecord import read_record, scan_shard
+from data_pipelines.tfrecord import ShardIndex, open_record, scan_shard
 from hma_jax.config import ConfigError, require
+
+if TYPE_CHECKING:
+    from data_pipelines.location import Location
 
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
@@ -44,11 +50,32 @@ class RawEpisode:
         return len(self.actions)
 
 
+@dataclass(frozen=True)
+class OpenEpisode:
+    """An episode whose frames are decoded one by one, while its record is open."""
+
+    index: int
+    actions: np.ndarray  # float32 [N, A], native rate, raw units
+    success: bool | None
+    encoded: Callable[[int], bytes]
+    """Native frame n as recorded. One thread at a time. Raises EpisodeError if it cannot be read."""
+    decode: Callable[[int, bytes], np.ndarray]
+    """Native frame n from its bytes, uint8 [H, W, 3], in any thread. Raises EpisodeError."""
+
+    @property
+    def steps(self) -> int:
+        """N, native frames."""
+        return len(self.actions)
+
+    def image(self, n: int) -> np.ndarray:
+        return self.decode(n, self.encoded(n))
+
+
 class RldsDataset:
     """Random access to the episodes of one split.
 
-    `directory` is a version directory (`<name>/1.0.0`) or its parent, then the newest
-    version is taken. Shards are indexed when the object is made. Thread-safe; pickles.
+    `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, then the
+    newest version is taken. Shards are indexed when the object is made. Thread-safe; pickles.
 
     Damage: with corrupt="raise" every damaged shard or record is an error. With "skip",
     what a damaged shard still holds is indexed, `skip` accepts unusable episodes, and all
@@ -60,7 +87,7 @@ class RldsDataset:
 
     def __init__(
         self,
-        directory: str | Path,
+        directory: str | Location,
         split: str = "train",
         *,
         corrupt: Literal["raise", "skip"] = "raise",
@@ -91,10 +118,11 @@ class RldsDataset:
 
     # --- episodes ----------------------------------------------------------------------------
 
-    def episode(
-        self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1
-    ) -> RawEpisode:
-        """Episode `i`: one camera, the actions of `action_keys` concatenated, the success flag.
+    @contextmanager
+    def open_episode(
+        self, i: int, image_key: str, action_keys: Sequence[str]
+    ) -> Iterator[OpenEpisode]:
+        """Episode `i` in bounded memory, however large its record: see `OpenEpisode`.
 
         Keys are relative to a step, as in features.json: `observation/image_0`, `action`,
         `action/arm`. Raises ConfigError for keys that the dataset lacks, CorruptRecordError
@@ -102,13 +130,29 @@ class RldsDataset:
         """
         self.check_keys(image_key, action_keys)
         image_key, action_keys = step_key(image_key), [step_key(k) for k in action_keys]
-        record = self.record(i, [image_key, *action_keys, SUCCESS_KEY])
-        encoded = record.get(image_key) or []
-        actions = self._actions(i, record, action_keys, steps=len(encoded))
-        images = [self._image(i, image_key, t, encoded) for t in range(0, len(encoded), frame_step)]
-        success = record.get(SUCCESS_KEY)
-        known = success is not None and len(success) == 1
-        return RawEpisode(i, images, actions, bool(success[0]) if known else None)
+        with self._open(i, [image_key, *action_keys, SUCCESS_KEY]) as record:
+            encoded = self._frames_of(i, record, image_key)
+            actions = self._actions(i, record, action_keys, steps=len(encoded))
+            success = record.get(SUCCESS_KEY)
+            known = success is not None and len(success) == 1
+            yield OpenEpisode(
+                i,
+                actions,
+                bool(success[0]) if known else None,
+                lambda step: self._encoded(i, image_key, step, encoded),
+                lambda step, data: self._image(i, image_key, step, data),
+            )
+
+    def episode(
+        self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1
+    ) -> RawEpisode:
+        """Episode `i`, whole: one camera, the actions of `action_keys` concatenated, the success flag.
+
+        Raises what `open_episode` raises.
+        """
+        with self.open_episode(i, image_key, action_keys) as episode:
+            images = [episode.image(t) for t in range(0, episode.steps, frame_step)]
+            return RawEpisode(i, images, episode.actions, episode.success)
 
     def frames(
         self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]
@@ -116,19 +160,19 @@ class RldsDataset:
         """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers."""
         self.check_keys(image_key, ())
         image_key = step_key(image_key)
-        encoded = self.record(i, [image_key]).get(image_key) or []
-        if not encoded:
-            raise EpisodeError(f"{self._where(i)}: it has no frames in {image_key!r}; leave it out")
-        return [self._image(i, image_key, t, encoded) for t in choose(len(encoded))]
+        with self._open(i, [image_key]) as record:
+            encoded = self._frames_of(i, record, image_key)
+            chosen = choose(len(encoded))
+            return [self._image(i, image_key, t, self._encoded(i, image_key, t, encoded)) for t in chosen]
 
     def record(self, i: int, keys: Sequence[str] | None = None) -> dict[str, Feature]:
         """The flat features of episode `i`, as `example.parse_example` gives them."""
-        path, offset, length = self._place(i)
-        payload = read_record(path, offset, length)
-        try:
-            return parse_example(payload, keys)
-        except DataError as error:
-            raise CorruptRecordError(path, offset, str(error)) from error
+        with self._open(i, keys, lazy=False) as record:
+            return record
+
+    def sizes(self) -> np.ndarray:
+        """int64 [episodes]: bytes of each record."""
+        return self._lengths
 
     def check_keys(
         self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None
@@ -168,17 +212,28 @@ class RldsDataset:
 
     # --- inside ------------------------------------------------------------------------------
 
-    def _index(self, shards: list[Path], expected: list[int]) -> None:
-        offsets, lengths, checksums, shard_of, sizes = [], [], [], [], []
-        for n, (path, count) in enumerate(zip(shards, expected, strict=True)):
+    @contextmanager
+    def _open(
+        self, i: int, keys: Sequence[str] | None, lazy: bool = True
+    ) -> Iterator[dict[str, Feature]]:
+        path, offset, length = self._place(i)
+        with open_record(path, offset, length) as payload:
             try:
-                index, damage = scan_shard(path)
-            except DataError as error:
-                if self.corrupt == "raise":
-                    raise
-                self._lose(str(error), count)
+                record = parse_example(payload, keys, lazy)
+            except (DataError, OSError) as error:
+                raise CorruptRecordError(path, offset, str(error)) from error
+            yield record
+
+    def _index(self, shards: list[Location], expected: list[int]) -> None:
+        offsets, lengths, checksums, shard_of, sizes = [], [], [], [], []
+        for n, (path, count, scanned) in enumerate(zip(shards, expected, _scan(shards), strict=True)):
+            if isinstance(scanned, DataError):
+                if self.corrupt == "raise" or isinstance(scanned, UnreachableError):
+                    raise scanned
+                self._lose(str(scanned), count)
                 sizes.append(0)
                 continue
+            index, damage = scanned
             if damage is not None and self.corrupt == "raise":
                 raise damage
             self._check_count(path, len(index), count, damage)
@@ -195,7 +250,7 @@ class RldsDataset:
         if not len(self):
             raise DataError(f"{self.directory}: split {self.split!r} has no readable episode.")
 
-    def _check_count(self, path: Path, found: int, expected: int, damage: Exception | None) -> None:
+    def _check_count(self, path: Location, found: int, expected: int, damage: Exception | None) -> None:
         if found == expected:
             return
         empty = ": the file is empty" if path.stat().st_size == 0 else ""
@@ -216,40 +271,75 @@ class RldsDataset:
                 f"The last: {reason} Raise max_skipped if the rest is worth it."
             )
 
-    def _place(self, i: int) -> tuple[Path, int, int]:
+    def _place(self, i: int) -> tuple[Location, int, int]:
         if not 0 <= i < len(self):
             raise IndexError(f"{self.name}: episode {i} of {len(self)}")
         return self._paths[self._shard_of[i]], int(self._offsets[i]), int(self._lengths[i])
 
-    def _where(self, i: int) -> str:
+    def _unusable(self, i: int, what: str) -> EpisodeError:
         path, offset, _ = self._place(i)
-        return f"{self.name}, episode {i} ({path.name}, byte {offset})"
+        where = f"{self.name}, episode {i} ({path.name}, byte {offset})"
+        return EpisodeError(f"{where}: {what}").at(path, offset)
 
-    def _image(self, i: int, key: str, step: int, encoded: list[bytes]) -> np.ndarray:
+    def _frames_of(self, i: int, record: dict[str, Feature], key: str) -> Sequence[bytes]:
+        encoded = record.get(key, ())
+        if not len(encoded):
+            raise self._unusable(i, f"it has no frames in {key!r}; leave it out with corrupt='skip'")
+        return encoded
+
+    def _encoded(self, i: int, key: str, step: int, encoded: Sequence[bytes]) -> bytes:
         try:
-            return decode_image(encoded[step])
+            return encoded[step]
+        except OSError as error:
+            raise self._unusable(i, f"step {step} of {key!r} cannot be read ({error})") from error
+
+    def _image(self, i: int, key: str, step: int, data: bytes) -> np.ndarray:
+        try:
+            return decode_image(data)
         except ValueError as error:
-            raise EpisodeError(
-                f"{self._where(i)}: step {step} of {key!r} cannot be decoded: {error}. "
-                "Repair the episode, or read with corrupt='skip'."
+            raise self._unusable(
+                i,
+                f"step {step} of {key!r} cannot be decoded: {error}. "
+                "Repair the episode, or read with corrupt='skip'.",
             ) from error
 
     def _actions(self, i: int, record: dict[str, Feature], keys: list[str], steps: int) -> np.ndarray:
         columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
         for key in keys:
             values, size = record.get(key, []), self.features[key].size
-            if isinstance(values, list) or len(values) != steps * size or not steps:
-                raise EpisodeError(
-                    f"{self._where(i)}: {key!r} has {len(values)} values, but {steps} frames of "
-                    f"{size} need {steps * size}. Repair the episode, or read with corrupt='skip'."
+            if not isinstance(values, np.ndarray) or len(values) != steps * size or not steps:
+                raise self._unusable(
+                    i,
+                    f"{key!r} has {len(values)} values, but {steps} frames of {size} need "
+                    f"{steps * size}. Repair the episode, or read with corrupt='skip'.",
                 )
             values = values.reshape(steps, size).astype(np.float32)
             finite = np.isfinite(values).all(axis=1)
             if not finite.all():
                 step = int(np.flatnonzero(~finite)[0])
-                raise EpisodeError(
-                    f"{self._where(i)}: {key!r} is not finite at step {step}: {values[step].tolist()}. "
-                    "Repair the episode, or read with corrupt='skip'."
+                raise self._unusable(
+                    i,
+                    f"{key!r} is not finite at step {step}: {values[step].tolist()}. "
+                    "Repair the episode, or read with corrupt='skip'.",
                 )
             columns.append(values)
         return np.concatenate(columns, axis=1)
+
+
+Scanned = tuple[ShardIndex, CorruptRecordError | None] | DataError
+
+
+def _scan(shards: Sequence[Location]) -> Iterator[Scanned]:
+    """Each shard's index or what is wrong with it; several at a time if they are remote."""
+
+    def scan(path: Location) -> Scanned:
+        try:
+            return scan_shard(path)
+        except DataError as error:
+            return error
+
+    if not shards or not is_remote(shards[0]):
+        yield from map(scan, shards)
+        return
+    with ThreadPoolExecutor(REMOTE_READS) as pool:
+        yield from pool.map(scan, shards)

@@ -1,6 +1,7 @@
 """The schema of an RLDS directory: where its version lies, what a step holds, which shards.
 
-Owns what is read through tfds, which is metadata only. Reads no record.
+Owns what is read through tfds, which is metadata only. Reads no record. The metadata of a
+remote directory is copied aside for tfds, which then needs to know nothing of remote stores.
 """
 
 from __future__ import annotations
@@ -8,14 +9,25 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from data_pipelines.errors import DataError
+from data_pipelines.location import is_remote, locate
 from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.location import Location
+
+METADATA = (".json", ".txt")
+"""How the files end that tfds writes beside the shards."""
 
 
 @dataclass(frozen=True)
@@ -33,13 +45,13 @@ class SplitMetadata:
     name: str
     version: str
     features: dict[str, FlatFeature]
-    shards: list[Path]
+    shards: list[Location]
     shard_lengths: list[int]
 
 
-def resolve_version(directory: str | Path) -> Path:
+def resolve_version(directory: str | Location) -> Location:
     """The version directory: `directory` itself or its newest version."""
-    directory = Path(directory)
+    directory = locate(directory)
     if not directory.is_dir():
         raise DataError(f"{directory}: no such directory. Give the path of an RLDS dataset.")
     if (directory / "dataset_info.json").is_file():
@@ -59,14 +71,28 @@ def resolve_version(directory: str | Path) -> Path:
     )
 
 
-def read_metadata(directory: Path, split: str) -> SplitMetadata:
+def dataset_name(directory: str | Location) -> str:
+    """The name that an RLDS directory gives itself, read from dataset_info.json alone.
+
+    Raises DataError for a directory that is none.
+    """
+    path = resolve_version(directory) / "dataset_info.json"
+    try:
+        return str(json.loads(path.read_text())["name"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        message = f"{path}: it does not name the dataset ({error}). Restore it as tfds wrote it."
+        raise DataError(message) from error
+
+
+def read_metadata(directory: Location, split: str) -> SplitMetadata:
     """Metadata of one split. Raises DataError for damaged files, ConfigError for an unknown split."""
     # Imported here: it takes half a second that readers of a token store need not pay.
     import tensorflow_datasets as tfds
     from google.protobuf.json_format import ParseError
 
     try:
-        info = tfds.builder_from_directory(str(directory)).info
+        with _on_disk(directory) as here:
+            info = tfds.builder_from_directory(str(here)).info
         file_format = json.loads((directory / "dataset_info.json").read_text()).get("fileFormat", "tfrecord")
     except (OSError, ValueError, KeyError, ParseError) as error:
         raise DataError(
@@ -83,9 +109,25 @@ def read_metadata(directory: Path, split: str) -> SplitMetadata:
         name=info.name,
         version=str(info.version),
         features=_flatten(info.features, ""),
-        shards=[Path(p) for p in info.splits[split].filepaths],
+        shards=[directory / Path(p).name for p in info.splits[split].filepaths],
         shard_lengths=list(info.splits[split].shard_lengths),
     )
+
+
+@contextmanager
+def _on_disk(directory: Location) -> Iterator[Location]:
+    """`directory`, or a copy of its metadata if it is remote."""
+    if not is_remote(directory):
+        yield directory
+        return
+    copy = Path(tempfile.mkdtemp(prefix="hma-metadata-"))
+    try:
+        for file in directory.iterdir():
+            if file.name.endswith(METADATA):
+                (copy / file.name).write_bytes(file.read_bytes())
+        yield copy
+    finally:
+        shutil.rmtree(copy)
 
 
 def _flatten(feature, key: str) -> dict[str, FlatFeature]:

@@ -1,51 +1,53 @@
 """RLDS episodes in, one dataset of the token store out.
 
-Owns the job: which episodes are held out, what is kept of them, action statistics, the
-manifest. A dataset appears in the store only when it is complete; an interrupted job leaves
-a hidden directory that the next one removes.
+Owns what is made of an episode: which are held out, which frames are kept, how frames of many
+episodes are put through the tokenizer in equal pieces. Reading ahead is in `read_ahead`; parts,
+restarts, several processes and publishing are in `dataset_writer`.
+DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written,
+and everything behind it is misaligned (reference section 5.1). Here an episode is stored whole,
+or recorded as lost with its file and offset.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
-import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from array_record.python import array_record_module
 
-from data_pipelines.episode_record import StoredEpisode, encode_episode, token_dtype
-from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.dataset_writer import Progress, cut_parts, write_dataset
+from data_pipelines.episode_record import StoredEpisode, token_dtype
+from data_pipelines.errors import EpisodeError
 from data_pipelines.images import fit_image
-from data_pipelines.manifest import (
-    FILE,
-    SPLITS,
-    JobSettings,
-    Manifest,
-    SplitFacts,
-    TokenizerFacts,
-    load_manifest,
-)
+from data_pipelines.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
+from data_pipelines.part import Made, Part
+from data_pipelines.read_ahead import Begin, End, frames_ahead
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.rlds import MAX_SKIPPED, RawEpisode, RldsDataset
+from data_pipelines.rlds import MAX_SKIPPED, RldsDataset
+from data_pipelines.share import Share
 from data_pipelines.splits import held_out
-from hma_jax.config import ConfigError, diff, require
+from hma_jax.config import require
 
 if TYPE_CHECKING:
+    from data_pipelines.location import Location
     from hma_jax.tokenizers.base import Tokenizer
 
-READ_AHEAD = 4  # episodes decoded while earlier ones are encoded
+PART_SIZE = 256 * 2**20
+"""Bytes of records in one part: what a killed process has to do again, at most."""
+
+MOST_PARTS = 1024
+"""Parts of a dataset: of one larger than this many times PART_SIZE the parts are larger."""
 
 
 def tokenize_dataset(
     spec: DatasetSpec,
-    directory: str | Path,
+    directory: str | Location,
     tokenizer: Tokenizer,
     store_root: str | Path,
     *,
@@ -55,19 +57,27 @@ def tokenize_dataset(
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
     batch: int = 256,
+    threads: int | None = None,
+    part_size: int = PART_SIZE,
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: int = MAX_SKIPPED,
-    progress: Callable[[int, int], None] | None = None,
-) -> Manifest:
+    share: Share = Share(),
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Manifest | None:
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
     `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz
     frames), 1 stores all phases; it must divide the stride. `batch` images are encoded at a
-    time. `progress(done, total)` counts episodes. If the store already has this dataset made
-    from the same shards in the same way, nothing is done.
+    time, `threads` (default: as many as cores, up to 8) decode. `progress(done, total)` counts
+    episodes of this process's `share`. If the store already has this dataset made from the
+    same shards in the same way, nothing is done; what a killed job had finished is kept. The
+    bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of
+    JobSettings; on nothing else. None: parts of other processes are still missing.
 
-    Raises ConfigError for keys, settings or a store directory that cannot work, DataError for
-    damaged data (see `RldsDataset`).
+    Raises ConfigError for keys, settings or a store directory that cannot work, and for a
+    dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
+    (see `RldsDataset`).
     """
     frame_step = spec.stride if frame_step is None else frame_step
     require(
@@ -79,7 +89,7 @@ def tokenize_dataset(
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = Manifest(
         spec=replace(spec, camera="", note=""),  # words for people do not change the data
-        tokenizer=_facts(tokenizer),
+        tokenizer=tokenizer_facts(tokenizer),
         settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
         source=source.fingerprint(),
         source_version=source.version,
@@ -88,27 +98,26 @@ def tokenize_dataset(
         train=SplitFacts(),
         val=SplitFacts(),
     )
-    final = Path(store_root) / spec.name
-    if final.exists():
-        return _reuse(final, plan)
-    aside = final.with_name(f".{spec.name}.partial")
-    try:
-        shutil.rmtree(aside, ignore_errors=True)
-        aside.mkdir(parents=True)
-        manifest = _write(aside, source, plan, tokenizer, batch, progress)
-        (aside / FILE).write_text(manifest.to_text())
-        os.replace(aside, final)
-    except OSError as error:
-        raise ConfigError(
-            f"{final}: the token store cannot be written there ({error.strerror or error}). "
-            "Choose a directory on a disk with space where you may write."
-        ) from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
-    return manifest
+    work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
+    lost = [
+        Loss(reason.replace(f"{source.directory}/", ""), episodes=count)
+        for reason, count in sorted(source.skipped.items())
+    ]
+    return write_dataset(
+        store_root,
+        plan,
+        cut_parts(source.sizes(), part_size, MOST_PARTS),
+        work.make,
+        share=share,
+        lost=lost,
+        max_lost=max_skipped if corrupt == "skip" else 0,
+        overwrite=overwrite,
+        progress=progress,
+    )
 
 
-def _facts(tokenizer: Tokenizer) -> TokenizerFacts:
+def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
+    """What a manifest says of a tokenizer."""
     return TokenizerFacts(
         identity=tokenizer.identity,
         image_size=tokenizer.image_size,
@@ -121,133 +130,145 @@ def _facts(tokenizer: Tokenizer) -> TokenizerFacts:
     )
 
 
-def _reuse(final: Path, plan: Manifest) -> Manifest:
-    """The manifest that is there, if it was made as planned; ConfigError naming what differs."""
-    there = load_manifest(final / FILE)
-    inputs = ("spec", "tokenizer", "settings", "source")
-    changes = [line for name in inputs for line in diff(getattr(there, name), getattr(plan, name), name)]
-    require(
-        not changes,
-        f"{final}: already tokenised in another way ({'; '.join(changes)}). "
-        "Choose another store directory, or remove this dataset from the store.",
-    )
-    return there
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _write(
-    directory: Path,
-    source: RldsDataset,
-    plan: Manifest,
-    tokenizer: Tokenizer,
-    batch: int,
-    progress: Callable[[int, int], None] | None,
-) -> Manifest:
-    s = plan.settings
-    is_val = held_out(plan.spec.name, len(source), s.val_fraction, s.min_val, s.max_val)
-    splits = {name: _SplitWriter(directory, name, s.keep_frames in ("all", name)) for name in SPLITS}
-    moments = _Moments(plan.spec.action_dim)
-    pending: list[tuple[RawEpisode, np.ndarray]] = []  # episodes whose frames wait for a full batch
-    dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
-    done = 0
+@dataclass
+class _Pending:
+    """An episode whose frames are on their way through the tokenizer."""
 
-    def flush() -> None:
-        nonlocal done
-        if not pending:
-            return
-        images = np.concatenate([frames for _, frames in pending])
-        parts = [tokenizer.encode(images[i : i + batch]) for i in range(0, len(images), batch)]
-        ends = np.cumsum([len(frames) for _, frames in pending])[:-1]
-        for (raw, frames), tokens in zip(pending, np.split(np.concatenate(parts), ends), strict=True):
-            name = "val" if is_val[raw.index] else "train"
-            if name == "train":
-                moments.add(raw.actions)
-            splits[name].add(raw, np.asarray(tokens).astype(dtype), frames)
-        done += len(pending)
-        pending.clear()
-        if progress is not None:
-            progress(done, len(source))
-
-    for raw, frames in _episodes(source, plan):
-        pending.append((raw, frames))
-        if sum(len(f) for _, f in pending) >= batch:
-            flush()
-    flush()
-    if not moments.count:
-        raise DataError(f"{source.directory}: no usable episode is left to train on.")
-    mean, std = moments.result()
-    return replace(
-        plan,
-        action_mean=mean,
-        action_std=std,
-        train=splits["train"].close(),
-        val=splits["val"].close(),
-        skipped={k.replace(f"{source.directory}/", ""): n for k, n in sorted(source.skipped.items())},
-    )
+    begin: Begin
+    keep: bool
+    came: int = 0  # frames put into the tokenizer's input
+    frames: list[np.ndarray] = field(default_factory=list)
+    end: End | None = None  # None: more frames are to come
 
 
-def _episodes(source: RldsDataset, plan: Manifest) -> Iterator[tuple[RawEpisode, np.ndarray]]:
-    """Decoded episodes in order, read ahead in a thread (image decoding releases the GIL)."""
+class _Work:
+    """How the parts of one dataset are made."""
 
-    def read(i: int) -> tuple[RawEpisode, np.ndarray]:
-        raw = source.episode(i, plan.spec.image_key, plan.spec.action_keys, plan.frame_step)
-        return raw, np.stack([fit_image(image, plan.tokenizer.image_size) for image in raw.images])
+    def __init__(
+        self, source: RldsDataset, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int
+    ):
+        s = plan.settings
+        self._source, self._plan, self._threads = source, plan, threads
+        self._tokenizer, self._batch = tokenizer, batch
+        self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
+        self._is_val = held_out(plan.spec.name, len(source), s.val_fraction, s.min_val, s.max_val)
 
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        ahead = deque(pool.submit(read, i) for i in range(min(READ_AHEAD, len(source))))
-        for i in range(len(source)):
-            try:
-                yield ahead.popleft().result()
-            except EpisodeError as error:
-                source.skip(error)
-            if i + READ_AHEAD < len(source):
-                ahead.append(pool.submit(read, i + READ_AHEAD))
+    def make(self, part: Part) -> Iterator[Made]:
+        """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""
+        spec, size = self._plan.spec, self._plan.tokenizer.image_size
+        items = frames_ahead(
+            part.episodes,
+            lambda i: self._source.open_episode(i, spec.image_key, spec.action_keys),
+            lambda image: fit_image(image, size),
+            3 * size * size,
+            self._plan.frame_step,
+            self._threads,
+        )
+        pending: deque[_Pending] = deque()
+        with closing(items), _Encoder(self._tokenizer, self._batch) as encoder:
+            for item in items:
+                if isinstance(item, Begin):
+                    pending.append(_Pending(item, self._keeps(item.index)))
+                elif isinstance(item, End):
+                    if not pending or pending[-1].begin.index != item.index:  # it could not be opened
+                        pending.append(_Pending(Begin(item.index, np.zeros((0, 0)), None), False))
+                    pending[-1].end = item
+                else:
+                    pending[-1].came += 1
+                    if pending[-1].keep:
+                        pending[-1].frames.append(item)
+                    encoder.put(item)
+                yield from self._finished(pending, encoder)
+            encoder.flush()
+            yield from self._finished(pending, encoder)
+
+    def _split(self, index: int) -> str:
+        return "val" if self._is_val[index] else "train"
+
+    def _keeps(self, index: int) -> bool:
+        return self._plan.settings.keep_frames in ("all", self._split(index))
+
+    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[Made]:
+        """Takes the episodes from `pending` that have all their tokens."""
+        while pending and pending[0].end is not None and encoder.ready >= pending[0].came:
+            episode = pending.popleft()
+            tokens = encoder.take(episode.came)
+            if episode.end.error is not None:
+                yield self._lose(episode.end.error)
+                continue
+            begin = episode.begin
+            frames = np.stack(episode.frames) if episode.keep else None
+            episode.frames.clear()
+            yield self._split(begin.index), StoredEpisode(
+                begin.index, begin.success, tokens.astype(self._dtype), begin.actions, frames
+            )
+
+    def _lose(self, error: EpisodeError) -> Loss:
+        self._source.skip(error)
+        reason = str(error).replace(f"{self._source.directory}/", "")
+        place = (error.path.name, error.offset) if error.path is not None else ("", -1)
+        return Loss(reason, *place)
 
 
-class _SplitWriter:
-    """Appends episodes to one ArrayRecord file and keeps its facts."""
+class _Encoder:
+    """Frames in, their tokens out in the same order. The device works while the next piece gathers."""
 
-    def __init__(self, directory: Path, name: str, keep_frames: bool):
-        # Tokens do not compress; frames do. One record per group gives true random access.
-        options = "group_size:1" if keep_frames else "group_size:1,uncompressed"
-        self._writer = array_record_module.ArrayRecordWriter(str(directory / f"{name}.array_record"), options)
-        self._keep_frames = keep_frames
-        self._episodes: list[int] = []
-        self._steps: list[int] = []
-        self._content = hashlib.sha256()
+    def __init__(self, tokenizer: Tokenizer, batch: int):
+        self._tokenizer, self._batch = tokenizer, batch
+        self._frames: list[np.ndarray] = []
+        self._tokens: deque[np.ndarray] = deque()
+        self._under_way: Future | None = None
+        self._pool = ThreadPoolExecutor(1, "encode")
+        self.ready = 0
+        """Frames whose tokens can be taken."""
 
-    def add(self, raw: RawEpisode, tokens: np.ndarray, frames: np.ndarray) -> None:
-        kept = frames if self._keep_frames else None
-        record = encode_episode(StoredEpisode(raw.index, raw.success, tokens, raw.actions, kept))
-        self._writer.write(record)
-        self._content.update(record)
-        self._episodes.append(raw.index)
-        self._steps.append(raw.steps)
+    def __enter__(self) -> _Encoder:
+        return self
 
-    def close(self) -> SplitFacts:
-        try:
-            self._writer.close()
-        except RuntimeError as error:  # how ArrayRecord reports a full disk, if only here
-            raise OSError(str(error)) from error
-        return SplitFacts(tuple(self._episodes), tuple(self._steps), self._content.hexdigest()[:32])
+    def __exit__(self, *exc: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
 
+    def put(self, frame: np.ndarray) -> None:
+        self._frames.append(frame)
+        if len(self._frames) == self._batch:
+            self._start()
 
-class _Moments:
-    """Mean and standard deviation over rows, merged episode by episode in float64."""
+    def flush(self) -> None:
+        """Encodes what has gathered; afterwards everything is ready."""
+        if self._frames:
+            self._start()
+        self._collect()
 
-    def __init__(self, dim: int):
-        self.count = 0
-        self._mean = np.zeros(dim)
-        self._square = np.zeros(dim)  # sum of squared deviations from the mean
+    def take(self, count: int) -> np.ndarray:
+        """The tokens of the next `count` frames, which are ready."""
+        taken = [np.zeros((0, *self._shape()), np.int32)]
+        missing = count
+        while missing:
+            piece = self._tokens.popleft()
+            taken.append(piece[:missing])
+            if len(piece) > missing:
+                self._tokens.appendleft(piece[missing:])
+            missing -= len(taken[-1])
+        self.ready -= count
+        return np.concatenate(taken[1:] or taken)
 
-    def add(self, rows: np.ndarray) -> None:
-        rows = rows.astype(np.float64)
-        mean = rows.mean(axis=0)
-        total = self.count + len(rows)
-        step = mean - self._mean
-        self._square += ((rows - mean) ** 2).sum(axis=0) + step**2 * (self.count * len(rows) / total)
-        self._mean += step * (len(rows) / total)
-        self.count = total
+    def _shape(self) -> tuple[int, ...]:
+        t = self._tokenizer
+        return (t.tokens, t.channels) if t.channels else (t.tokens,)
 
-    def result(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        std = np.sqrt(self._square / self.count)
-        return tuple(self._mean.tolist()), tuple(std.tolist())
+    def _start(self) -> None:
+        images = np.stack(self._frames)
+        self._frames.clear()
+        self._collect()
+        self._under_way = self._pool.submit(self._tokenizer.encode, images)
+
+    def _collect(self) -> None:
+        if self._under_way is not None:
+            tokens = np.asarray(self._under_way.result())
+            self._tokens.append(tokens)
+            self.ready += len(tokens)
+            self._under_way = None

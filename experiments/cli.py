@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import cli_bench, cli_convert, commands, model_commands
+from experiments import cli_bench, cli_convert, commands, model_commands, tokenize_commands
 from experiments.cli_fit import fit
 from experiments.cli_tokenizer import tokenizer_app
 from experiments.program import PROGRAM
@@ -39,7 +39,8 @@ class Where:
     out: Path | None = None
     """Directory for everything that is written; runs/PRESET if not given."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
-    """Your RLDS directories, instead of the simulated suite. Their names must be in the registry."""
+    """Your RLDS directories, paths or URLs such as gs://..., instead of the simulated suite. Their names must
+    be in the registry."""
     tokenizer: Path | None = None
     """Directory of a tokenizer to use, instead of training one on the data. The model's tokens follow it."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
@@ -116,9 +117,27 @@ def tokenizer_train(where: OmitArgPrefixes[Where]) -> None:
 
 
 @app.command(name="tokenize")
-def tokenize(where: OmitArgPrefixes[Where]) -> None:
-    """Prepare everything up to training: suite, tokenizer, token store, evaluation windows."""
-    commands.tokenize(where.setting())
+def tokenize(
+    where: OmitArgPrefixes[Where],
+    process: int | None = None,
+    processes: int | None = None,
+    batch: int | None = None,
+    threads: int | None = None,
+) -> None:
+    """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
+
+    Killed at any point, the same command goes on and ends with the same bytes. Several processes
+    or machines share the work if each gets its number; SLURM's arrays and tasks, and Open MPI's, are
+    understood by themselves. The tokenizer must be there then: --tokenizer, or `hma tokenizer train` before.
+
+    Args:
+        where: Study, data, output directory and settings. The output must be shared by all processes.
+        process: Number of this process, from 0 on.
+        processes: How many processes share the work; 1 for all of it, whatever SLURM says.
+        batch: Frames encoded at a time; 256 if not given. Changes no token.
+        threads: Threads that decode frames; one per core up to 8 if not given.
+    """
+    tokenize_commands.tokenize(where.setting(), process, processes, batch, threads)
 
 
 @app.command(name="train")

@@ -64,17 +64,18 @@ def make_setting(
     tokenizer: Path | None = None,
 ) -> Setting:
     """The preset, on the user's data and tokenizer if given, with overrides. Touches no other file."""
-    study = get_preset(preset)
+    study, directories = get_preset(preset), ()
     if data:
+        from data_pipelines.location import absolute
         from experiments.pipeline import name_datasets
 
         study = on_user_data(study, name_datasets(data))
+        directories = tuple(map(absolute, data))
     if tokenizer is not None:
         from hma_jax.tokenizers.io import load_config
 
         study = on_tokenizer(study, load_config(tokenizer))
     study = override(study, settings)
-    directories = tuple(str(Path(d).absolute()) for d in data)
     workspace = Workspace((out or Path("runs") / study.name).absolute())
     return Setting(study, directories, workspace, tokenizer and tokenizer.absolute())
 
@@ -218,14 +219,6 @@ def train_tokenizer(setting: Setting) -> None:
         sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace)
         make_tokenizer(study, workspace, sources)
     wrote(workspace.tokenizer, then=next_command("tokenize", setting))
-
-
-def tokenize(setting: Setting) -> None:
-    from experiments.pipeline import prepare
-
-    with setting.workspace.claimed():
-        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer)
-    wrote(setting.workspace.store, setting.workspace.manifest, then=next_command("train", setting))
 
 
 def draw_again(out: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from rich.markup import escape
 
 from experiments.atomic import write_atomically
-from experiments.progress import console, step
+from experiments.progress import Pace, console, step
 from experiments.provenance import Provenance, source_hash
 from experiments.study import StoreConfig, Study
 from experiments.trial import CHECKPOINTS
@@ -26,8 +26,10 @@ from experiments.workspace import Workspace
 from hma_jax.config import TokenizerConfig, require, stable_hash, to_dict
 
 if TYPE_CHECKING:
+    from data_pipelines.location import Location
     from data_pipelines.registry import DatasetSpec
     from data_pipelines.rlds import RldsDataset
+    from data_pipelines.share import Share
     from data_pipelines.store import TokenStore
     from hma_jax.tokenizers.base import Tokenizer
 
@@ -38,17 +40,24 @@ QUALITY = "quality.json"
 QUALITY_FRAMES = 1024
 """Held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
 
-Source = tuple["DatasetSpec", Path]
+Source = tuple["DatasetSpec", "Location"]
 """A dataset: how it is read, and its RLDS directory."""
 
 
 def prepare(
-    study: Study, workspace: Workspace, data: Sequence[str] = (), tokenizer: Path | None = None
+    study: Study,
+    workspace: Workspace,
+    data: Sequence[str] = (),
+    tokenizer: Path | None = None,
+    *,
+    batch: int | None = None,
+    threads: int | None = None,
 ) -> Provenance:
     """Makes what is missing and returns what trials depend on.
 
     `data` are RLDS directories of the user, in the study's order; () simulates the suite. Instead
-    of training one, a trained `tokenizer` is taken from its directory.
+    of training one, a trained `tokenizer` is taken from its directory. `batch` and `threads` as
+    in `make_store`.
     Raises ConfigError or DataError.
     """
     sources = find_sources(study, data) if data else make_suite(study, workspace)
@@ -56,22 +65,23 @@ def prepare(
         make_tokenizer(study, workspace, sources)
     else:
         adopt_tokenizer(tokenizer, study, workspace)
-    make_store(study, workspace, sources)
+    make_store(study, workspace, sources, batch=batch, threads=threads)
     return freeze_windows(study, workspace)
 
 
 def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
     """The names that RLDS directories give themselves. Raises DataError for one that is none."""
-    from data_pipelines.rlds import RldsDataset
+    from data_pipelines.schema import dataset_name
 
-    return tuple(RldsDataset(Path(directory)).name for directory in data)
+    return tuple(map(dataset_name, data))
 
 
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     """User directories with their registry entries. Raises ConfigError for unknown names."""
+    from data_pipelines.location import locate
     from data_pipelines.registry import get_spec
 
-    named = dict(zip(name_datasets(data), map(Path, data), strict=True))
+    named = dict(zip(name_datasets(data), map(locate, data), strict=True))
     missing = [n for n in study.dataset_names() if n not in named]
     require(not missing, f"no --data directory for {', '.join(missing)}; given: {', '.join(named)}")
     return [(get_spec(name), named[name]) for name in study.dataset_names()]
@@ -181,26 +191,59 @@ def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> 
     return dataclasses.asdict(mean_and_sem(values))
 
 
-def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) -> None:
-    """Tokens of every source. Those made in the same way from the same shards are kept."""
+def find_suite(study: Study, workspace: Workspace) -> list[Source]:
+    """The simulated datasets, which must be there. Raises ConfigError otherwise."""
+    from data_pipelines.registry import get_spec
+
+    sources = [(get_spec(name), workspace.suite / name) for name in study.dataset_names()]
+    missing = [spec.name for spec, path in sources if not path.is_dir()]
+    require(
+        not missing,
+        f"{workspace.suite}: {', '.join(missing)} not simulated yet. Run `hma data suite` and `hma tokenizer "
+        "train` once with the same --preset and --out, then share the tokenising; or give --data",
+    )
+    return sources
+
+
+def make_store(
+    study: Study,
+    workspace: Workspace,
+    sources: Sequence[Source],
+    *,
+    tokenizer: Path | None = None,
+    share: Share | None = None,
+    batch: int | None = None,
+    threads: int | None = None,
+) -> list[str]:
+    """Tokens of every source, or of a `share` of their parts; those made in the same way are kept.
+
+    Other tokens in their place are removed, unless several processes are at work. Returns the
+    datasets that still lack parts of other processes. `tokenizer`: a directory, if it is not
+    the workspace's. `batch` and `threads` as in `tokenize_dataset`.
+    """
+    from data_pipelines.share import Share
     from data_pipelines.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
-    tokenizer, settings = load_tokenizer(workspace.tokenizer), to_dict(study.store)
-    workspace.store.mkdir(exist_ok=True)
-    with step(f"tokenise {len(sources)} dataset(s)") as update:
+    made_with = load_tokenizer(tokenizer or workspace.tokenizer)
+    settings, share = to_dict(study.store), share or Share()
+    how = {k: v for k, v in (("batch", batch), ("threads", threads)) if v is not None}
+    workspace.store.mkdir(parents=True, exist_ok=True)
+    unfinished = []
+    mine = f", share {share.process + 1} of {share.processes}" if share.processes > 1 else ""
+    with step(f"tokenise {len(sources)} dataset(s){mine}") as update:
         for i, (spec, path) in enumerate(sources):
-            note = f"{spec.name} ({i + 1} of {len(sources)})"
-            shards = open_source((spec, path), study.store).fingerprint()
-            made_from = stable_hash([tokenizer.identity, settings, to_dict(spec), shards])
-            stamp = workspace.store / f"{spec.name}.{STAMP}"
-            if not _reads(stamp, made_from):  # tokens of other data or another tokenizer are of no use
-                shutil.rmtree(workspace.store / spec.name, ignore_errors=True)
-                write_atomically(stamp, made_from)
-            tokenize_dataset(
-                spec, path, tokenizer, workspace.store, **settings,
-                progress=lambda done, total, note=note: update(done, total, note),
+            pace, note = Pace(), f"{spec.name} ({i + 1} of {len(sources)})"
+            manifest = tokenize_dataset(
+                spec, path, made_with, workspace.store, **settings, **how,
+                share=share, overwrite=share.processes == 1,
+                progress=lambda done, total, note=note, pace=pace: update(
+                    done, total, f"{note}{pace(done, total)}"
+                ),
             )  # fmt: skip
+            if manifest is None:
+                unfinished.append(spec.name)
+    return unfinished
 
 
 def freeze_windows(study: Study, workspace: Workspace) -> Provenance:
@@ -237,7 +280,7 @@ def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str,
             "episodes": len(manifest.train.episodes),
             "too_short": windows.too_short,
             "windows": len(windows),
-            "skipped": sum(manifest.skipped.values()),
+            "skipped": manifest.lost,
         }
     return summary
 

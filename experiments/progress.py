@@ -19,6 +19,9 @@ from experiments.runner import Job, Monitor, State
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)
 
+SAY_EVERY = 30.0
+"""Seconds between lines about work that goes on, where there is no terminal for a bar."""
+
 Update = Callable[[int, int, str], None]
 """Called as update(done, total, note)."""
 
@@ -38,14 +41,44 @@ def _bars() -> Progress:
 
 @contextmanager
 def step(title: str) -> Iterator[Update]:
-    """A bar while the block runs, one line with its duration after it."""
+    """A bar while the block runs, in a log a line now and then; one with the duration after it."""
     began = time.monotonic()
     if not console.is_terminal:
         console.print(f"{title} ...")
     with _bars() as bars:
         task = bars.add_task(title, total=None, note="")
-        yield lambda done, total, note="": bars.update(task, completed=done, total=total, note=note)
+        said = began
+
+        def update(done: int, total: int, note: str = "") -> None:
+            nonlocal said
+            bars.update(task, completed=done, total=total, note=note)
+            if not console.is_terminal and time.monotonic() - said >= SAY_EVERY:
+                said = time.monotonic()
+                console.print(f"{title}: {done}/{total} {escape(note)}", soft_wrap=True)
+
+        yield update
     console.print(f"[green]done[/] {title} [dim]({_clock(time.monotonic() - began)})")
+
+
+class Pace:
+    """How long what is left will take, from how long it took since the first call."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic):
+        self._clock = clock
+        self._first: tuple[float, int] | None = None
+
+    def __call__(self, done: int, total: int) -> str:
+        """', 3 min 20 s left', or nothing as long as it cannot be told.
+
+        What was done before the first call, by an earlier process, does not count.
+        """
+        now = self._clock()
+        if self._first is None:
+            self._first = (now, done)
+        began, before = self._first
+        if done <= before or done >= total:
+            return ""
+        return f", {_clock((now - began) / (done - before) * (total - done))} left"
 
 
 def tidy_table(title: str, *columns: str) -> Table:
@@ -95,4 +128,6 @@ class SweepMonitor(Monitor):
 
 def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
+    if minutes >= 60:
+        return f"{minutes // 60} h {minutes % 60} min"
     return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"

@@ -15,6 +15,10 @@ from experiments.study import Study
 from hma_jax.config import ConfigError, from_dict, to_dict
 
 
+class Busy(ConfigError):
+    """Another command is at work in the directory."""
+
+
 @dataclass(frozen=True)
 class Workspace:
     """Paths under `root`. Deleting any of them is safe: the next run makes it again."""
@@ -74,7 +78,7 @@ class Workspace:
     def claimed(self) -> Iterator[None]:
         """Makes the directory and holds the right to write in it; a lock that dies with its process.
 
-        Raises ConfigError if the directory cannot be written or another process holds it.
+        Raises ConfigError if the directory cannot be written, Busy if another process holds it.
         """
         try:
             self.root.mkdir(parents=True, exist_ok=True)
@@ -87,7 +91,7 @@ class Workspace:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise ConfigError(
+                raise Busy(
                     f"another command is at work in {self.root}; wait for it or choose another --out"
                 ) from None
             yield

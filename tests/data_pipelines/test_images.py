@@ -34,6 +34,12 @@ def test_bytes_that_are_no_image_are_refused(data):
         decode_image(data)
 
 
+def test_image_that_would_fill_the_memory_is_refused(monkeypatch):
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
+    with pytest.raises(ValueError, match="too large to be a frame"):
+        decode_image(png(np.zeros((8, 8, 3), np.uint8)))
+
+
 @pytest.mark.parametrize("shape", [(40, 64), (64, 40), (720, 1280), (1440, 1920), (31, 33)])
 def test_the_central_square_is_kept_whatever_the_aspect(shape):
     """A ramp along each axis tells where a pixel came from."""
@@ -50,6 +56,36 @@ def test_the_central_square_is_kept_whatever_the_aspect(shape):
     inner = slice(1, -1)  # the filter is cut at the border
     assert np.abs(out[..., 0] - rows[:, None])[inner].max() < 2.5
     assert np.abs(out[..., 1] - columns[None])[:, inner].max() < 2.5
+
+
+def resize_and_crop(image: np.ndarray, size: int) -> np.ndarray:
+    """By definition, in float: a triangle filter on the whole image, of which the central
+    square is evaluated, with no rounding of the longer side in between."""
+    scale = min(image.shape[:2]) / size
+    out = image.astype(float)
+    for axis in (0, 1):
+        length = image.shape[axis]
+        centres = (np.arange(size) + 0.5 - size / 2) * scale + length / 2
+        distance = np.abs(np.arange(length) + 0.5 - centres[:, None])
+        weights = np.clip(1 - distance / max(scale, 1), 0, None)
+        out = np.moveaxis(np.tensordot(weights / weights.sum(axis=1, keepdims=True), out, (1, axis)), 0, axis)
+    return out
+
+
+@pytest.mark.parametrize("size", [64, 96])
+@pytest.mark.parametrize(
+    "shape",
+    [(480, 640), (640, 480), (720, 1280), (1280, 720), (1080, 1920), (97, 211), (64, 1500), (50, 41), (9, 9)],
+)
+def test_resizing_equals_its_definition_at_every_aspect(shape, size):
+    """Portrait, landscape, beyond the 1024 pixels where the release distorts, odd margins, enlarged."""
+    rng = np.random.default_rng(shape[0])
+    coarse = Image.fromarray(rng.integers(0, 256, (9, 13, 3)).astype(np.uint8))
+    image = np.asarray(coarse.resize(shape[::-1], Image.Resampling.BICUBIC))
+    noisy = np.clip(image + rng.normal(0, 20, image.shape), 0, 255).astype(np.uint8)
+    out = fit_image(noisy, size)
+    assert out.shape == (size, size, 3) and out.dtype == np.uint8
+    assert np.abs(out - resize_and_crop(noisy, size)).max() <= 1.5  # two passes of rounding
 
 
 def test_down_scaling_is_antialiased():

@@ -206,6 +206,16 @@ def test_actions_and_frames_of_different_number(tmp_path):
         dataset.episode(0, *KEYS)
 
 
+def test_episode_without_frames_is_unusable(tmp_path):
+    def spoil(episode, features):
+        features |= {"steps/observation/image": [], "steps/action": np.zeros((0, 3), np.float32)}
+
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6], change=spoil))
+    for keys in (SPEC.action_keys, ()):
+        with pytest.raises(EpisodeError, match="episode 0 .*no frames"):
+            dataset.episode(0, SPEC.image_key, keys)
+
+
 def test_image_that_cannot_be_decoded_names_the_step(tmp_path):
     def spoil(episode, features):
         features["steps/observation/image"][3] = b"\xff\xd8\xff broken"

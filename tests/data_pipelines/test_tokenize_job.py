@@ -15,6 +15,7 @@ from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
 
 SPEC = make_spec(hz=4)  # stride 2
+FILES = ["train-00000-of-00001.array_record", "val-00000-of-00001.array_record"]
 
 
 @pytest.fixture
@@ -24,6 +25,11 @@ def rlds(tmp_path):
 
 def files(directory):
     return sorted(p.name for p in directory.iterdir())
+
+
+def visible(directory):
+    """What is no leftover of an unfinished job."""
+    return [name for name in files(directory) if not name.startswith(".")]
 
 
 def test_every_episode_is_stored_once_with_its_own_frames_and_actions(tmp_path, rlds):
@@ -45,7 +51,8 @@ def test_every_episode_is_stored_once_with_its_own_frames_and_actions(tmp_path, 
             seen.append(number)
     assert sorted(seen) == list(range(8))
     assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", 8)))
-    assert files(tmp_path / "store" / "toy") == ["manifest.json", "train.array_record", "val.array_record"]
+    assert files(tmp_path / "store" / "toy") == ["manifest.json", "parts", *FILES]
+    assert files(tmp_path / "store") == ["toy"]
 
 
 def test_latents_are_stored_in_half_precision_with_their_own_frames(tmp_path, rlds):
@@ -70,7 +77,7 @@ def test_result_is_the_same_bytes_whenever_wherever_and_in_whatever_batches(tmp_
     elsewhere = write_rlds(tmp_path / "other place", SPEC, [5, 6, 7, 8, 9, 10, 11, 12], shards=2)
     tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "a", batch=3)
     tokenize_dataset(SPEC, elsewhere, FakeTokenizer(), tmp_path / "b", batch=256)
-    for name in ("manifest.json", "train.array_record", "val.array_record"):
+    for name in ("manifest.json", *FILES):
         assert (tmp_path / "a/toy" / name).read_bytes() == (tmp_path / "b/toy" / name).read_bytes()
     assert TokenStore(tmp_path / "a").hash() == TokenStore(tmp_path / "b").hash()
 
@@ -94,6 +101,8 @@ def test_statistics_are_over_native_train_actions(tmp_path, rlds):
     rows = [(e, t, 0) for e in manifest.train.episodes for t in range(5 + e)]
     np.testing.assert_allclose(manifest.action_mean, np.mean(rows, axis=0), rtol=1e-12)
     np.testing.assert_allclose(manifest.action_std, np.std(rows, axis=0), rtol=1e-12)
+    assert manifest.action_min == tuple(np.min(rows, axis=0))
+    assert manifest.action_max == tuple(np.max(rows, axis=0))
 
 
 def test_all_phases_can_be_stored(tmp_path, rlds):
@@ -113,10 +122,10 @@ def test_raw_frames_are_kept_as_asked(tmp_path, rlds, keep, expected):
 
 def test_second_run_does_nothing_and_other_settings_are_refused(tmp_path, rlds):
     first = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
-    stamp = (tmp_path / "store/toy/train.array_record").stat().st_mtime_ns
+    stamp = (tmp_path / "store/toy" / FILES[0]).stat().st_mtime_ns
     described = replace(SPEC, note="words", camera="more words")
     assert tokenize_dataset(described, rlds, FakeTokenizer(), tmp_path / "store") == first
-    assert (tmp_path / "store/toy/train.array_record").stat().st_mtime_ns == stamp
+    assert (tmp_path / "store/toy" / FILES[0]).stat().st_mtime_ns == stamp
     with pytest.raises(ConfigError, match="in another way.*tokenizer.identity: 'fake' -> 'new'"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer("new"), tmp_path / "store")
     with pytest.raises(ConfigError, match="settings.keep_frames: 'val' -> 'all'"):
@@ -130,9 +139,9 @@ def test_interrupted_job_leaves_no_dataset_and_can_be_repeated(tmp_path, rlds):
 
     with pytest.raises(KeyboardInterrupt):
         tokenize_dataset(SPEC, rlds, Dies(), tmp_path / "store")
-    assert files(tmp_path / "store") == []
-    (tmp_path / "store/.toy.partial").mkdir()  # as a killed process leaves it
-    (tmp_path / "store/.toy.partial/train.array_record").write_bytes(b"half")
+    assert visible(tmp_path / "store") == []
+    with pytest.raises(DataError, match="no dataset in this token store"):
+        TokenStore(tmp_path / "store")
     tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     assert files(tmp_path / "store") == ["toy"]
 
@@ -144,7 +153,7 @@ def test_unwritable_directory_is_one_clear_message(tmp_path, rlds):
 
 
 def test_full_disk_is_one_clear_message_and_leaves_nothing(tmp_path, rlds, monkeypatch):
-    from data_pipelines import tokenize_job
+    from data_pipelines import part
 
     class Full:
         def __init__(self, path, options):
@@ -156,10 +165,10 @@ def test_full_disk_is_one_clear_message_and_leaves_nothing(tmp_path, rlds, monke
         def close(self):  # what ArrayRecord does when the disk is full
             raise RuntimeError("write() failed: No space left on device")
 
-    monkeypatch.setattr(tokenize_job.array_record_module, "ArrayRecordWriter", Full)
+    monkeypatch.setattr(part.array_record_module, "ArrayRecordWriter", Full)
     with pytest.raises(ConfigError, match="cannot be written there .*No space left"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
-    assert files(tmp_path / "store") == []
+    assert visible(tmp_path / "store") == []
 
 
 def test_wrong_spec_is_found_before_anything_is_written(tmp_path, rlds):
@@ -181,8 +190,9 @@ def test_unusable_episode_stops_the_job_or_is_skipped_and_recorded(tmp_path):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip")
     assert sorted(manifest.train.episodes + manifest.val.episodes) == [1, 2, 3, 4]
-    (reason, count), = manifest.skipped.items()
-    assert count == 1 and "episode 0" in reason and str(tmp_path) not in reason
+    (loss,) = manifest.skipped
+    assert (loss.file, loss.offset, loss.episodes) == ("toy-train.tfrecord-00000-of-00001", 0, 1)
+    assert "episode 0" in loss.reason and str(tmp_path) not in loss.reason
     assert load_manifest(tmp_path / "store/toy/manifest.json") == manifest
 
 
@@ -190,8 +200,8 @@ def test_truncated_shard_is_skipped_and_recorded_without_its_path(tmp_path, rlds
     shard = sorted(rlds.glob("*.tfrecord*"))[0]
     shard.write_bytes(shard.read_bytes()[:-1])
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip")
-    assert sum(manifest.skipped.values()) == 1
-    assert next(iter(manifest.skipped)).startswith(shard.name)
+    assert manifest.lost == 1
+    assert manifest.skipped[0].reason.startswith(shard.name)
 
 
 def test_skipping_too_much_stops_the_job(tmp_path):
@@ -203,7 +213,7 @@ def test_skipping_too_much_stops_the_job(tmp_path):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip", max_skipped=3)
     with pytest.raises(DataError, match="no usable episode"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip")
-    assert files(tmp_path / "store") == []
+    assert visible(tmp_path / "store") == []
 
 
 def test_progress_reaches_the_number_of_episodes(tmp_path, rlds):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipelines.episode_record import StoredEpisode
-from data_pipelines.tokenize_job import _Moments
+from data_pipelines.moments import Moments, merge_all
 from data_pipelines.windows import cut_actions, cut_frames, train_windows
 from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.convert.official import official_shapes
@@ -120,10 +120,9 @@ def check_windows(case: Case) -> None:
         _check_starts(case, data, one)
     for key in items:
         _check_item(case, stores, key, items[key])
-    moments = _Moments(data.actions.shape[1])
-    for segment in np.unique(data.segments):
-        moments.add(data.actions[data.segments == segment])
-    for name, got in zip(("action_mean", "action_std"), moments.result(), strict=True):
+    episodes = [data.actions[data.segments == segment] for segment in np.unique(data.segments)]
+    moments = merge_all(map(Moments.of, episodes), data.actions.shape[1])
+    for name, got in (("action_mean", moments.mean), ("action_std", moments.std)):
         case.compare(name, got, facts[name], 1e-5)
     case.compare("episodes", len(data.ends), facts["episodes"], 0)
     case.add(Finding("stride_from_frequency_table", None, note="not followed: our datasets all have a rate"))
