@@ -78,7 +78,7 @@ def tokenize_dataset(
     source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = Manifest(
-        spec=replace(spec, camera="", note=""),  # words for people do not change the data
+        spec=spec.facts(),
         tokenizer=_facts(tokenizer),
         settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
         source=source.fingerprint(),

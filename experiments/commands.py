@@ -88,14 +88,11 @@ def run_study(
     setting: Setting, axes: Sequence[str], *, workers: int, retry_failed: bool, mesh: MeshConfig
 ) -> None:
     """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end."""
-    from experiments.pipeline import prepare
+    from experiments.pipeline import prepare, require_simulated
 
     study, workspace = setting.study, setting.workspace
-    if study.name == "paper" and not setting.data:
-        raise ConfigError(
-            "the paper's forty datasets are not simulated: give their RLDS directories with --data, or "
-            "add --dry-run to see the plan"
-        )
+    if not setting.data:
+        require_simulated(study.dataset_names())
     sweeps = [AXES[axis](study) for axis in axes]
     with workspace.claimed():
         all_axes = merge_axes(workspace, study, axes)

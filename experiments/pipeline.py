@@ -77,6 +77,19 @@ def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     return [(get_spec(name), named[name]) for name in study.dataset_names()]
 
 
+def require_simulated(names: Sequence[str]) -> None:
+    """Raises ConfigError unless every dataset is one of the suite, which needs no --data."""
+    from data_pipelines.suite.embodiments import EMBODIMENTS
+
+    simulated = {e.name for e in EMBODIMENTS}
+    real = [name for name in names if name not in simulated]
+    require(
+        not real,
+        f"{', '.join(real[:3])}{' and others' if len(real) > 3 else ''}: not simulated. Give RLDS directories "
+        "with --data, or add --dry-run to see the plan",
+    )
+
+
 def make_suite(study: Study, workspace: Workspace) -> list[Source]:
     """The simulated datasets of the study, written once."""
     from data_pipelines.registry import get_spec
@@ -84,6 +97,7 @@ def make_suite(study: Study, workspace: Workspace) -> list[Source]:
 
     names = study.dataset_names()
     specs = [get_spec(name) for name in names]  # a mistyped name is refused before any work
+    require_simulated(names)
     with step(f"simulate {len(names)} datasets") as update:
         paths = generate_suite(
             workspace.suite,
@@ -188,7 +202,7 @@ def make_store(study: Study, workspace: Workspace, sources: Sequence[Source]) ->
         for i, (spec, path) in enumerate(sources):
             note = f"{spec.name} ({i + 1} of {len(sources)})"
             shards = open_source((spec, path), study.store).fingerprint()
-            made_from = stable_hash([tokenizer.identity, settings, to_dict(spec), shards])
+            made_from = stable_hash([tokenizer.identity, settings, to_dict(spec.facts()), shards])
             stamp = workspace.store / f"{spec.name}.{STAMP}"
             if not _reads(stamp, made_from):  # tokens of other data or another tokenizer are of no use
                 shutil.rmtree(workspace.store / spec.name, ignore_errors=True)

@@ -186,7 +186,7 @@ def test_unknown_dataset_name(tmp_path, refused):
     rlds = write_rlds(tmp_path, make_spec("two_link_arm_joint_target", (2,)), LENGTHS)
     message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
     assert "unknown dataset 'two_link_arm_joint_target'; did you mean two_link_arm_joint_targets" in message
-    assert "data_pipelines/registry.py" in message
+    assert "data_pipelines/registry/own.py" in message and "hma data inspect" in message
 
 
 def test_unknown_dataset_of_the_suite(tmp_path, refused):
