@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands, model_commands
+from experiments import commands, data_commands, model_commands
 from experiments.cli_convert import HELP, convert_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -41,13 +41,19 @@ class Where:
     """Directory for everything that is written; runs/PRESET if not given."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
     """Your RLDS directories, instead of the simulated suite. Their names must be in the registry."""
+    registry: Path | None = None
+    """TOML file with registry entries of your own, as `hma data inspect --entry` writes it."""
+    mixture: str | None = None
+    """Named list of datasets, such as dataset10; --data then takes the directories that hold them."""
     tokenizer: Path | None = None
     """Directory of a trained tokenizer to use, instead of training one on the data."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
     """Change one setting, such as --set model.frames=4 --set train.steps=100; may be repeated."""
 
     def setting(self) -> commands.Setting:
-        return commands.make_setting(self.preset, self.out, self.data, self.set, self.tokenizer)
+        return commands.make_setting(
+            self.preset, self.out, self.data, self.set, self.tokenizer, self.registry, self.mixture
+        )
 
 
 @dataclass(frozen=True)
@@ -100,9 +106,50 @@ def _run(where: Where, how: How, axes: tuple[str, ...]) -> None:
 
 
 @data_app.command(name="list")
-def data_list() -> None:
-    """List the datasets that the registry knows: camera, action size, rate."""
-    commands.list_datasets()
+def data_list(
+    words: Annotated[Positional[tuple[str, ...]], arg(metavar="[WORD ...]")] = (),
+    mixture: str | None = None,
+    registry: Path | None = None,
+) -> None:
+    """List the datasets that the registry knows: camera, action size, rate.
+
+    Args:
+        words: Only entries with all these words in name, note, camera or group ("open-x", "franka").
+        mixture: Only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
+        registry: TOML file with entries of your own.
+    """
+    data_commands.list_datasets(words, mixture, registry)
+
+
+@data_app.command(name="inspect")
+def data_inspect(
+    directory: Positional[Path],
+    hz: float | None = None,
+    split: str = "train",
+    out: Path | None = None,
+    episodes: int = 32,
+    frames: int = 12,
+    json: Path | None = None,
+    entry: Path | None = None,
+    registry: Path | None = None,
+) -> None:
+    """Show what an RLDS directory holds, draw a contact sheet, and suggest its registry entry.
+
+    Args:
+        directory: The dataset: <name> or <name>/<version>, as tfds wrote it.
+        hz: Native rate of its frames; no file says it.
+        split: The split to look at.
+        out: Directory for contact_sheet.png; runs/inspect/NAME if not given.
+        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        frames: Frames of the model's window, to count windows.
+        json: Write everything there as JSON.
+        entry: Add the suggested entry to this TOML file, for --registry.
+        registry: TOML file with entries of your own.
+    """
+    data_commands.inspect(
+        directory, split=split, hz=hz, out=out, episodes=episodes, frames=frames, as_json=json,
+        entry=entry, registry=registry,
+    )  # fmt: skip
 
 
 @data_app.command(name="suite")
@@ -183,7 +230,7 @@ def report(out: Path) -> None:
     commands.draw_again(out)
 
 
-app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
+app.command(data_app, name="data", help="Datasets: the registry, what a directory holds, the simulated suite.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 app.command(convert_app, name="convert", help=HELP)
 

@@ -57,6 +57,7 @@ class Setting:
     data: tuple[str, ...]
     workspace: Workspace
     tokenizer: Path | None = None  # a trained one to use; None: train one on the data
+    registry: Path | None = None  # a file of entries besides those of the project
 
 
 def make_setting(
@@ -65,17 +66,50 @@ def make_setting(
     data: Sequence[str],
     settings: Sequence[str],
     tokenizer: Path | None = None,
+    registry: Path | None = None,
+    mixture: str | None = None,
 ) -> Setting:
-    """The preset, on the user's data if given, with overrides. Touches no file but `data`."""
+    """The preset, on the user's data if given, with overrides. Touches no file but `data`.
+
+    A `mixture` names the datasets, which are then looked for in the directories of `data`.
+    """
     study = get_preset(preset)
-    if data:
+    use_entries(registry)
+    if mixture is not None:
+        from data_pipelines.registry.mixtures import get_mixture
+
+        names = get_mixture(mixture)
+        study = on_user_data(study, names)
+        data = find_directories(names, data) if data else ()
+    elif data:
         from experiments.pipeline import name_datasets
 
         study = on_user_data(study, name_datasets(data))
     study = override(study, settings)
     directories = tuple(str(Path(d).absolute()) for d in data)
     workspace = Workspace((out or Path("runs") / study.name).absolute())
-    return Setting(study, directories, workspace, tokenizer and tokenizer.absolute())
+    return Setting(study, directories, workspace, tokenizer and tokenizer.absolute(), registry and registry.absolute())
+
+
+def use_entries(registry: Path | None) -> None:
+    """Adds the entries of a TOML file to the registry, for the rest of this process."""
+    if registry is not None:
+        from data_pipelines.registry import register
+        from data_pipelines.registry.toml_file import load_entries
+
+        register(load_entries(registry))
+
+
+def find_directories(names: Sequence[str], roots: Sequence[str]) -> list[str]:
+    """`<root>/<name>` for every name, in the first root that has it. ConfigError for those missing."""
+    found = {n: Path(r) / n for r in reversed(roots) for n in names if (Path(r) / n).is_dir()}
+    missing = [n for n in names if n not in found]
+    if missing:
+        raise ConfigError(
+            f"no directory for {', '.join(missing)} in {', '.join(roots)}; with a mixture, --data takes the "
+            "directories that hold <name>/<version>"
+        )
+    return [str(found[n]) for n in names]
 
 
 def dry_run(study: Study, axes: Sequence[str]) -> None:
@@ -184,25 +218,6 @@ def short(path: Path) -> str:
 # --- Single steps ----------------------------------------------------------------------------
 
 
-def list_datasets() -> None:
-    from data_pipelines.registry import all_specs
-
-    table = tidy_table("Datasets that the registry knows", "name", "dims", "Hz", "stride")
-    table.add_column("image", overflow="fold")
-    table.add_column("what it is", min_width=30)
-    for spec in all_specs():
-        table.add_row(
-            spec.name,
-            f"{spec.action_dim}",
-            f"{spec.hz:g}",
-            f"{spec.stride}",
-            spec.image_key.removeprefix("observation/"),
-            spec.note,
-        )
-    console.print(table)
-    console.print("A dataset of your own is one more entry in data_pipelines/registry.py.")
-
-
 def write_suite(setting: Setting) -> None:
     from experiments.pipeline import make_suite
 
@@ -240,4 +255,5 @@ def next_command(command: str, setting: Setting) -> str:
     out = short(setting.workspace.root)
     data = " --data " + " ".join(map(shlex.quote, setting.data)) if setting.data else ""
     tokenizer = f" --tokenizer {shlex.quote(short(setting.tokenizer))}" if setting.tokenizer else ""
-    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}{tokenizer}"
+    registry = f" --registry {shlex.quote(short(setting.registry))}" if setting.registry else ""
+    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}{registry}{tokenizer}"

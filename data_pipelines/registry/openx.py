@@ -18,6 +18,7 @@ from data_pipelines.registry.spec import DatasetSpec
 
 LONG = "_converted_externally_to_rlds"
 
+BASE = {"action/base_displacement_vector": 2, "action/base_displacement_vertical_rotation": 1}
 DELTA_POSE = {"action/world_vector": 3, "action/rotation_delta": 3}
 CLOSEDNESS = DELTA_POSE | {"action/gripper_closedness_action": 1}
 
@@ -59,8 +60,7 @@ OPENX = (
           "WidowX: end-effector deltas and gripper; image_1..3 can be blank",
           image="image_0", version="0.0.1"),
     # DIFFERS: the release appends the three flags of terminate_episode (13 values).
-    openx("fractal20220817_data", 3,
-          {"action/base_displacement_vector": 2, "action/base_displacement_vertical_rotation": 1} | CLOSEDNESS,
+    openx("fractal20220817_data", 3, BASE | CLOSEDNESS,
           "Google robot (RT-1): base, end-effector deltas, gripper; the base hardly moves", camera="head"),
     # DIFFERS: the release's table says 2 Hz, so that every native 10 Hz frame is used.
     openx("language_table", 10, {"action": 2}, "xArm pushing blocks: planar deltas; text as code points",
@@ -78,11 +78,9 @@ OPENX = (
     # DIFFERS: the release has no rate for it (native 10 Hz).
     openx("berkeley_fanuc_manipulation", 10, {"action": 6}, "Fanuc Mate: end-effector deltas, no gripper"),
     openx(f"berkeley_mvp{LONG}", 5, {"action": 8}, "xArm: joint deltas and binary gripper",
-          image="hand_image",
-          camera="wrist, the only one"),
+          image="hand_image", camera="wrist, the only one"),
     openx(f"berkeley_rpt{LONG}", 30, {"action": 8}, "Franka: joint deltas and binary gripper",
-          image="hand_image",
-          camera="wrist, the only one"),
+          image="hand_image", camera="wrist, the only one"),
     openx("cmu_play_fusion", 5, {"action[:8]": 8}, "Franka: delta pose (quaternion) and gripper"),
     openx(f"iamlab_cmu_pickup_insert{LONG}", 20, {"action": 8},
           "Franka: absolute pose (quaternion) and gripper"),

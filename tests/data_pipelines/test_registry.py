@@ -71,9 +71,9 @@ def test_rates_that_the_release_gets_wrong_are_right():
     native = {
         "bridge_data_v2": 5, "utokyo_xarm_bimanual_converted_externally_to_rlds": 10,
         "berkeley_fanuc_manipulation": 10, "qut_dexterous_manpulation": 30,
-        "dlr_sara_grid_clamp_converted_externally_to_rlds": 10, "cmu_stretch": 10, "spoc": 10, "io_ai_tech": 30,
-        "dobbe": 3.75, "berkeley_gnm_cory_hall": 5, "plex_robosuite": 20, "imperial_wrist_dataset": 10,
-        "language_table": 10, "kuka": 10,
+        "dlr_sara_grid_clamp_converted_externally_to_rlds": 10, "cmu_stretch": 10, "spoc": 10,
+        "io_ai_tech": 30, "dobbe": 3.75, "berkeley_gnm_cory_hall": 5, "plex_robosuite": 20,
+        "imperial_wrist_dataset": 10, "language_table": 10, "kuka": 10,
     }  # fmt: skip
     assert {name: get_spec(name).hz for name in native} == native
 
