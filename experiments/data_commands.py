@@ -101,8 +101,8 @@ def inspect(
         windows = window_facts(facts, stride, frames)
         console.print(
             f"[bold]rate[/] {rate:g} Hz{'' if hz else ' (registry)'}: stride {stride}, "
-            f"{rate / stride:.2f} Hz; a window of {frames} frames takes {windows.needed} steps, which {windows.long_enough} of "
-            f"{facts.sampled} sampled episodes have; about {windows.total:,.0f} windows in the split"
+            f"{rate / stride:.2f} Hz; a window of {frames} frames takes {windows.needed} steps, which "
+            f"{windows.long_enough} of {facts.sampled} sampled episodes have; about {windows.total:,.0f} windows in the split"
         )
     _print_entry(facts, known, suggestion)
     folder = out or Path("runs") / "inspect" / facts.name
