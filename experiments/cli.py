@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands, data_commands, model_commands
+from experiments import commands, registry_commands, model_commands
 from experiments.cli_convert import HELP, convert_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -118,7 +118,7 @@ def data_list(
         mixture: Only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
         registry: TOML file with entries of your own.
     """
-    data_commands.list_datasets(words, mixture, registry)
+    registry_commands.list_datasets(words, mixture, registry)
 
 
 @data_app.command(name="inspect")
@@ -146,7 +146,7 @@ def data_inspect(
         entry: Add the suggested entry to this TOML file, for --registry.
         registry: TOML file with entries of your own.
     """
-    data_commands.inspect(
+    registry_commands.inspect(
         directory, split=split, hz=hz, out=out, episodes=episodes, frames=frames, as_json=json,
         entry=entry, registry=registry,
     )  # fmt: skip

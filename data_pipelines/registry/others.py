@@ -1,7 +1,7 @@
 """What the paper's mixture adds to Open X-Embodiment: human videos and simulators.
 
-Nobody published these as RLDS, so the entries describe what a conversion writes: one camera
-`image` and one field `action`.
+Nobody published these as RLDS, so the entries describe what a conversion writes (`hma data
+convert`): one camera, and one field `action`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ OTHERS = (
     openx("metaworld", 80, {"action": 4}, "Meta-World, Sawyer: hand displacement and gripper", version="",
           unverified=CONVERTED),
     # DIFFERS: the release says 6 Hz; robosuite's control rate, at which the demonstrations lie, is 20 Hz.
-    openx("robomimic", 20, {"action": 7}, "Robomimic, simulated Panda: pose deltas and gripper", version="",
-          unverified=CONVERTED),
-    openx("epic_kitchen", 30, {"action": 4}, "EPIC-KITCHENS: both hands' box centres",
-          camera="head", version="",
-          unverified=f"{CONVERTED}; hz (frames as extracted)"),
-    openx("ego4d", 1, {"action": 4}, "Ego4D: both hands' centres in annotated frames",
-          camera="head", version="",
-          unverified=f"{CONVERTED}; hz (annotated frames are irregular)"),
-    openx("exoego4d", 30, {"action": 4}, "Ego-Exo4D: both wrists in an outer camera", version="",
-          unverified=CONVERTED),
+    openx("robomimic", 20, {"action": 7}, "Robomimic, simulated Panda: pose deltas and gripper",
+          image="agentview", version="", unverified=CONVERTED),
+    # DIFFERS: the release says 30 Hz; videos have 50 or 60, and a conversion thins both to the same 10.
+    openx("epic_kitchen", 10, {"action": 4}, "EPIC-KITCHENS: how both hands' box centres move",
+          camera="head", version="", unverified=CONVERTED),
+    # DIFFERS: the release says 1 Hz; annotated frames are half a second apart.
+    openx("ego4d", 2, {"action": 4}, "Ego4D: where both hands' centres are next", camera="head", version="",
+          unverified=f"{CONVERTED}; annotated frames are not quite even"),
+    openx("exoego4d", 30, {"action": 4}, "Ego-Exo4D: where both wrists are next, in an outer camera",
+          version="", unverified=CONVERTED),
 )  # fmt: skip

@@ -55,7 +55,7 @@ def main(arguments: list[str]) -> int:
         return 2
     tensorflow = load_tensorflow()
     version = importlib.metadata.version("tensorflow_datasets")
-    against = f"tensorflow {tensorflow.__version__}" if tensorflow else "no TensorFlow here: pixels not compared"
+    against = f"tensorflow {tensorflow.__version__}" if tensorflow else "no TensorFlow, pixels not compared"
     print(f"tensorflow_datasets {version}; {against}")
     total = Tally()
     for path in [d for a in arguments for d in datasets_in(Path(a))]:

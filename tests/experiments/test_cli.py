@@ -15,7 +15,7 @@ from experiments.runner import read_states
 from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
-COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "tokenizer", "tokenizer train", "tokenize",
+COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer", "tokenizer train", "tokenize",
             "train", "evaluate", "report", "convert", "convert from-official", "convert to-official",
             "convert to-safetensors", "convert from-safetensors", "convert to-stablehlo")  # fmt: skip
 
