@@ -81,6 +81,7 @@ def inspect(
 ) -> None:
     """Prints the facts, writes the contact sheet and, if asked, JSON and the suggested entry."""
     from data_pipelines.inspect import inspect_dataset
+    from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_spec
     from data_pipelines.suggest import suggest_entry, window_facts
     from experiments.contact_sheet import draw_sheet
@@ -97,12 +98,13 @@ def inspect(
     print_facts(facts)
     rate = hz or (known.hz if known else None)
     if rate:
-        stride = _stride(rate)
+        stride = stride_of(rate)
         windows = window_facts(facts, stride, frames)
         console.print(
             f"[bold]rate[/] {rate:g} Hz{'' if hz else ' (registry)'}: stride {stride}, "
             f"{rate / stride:.2f} Hz; a window of {frames} frames takes {windows.needed} steps, which "
-            f"{windows.long_enough} of {facts.sampled} sampled episodes have; about {windows.total:,.0f} windows in the split"
+            f"{windows.long_enough} of {facts.sampled} sampled episodes have; about {windows.total:,.0f} "
+            "windows in the split"
         )
     _print_entry(facts, known, suggestion)
     folder = out or Path("runs") / "inspect" / facts.name
@@ -115,16 +117,11 @@ def inspect(
     wrote(sheet)
     if as_json is not None:
         values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
-        write_atomically(as_json, json.dumps(values, indent=1))
+        strict = json.loads(json.dumps(values), parse_constant=lambda _: None)  # JSON has no NaN
+        write_atomically(as_json, json.dumps(strict, indent=1))
         wrote(as_json)
     if entry is not None:
         _write_entry(entry, suggestion)
-
-
-def _stride(rate: float) -> int:
-    from data_pipelines.registry import DatasetSpec
-
-    return DatasetSpec("any", "observation/image", (), (), rate).stride
 
 
 def print_facts(facts: Facts) -> None:

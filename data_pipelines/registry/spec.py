@@ -12,6 +12,15 @@ FRAME_RATE = 2.0
 """Hz at which the model sees frames (paper section 4)."""
 
 
+def stride_of(hz: float) -> int:
+    """Native frames per model frame: the integer that comes nearest to 2 Hz, at least 1.
+
+    DIFFERS: the release floors the ratio and knows a rate for 28 of its 40 datasets only;
+    the others run at their native rate (reference sections 5.3 and 5.4).
+    """
+    return max(round(hz / FRAME_RATE), 1)
+
+
 @dataclass(frozen=True)
 class DatasetSpec:
     """How one RLDS dataset is read.
@@ -55,12 +64,8 @@ class DatasetSpec:
 
     @property
     def stride(self) -> int:
-        """Native frames per model frame: the integer that comes nearest to 2 Hz, at least 1.
-
-        DIFFERS: the release floors the ratio and knows a rate for 28 of its 40 datasets only;
-        the others run at their native rate (reference sections 5.3 and 5.4).
-        """
-        return max(round(self.hz / FRAME_RATE), 1)
+        """Native frames per model frame."""
+        return stride_of(self.hz)
 
     @property
     def action_dim(self) -> int:

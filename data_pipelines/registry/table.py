@@ -29,7 +29,7 @@ def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
     groups = {
         "given by you": tuple(_registered.values()),
         "own and samples": OWN,
-        "Open X-Embodiment": OPENX + OPENX_MORE,
+        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE,
         "other datasets of the paper": OTHERS,
         "embedded suite (simulated)": _suite(),
     }

@@ -41,6 +41,8 @@ def test_list_is_filtered_by_words_and_mixture(capsys):
     assert "bc_z" in said and "fractal20220817_data" in said and "droid" not in said
     assert main(["data", "list", "--mixture", "dataset5"]) == 0
     assert "5 entries" in capsys.readouterr().out
+    assert main(["data", "list", "open-x", "wrist"]) == 0
+    assert "berkeley_mvp" in capsys.readouterr().out
     assert main(["data", "list", "no_such_word"]) == 2
 
 
