@@ -230,7 +230,7 @@ def report(out: Path) -> None:
     commands.draw_again(out)
 
 
-app.command(data_app, name="data", help="Datasets: the registry, what a directory holds, the simulated suite.")
+app.command(data_app, name="data", help="The registry, what a directory holds, the simulated suite.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 app.command(convert_app, name="convert", help=HELP)
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
-from experiments import commands, pipeline
+from experiments import pipeline, registry_commands
 from experiments.cli import main
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
@@ -412,9 +412,9 @@ def test_background_readers_of_a_damaged_checkpoint_stay_silent(study, tmp_path)
 
 
 def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch):
-    def broken():
+    def broken(*_):
         raise KeyError("oops")
 
-    monkeypatch.setattr(commands, "list_datasets", broken)
+    monkeypatch.setattr(registry_commands, "list_datasets", broken)
     with pytest.raises(KeyError, match="oops"):
         main(["data", "list"])
