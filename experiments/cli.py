@@ -15,16 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands, registry_commands, model_commands
-from experiments.cli_convert import HELP, convert_app
+from experiments import cli_bench, cli_convert, commands, model_commands, registry_commands
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.host_memory import keep_freed_memory
 
 Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous"]
 Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]
@@ -232,7 +229,8 @@ def report(out: Path) -> None:
 
 app.command(data_app, name="data", help="The registry, what a directory holds, the simulated suite.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
-app.command(convert_app, name="convert", help=HELP)
+app.command(cli_convert.convert_app, name="convert", help=cli_convert.HELP)
+app.command(cli_bench.bench_app, name="bench", help=cli_bench.HELP)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

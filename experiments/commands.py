@@ -5,9 +5,7 @@ Every command ends by saying what it wrote and what to run next.
 
 from __future__ import annotations
 
-import json
 import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +20,10 @@ from experiments import (
     scale_width,
     transfer_lr,
 )
-from experiments.atomic import write_atomically
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
-from experiments.program import PROGRAM
-from experiments.progress import SweepMonitor, console, step, tidy_table
+from experiments.program import command_line
+from experiments.progress import SweepMonitor, console, tidy_table
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import titles, unique_trials
@@ -201,11 +198,6 @@ def wrote(*paths: Path, then: str = "") -> None:
         console.print(f"wrote [bold]{escape(short(path))}[/]", soft_wrap=True)
     if then:
         console.print(f"next: {escape(then)}", soft_wrap=True)
-
-
-def command_line() -> str:
-    """The command as typed, whichever way the program was started."""
-    return shlex.join([PROGRAM, *sys.argv[1:]])
 
 
 def short(path: Path) -> str:

@@ -7,7 +7,6 @@ instances are in `presets`; which trials follow from a study is in the modules o
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import json
 from collections.abc import Sequence

@@ -321,6 +321,9 @@ class DecodeConfig:
     order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     resample: bool = False  # continuous: predict every patch again in each step, as released
+    # What happens past the window of T frames: `exact` computes the window again for every frame;
+    # `streaming` keeps what was computed when its frames stood elsewhere, an approximation.
+    slide: Literal["exact", "streaming"] = "exact"
 
     def __post_init__(self):
         require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")

@@ -99,6 +99,20 @@ def random_actions(
     return mean_EU[embodiment_B][:, None, None] + std_EU[embodiment_B][:, None, None] * noise
 
 
+def evaluation_inputs(
+    batch: dict[str, jax.Array], table: EmbodimentTable, model: ModelConfig, config: EvalConfig
+) -> tuple[jax.Array, jax.Array]:
+    """(chunks [B, 1 + draws, T, U], keys [B]): the recorded actions, then the random ones, which
+    differ from them from the first chunk that leads to a predicted frame."""
+    shape, first_free = (config.random_actions, model.frames), config.prompt_frames - 1
+    actions, window = batch["actions"], batch["window"]
+    other = random_actions(config.seed, window, batch["embodiment"], table, shape)
+    other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
+    key = jax.random.key(config.seed + 1)
+    keys = jax.vmap(lambda w: jax.random.fold_in(key, w))(window)
+    return jnp.concatenate([actions[:, None], other], axis=1), keys
+
+
 def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
     """Whether a model so trained has a policy to evaluate."""
     return model.action_heads and setting in ("full", "policy", "inverse")
@@ -116,7 +130,6 @@ def make_evaluator(
     )
     declared = declare_model(model, table)
     decode = DecodeConfig(unmask_steps=config.unmask_steps, sampler=config.sampler)
-    first_free = config.prompt_frames - 1  # the first chunk that leads to a predicted frame
 
     def hidden(embodiment_B: jax.Array) -> jax.Array | None:
         if setting == "passive":
@@ -129,18 +142,13 @@ def make_evaluator(
         hma = declared.merge(params)
         tokens, actions, embodiment = batch["tokens"], batch["actions"], batch["embodiment"]
         not_shown = hidden(embodiment)
-        key = jax.random.key(config.seed + 1)
-        keys = jax.vmap(lambda w: jax.random.fold_in(key, w))(batch["window"])
+        sequences, keys = evaluation_inputs(batch, table, model, config)
         out = next_frame_outputs(hma, tokens, actions, embodiment, not_shown)
         metrics = _likelihood(hma, out, tokens[:, 1:], keys)
         if predicts_actions(model, setting):
             causally = setting != "inverse"
-            metrics |= _policy_errors(hma, tokens, actions, embodiment, keys, decode, first_free, causally)
-
-        shape = (config.random_actions, model.frames)
-        other = random_actions(config.seed, batch["window"], embodiment, table, shape)
-        other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
-        sequences = jnp.concatenate([actions[:, None], other], axis=1)
+            first = config.prompt_frames - 1
+            metrics |= _policy_errors(hma, tokens, actions, embodiment, keys, decode, first, causally)
         prompt = tokens[:, : config.prompt_frames]
         return metrics, rollout(hma, prompt, sequences, embodiment, keys, decode, hidden_BT=not_shown)
 

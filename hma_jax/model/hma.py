@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.config import ModelConfig, require
+from hma_jax.config import ModelConfig
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.model.actions import Stem
 from hma_jax.model.conditioning import ActionFeature

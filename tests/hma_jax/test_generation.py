@@ -6,12 +6,14 @@ import pytest
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.decoding import Frame, masked_counts, unmask
 from hma_jax.generation import (
+    advance,
     next_frame_outputs,
     predict_actions,
     predict_next_actions,
     rollout,
     rollout_naive,
     rollout_policy,
+    start,
 )
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
@@ -258,11 +260,81 @@ def test_temperature_is_a_temperature():
     assert (run(0.01) == greedy).mean() > (run(5.0) == greedy).mean() + 0.2
 
 
-def test_a_rollout_longer_than_the_window_is_refused():
+LONG = 14  # frames, of models whose window has 6
+
+
+def long_batch(config, seed: int = 0) -> dict:
+    return random_batch(seed, model_config(frames=LONG, diffusion=config.diffusion), 2)
+
+
+def whole_rollouts(config, decode: DecodeConfig, prompt: int, hidden=None) -> tuple[np.ndarray, np.ndarray]:
+    """Past the window: (`rollout`'s frames, `rollout_naive`'s)."""
+    declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
+    batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
+    start, rest = batch["tokens"][:, :prompt], (batch["embodiment"], keys, decode)
+    fast = jax.jit(lambda p: rollout(declared.merge(p), start, batch["actions"][:, None], *rest, hidden_BT=hidden))
+    naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, batch["actions"], *rest, hidden_BT=hidden))
+    return np.asarray(fast(params))[:, 0], np.asarray(naive(params))
+
+
+@pytest.mark.parametrize(
+    "options, decode, prompt",
+    [
+        ({}, DecodeConfig(2), 2),
+        ({"action_alignment": "causal"}, DecodeConfig(3, 1.0), 5),
+        ({"conditioning": "cross_attention"}, DecodeConfig(1), 9),
+        ({"conditioning": "modulate", "action_alignment": "causal"}, DecodeConfig(2, order="confidence"), 6),
+    ],
+    ids=["released", "sampled-causal", "long-prompt", "full-window"],
+)
+def test_the_sliding_rollout_equals_recomputing_every_window(options: dict, decode: DecodeConfig, prompt: int):
+    got, want = whole_rollouts(model_config(**options), decode, prompt)
+    assert got.shape[1] == LONG - prompt
+    np.testing.assert_array_equal(got, want)
+
+
+def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions():
+    hidden = np.random.default_rng(0).random((2, LONG)) < 0.5
+    got, want = whole_rollouts(model_config(diffusion=DIFFUSION), DecodeConfig(2, sampler=SAMPLER), 4, hidden)
+    np.testing.assert_allclose(got, want, atol=2e-3)
+
+
+def test_streaming_is_exact_while_the_window_fills_and_an_approximation_after():
+    config = model_config()
+    streamed, exact = whole_rollouts(config, DecodeConfig(2, slide="streaming"), 3)
+    inside = config.frames - 3
+    np.testing.assert_array_equal(streamed[:, :inside], exact[:, :inside])
+    assert (streamed[:, inside:] != exact[:, inside:]).any()
+
+
+@pytest.mark.parametrize(
+    "slide, alignment, prompt",
+    [("exact", "causal", 3), ("streaming", "causal", 2), ("exact", "released", 8)],
+)
+def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignment: str, prompt: int):
+    config, decode = model_config(action_alignment=alignment), DecodeConfig(2, slide=slide)
+    declared, params = lively_params(config)
+    batch, keys = long_batch(config), jax.random.split(jax.random.key(0), 2)
+    actions, tokens = jnp.asarray(batch["actions"]), batch["tokens"][:, :prompt]
+    whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt)(params)[:, 0]
+
+    begin = jax.jit(lambda p: start(declared.merge(p), tokens, actions[:, : prompt - 1], batch["embodiment"]))
+    step = jax.jit(
+        lambda p, s, a, b: advance(declared.merge(p), s, a, keys, decode, next_chunk_BU=b), donate_argnums=1
+    )
+    session, frames = begin(params), []
+    for t in range(prompt, LONG):
+        session, frame = step(params, session, actions[:, t - 1], actions[:, t])
+        frames.append(frame)
+    np.testing.assert_array_equal(np.stack(frames, axis=1), whole)
+    assert step._cache_size() == 1, "a step was compiled more than once"
+
+
+def test_a_rollout_without_chunks_for_new_frames_is_refused():
     config = model_config()
     declared, params = lively_params(config)
     batch = random_batch(0, config, 1)
-    long = np.zeros((1, 1, config.frames + 1, TABLE.action_width), np.float32)
-    with pytest.raises(ConfigError, match="does not fit a window"):
-        rollout(declared.merge(params), batch["tokens"][:, :2], long, batch["embodiment"],
+    few = np.zeros((1, 1, 2, TABLE.action_width), np.float32)
+    with pytest.raises(ConfigError, match="needs chunks for more than that, got 2"):
+        rollout(declared.merge(params), batch["tokens"][:, :2], few, batch["embodiment"],
                 jax.random.split(jax.random.key(0), 1), DecodeConfig())

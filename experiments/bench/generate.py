@@ -1,0 +1,106 @@
+"""Generation, frame by frame: every way of making the next frame, on one model, by turns.
+
+`recompute` is what our oracle and the official release do: M passes over the whole window.
+`fill` is a frame while the window fills (its commit fused with the next frame's first look),
+`slide` an exact frame past the window, `stream` an approximate one. `window` is one pass over the
+whole window, the unit that the others are compared with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from experiments.bench.models import Subject
+from experiments.bench.record import Stage
+from experiments.bench.timing import Compiled, compile_call, time_by_turns
+from hma_jax.config import DecodeConfig
+from hma_jax.flops import forward_flops_per_window
+from hma_jax.generation import rollout_naive
+from hma_jax.generation.window import Window, empty_cache
+from hma_jax.model import HMA
+
+
+def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int) -> list[Stage]:
+    """One stage per way of making a frame, for `rows` examples at a time."""
+    config, declared = subject.config, subject.declared
+    size, batch, weights = config.frames, subject.batch(rows), subject.inference_params
+    keys = jax.random.split(jax.random.key(subject.seed), rows)
+    past, newest = batch["tokens"][:, :-1], batch["tokens"][:, -2]
+    cache = jax.jit(lambda p: empty_cache(declared.merge(p), rows, size - 1))(weights)
+
+    def window(model: HMA) -> Window:
+        return Window.over(model, batch["actions"], None, batch["embodiment"])
+
+    def whole(params: Any) -> jax.Array:
+        return window(declared.merge(params)).pass_over(batch["tokens"], None, 0).frames
+
+    def recompute(params: Any) -> jax.Array:
+        return rollout_naive(
+            declared.merge(params), past, batch["actions"], batch["embodiment"], keys, decode
+        )
+
+    def slide(params: Any) -> jax.Array:
+        return window(declared.merge(params)).slide(past, keys, decode)
+
+    def fill(params: Any, cache: Any) -> Any:
+        return window(declared.merge(params)).fill(cache, newest, jnp.int32(size - 1), keys, decode)
+
+    def stream(params: Any, cache: Any) -> Any:
+        return window(declared.merge(params)).stream(cache, newest, jnp.int32(size), keys, decode)
+
+    compiled = {f.__name__: compile_call(f, weights) for f in (whole, recompute, slide)}
+    calls: dict[str, Callable[[], Any]] = {
+        name: lambda c=call: c(weights) for name, call in compiled.items()
+    }
+    for function in (fill, stream):
+        call = compile_call(function, weights, cache, donate=(1,))
+        compiled[function.__name__] = call
+        calls[function.__name__] = _with_own_cache(call, weights, cache)
+    timings = time_by_turns(calls, repeats)
+
+    one_pass = rows * forward_flops_per_window(config, subject.table)
+    looks, per_frame = decode.unmask_steps, one_pass / size
+    flops = {
+        "whole": one_pass,
+        "recompute": looks * one_pass,
+        "slide": one_pass + (looks - 1) * per_frame,
+        "fill": (looks + 1) * per_frame,
+        "stream": (looks + 1) * per_frame,
+    }
+    return [
+        Stage(
+            name,
+            rows,
+            timings[name],
+            compiled[name].compile_seconds,
+            compiled[name].temporary_bytes or 0,
+            frames=0.0 if name == "whole" else rows,
+            flops=flops[name],
+        )
+        for name in calls
+    ]
+
+
+def _with_own_cache(call: Compiled, params: Any, cache: Any) -> Callable[[], Any]:
+    """Calls that hand the donated cache on, as a rollout does."""
+    kept = [jax.tree.map(jnp.copy, cache)]
+
+    def step() -> Any:
+        kept[0], frame = call(params, kept[0])
+        return frame
+
+    return step
+
+
+def ratios(stages: list[Stage], rows: int) -> dict[str, float]:
+    """What the caches buy, within this run."""
+    median = {s.name: s.timing.median for s in stages if s.batch == rows}
+    return {
+        f"recompute / fill, batch {rows}": median["recompute"] / median["fill"],
+        f"recompute / stream, batch {rows}": median["recompute"] / median["stream"],
+        f"slide / whole window pass, batch {rows}": median["slide"] / median["whole"],
+    }

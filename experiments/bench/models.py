@@ -1,0 +1,71 @@
+"""The models that are timed. Weights are drawn: speed does not depend on their values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.presets import CPU, CPU_CONTINUOUS
+from hma_jax.config import DiffusionConfig, ModelConfig, require
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model import declare_model
+from hma_jax.params import Declared, Params
+
+BASE = ModelConfig(action_heads=False, remat=False)
+MODELS = {
+    "base": BASE,
+    "xl": replace(BASE, width=1024),
+    "base-continuous": replace(BASE, diffusion=DiffusionConfig()),
+    "xl-continuous": replace(BASE, width=1024, diffusion=DiffusionConfig()),
+    "cpu": CPU.model,
+    "cpu-continuous": CPU_CONTINUOUS.model,
+}
+
+ROBOT_DIM, ROBOT_STRIDE = 7, 3
+"""An arm with a gripper at 6 Hz."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model to be timed, with random weights and inputs."""
+
+    config: ModelConfig
+    table: EmbodimentTable
+    declared: Declared
+    params: Params
+    seed: int
+
+    @property
+    def inference_params(self) -> Params:
+        """Matrices in the type they are used in: in bfloat16 a pass reads half the bytes."""
+        dtype = jnp.dtype(self.config.compute_dtype)
+        return jax.tree.map(lambda x: x.astype(dtype) if x.ndim > 1 else x, self.params)
+
+    def batch(self, rows: int, frames: int | None = None) -> dict[str, Any]:
+        """tokens [B, T, S (, C)], actions [B, T, U], embodiment [B], mixing all robots."""
+        config, rng = self.config, np.random.default_rng(self.seed)
+        frames = frames or config.frames
+        shape = (rows, frames, config.tokens)
+        if config.diffusion:
+            tokens = rng.standard_normal((*shape, config.diffusion.token_channels)).astype(np.float32)
+        else:
+            tokens = rng.integers(0, config.vocab_size, shape).astype(np.int32)
+        actions = rng.standard_normal((rows, frames, self.table.action_width)).astype(np.float32)
+        robots = (np.arange(rows) % self.table.size).astype(np.int32)
+        return jax.device_put({"tokens": tokens, "actions": actions, "embodiment": robots})
+
+
+def make_subject(
+    name: str, dtype: str, robots: int = 1, seed: int = 0, layers: int | None = None, remat: bool = False
+) -> Subject:
+    """Raises ConfigError for a name that is not in the table."""
+    require(name in MODELS, f"unknown model {name!r}; known: {', '.join(MODELS)}")
+    config = replace(MODELS[name], compute_dtype=dtype, layers=layers or MODELS[name].layers, remat=remat)
+    one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
+    table = EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
+    declared = declare_model(config, table)
+    return Subject(config, table, declared, declared.init(seed), seed)

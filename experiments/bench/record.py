@@ -1,0 +1,96 @@
+"""One benchmark's record: JSON with everything needed to believe it or to repeat it."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from experiments.atomic import write_atomically
+from experiments.bench.timing import Timing, peak_memory_bytes
+from experiments.machine import describe_machine
+from hma_jax.config import ConfigError, from_dict, to_dict
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One thing that was timed. `frames` and `flops` are per call; 0 where they mean nothing."""
+
+    name: str
+    batch: int
+    timing: Timing
+    compile_seconds: float = 0.0
+    temporary_bytes: int = 0
+    frames: float = 0.0
+    flops: float = 0.0  # of the model, by formula
+
+    @property
+    def frames_per_second(self) -> float:
+        return self.frames / self.timing.median
+
+
+@dataclass(frozen=True)
+class BenchRecord:
+    """What one `hma bench` command found."""
+
+    kind: str  # generate, rollout, train, load, tokenize, eval
+    subject: str  # which model, tokenizer or data
+    command: str
+    date: str
+    dtype: str
+    seed: int
+    machine: dict[str, Any]
+    settings: dict[str, Any]
+    stages: tuple[Stage, ...]
+    ratios: dict[str, float] = field(default_factory=dict)  # within this run, by what they say
+    notes: tuple[str, ...] = ()
+    matmul_flops_per_second: float = 0.0  # measured in the same run; 0: not measured
+    peak_flops_per_second: float = 0.0  # of the data sheet, all devices; 0: unknown
+    peak_memory_bytes: int = 0
+    format: int = FORMAT
+
+    def stage(self, name: str, batch: int) -> Stage:
+        found = [s for s in self.stages if (s.name, s.batch) == (name, batch)]
+        if not found:
+            raise ConfigError(f"the record of {self.kind} has no stage {name!r} at batch {batch}")
+        return found[0]
+
+
+def make_record(kind: str, subject: str, command: str, **fields: Any) -> BenchRecord:
+    """A record of this machine, now."""
+    from hma_jax.flops import peak_flops
+
+    return BenchRecord(
+        kind,
+        subject,
+        command,
+        date=time.strftime("%Y-%m-%d"),
+        machine=describe_machine(jax.devices()),
+        peak_flops_per_second=peak_flops() or 0.0,
+        peak_memory_bytes=peak_memory_bytes(),
+        **fields,
+    )
+
+
+def write_record(record: BenchRecord, directory: Path) -> Path:
+    """Writes into `directory` and returns the file."""
+    device = record.machine["devices"][0].split(" x ", 1)[-1].lower().replace(" ", "-")
+    directory.mkdir(parents=True, exist_ok=True)
+    path = directory / f"{record.kind}-{record.subject}-{record.dtype}-{device}.json"
+    write_atomically(path, json.dumps(to_dict(record), indent=1) + "\n")
+    return path
+
+
+def read_record(path: Path) -> BenchRecord:
+    """Raises ConfigError for a file that is no record of this format."""
+    try:
+        values = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: not a benchmark record ({error}); run `hma bench` again") from error
+    return from_dict(BenchRecord, values, where=str(path))

@@ -1,0 +1,23 @@
+"""Generation: whole rollouts, one frame at a time, teacher-forced looks, and policies.
+
+One way of filling a frame (`decoding`), one set of cached passes (`window`); the rest is who
+asks for which frame.
+"""
+
+from hma_jax.generation.policy import predict_actions, predict_next_actions, read_actions, rollout_policy
+from hma_jax.generation.rollout import rollout, rollout_naive
+from hma_jax.generation.session import Session, advance, start
+from hma_jax.generation.teacher import next_frame_outputs
+
+__all__ = [
+    "Session",
+    "advance",
+    "next_frame_outputs",
+    "predict_actions",
+    "predict_next_actions",
+    "read_actions",
+    "rollout",
+    "rollout_naive",
+    "rollout_policy",
+    "start",
+]

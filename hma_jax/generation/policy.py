@@ -1,0 +1,140 @@
+"""Actions read off frames: one chunk after recorded frames, or the model acting in its own dreams."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.config import DecodeConfig, require
+from hma_jax.diffusion import make_process, respace, sample_with_key
+from hma_jax.generation.window import Window, room_of
+from hma_jax.model.hma import HMA, Outputs, causal
+from hma_jax.model.trunk import TemporalCache
+
+
+def predict_actions(
+    model: HMA,
+    frames: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    hidden_BT: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+    *,
+    causally: bool = True,
+) -> jax.Array:
+    """Raw chunks [B, T, U] read off every frame, where those marked hidden are not shown.
+
+    As a policy a frame's chunk is predicted from frames up to it and what is shown of the
+    actions; with `causally` False from the whole window (inverse dynamics). Padding is 0.
+    """
+    count = frames.shape[1]
+    visible = None if causally else jnp.ones((count, count), bool)
+    hidden = model.align_hidden(hidden_BT, frames.shape[:2])
+    out = model(frames, None, model.align(actions_BTU), embodiment_B, hidden_BT=hidden, visible=visible)
+    return read_actions(model, out, embodiment_B, key_B, decode)
+
+
+def predict_next_actions(
+    model: HMA,
+    frames: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+) -> jax.Array:
+    """Raw chunks [B, T, U]: what the policy would do at every frame of a recorded window, having
+    seen the frames up to it and all actions before.
+
+    One pass: with causal alignment no frame is shown its own chunk; otherwise every frame stands
+    beside a copy of itself whose action is hidden, as in `next_frame_outputs`.
+    """
+    batch, count = frames.shape[:2]
+    if model.config.action_alignment == "causal":
+        nothing = jnp.zeros((batch, count), bool)
+        return predict_actions(model, frames, actions_BTU, embodiment_B, nothing, key_B, decode)
+    twice = lambda x: jnp.concatenate([x, x], axis=1)  # noqa: E731
+    hidden = jnp.broadcast_to(jnp.arange(2 * count) >= count, (batch, 2 * count))
+    past, before = causal(count), jnp.tril(jnp.ones((count, count), bool), -1)
+    visible = jnp.block([[past, jnp.zeros_like(past)], [before, jnp.eye(count, dtype=bool)]])
+    positions = jnp.concatenate([jnp.arange(count)] * 2)
+    out = model(
+        twice(frames),
+        None,
+        twice(actions_BTU),
+        embodiment_B,
+        hidden_BT=hidden,
+        visible=visible,
+        positions=positions,
+    )
+    own = out._replace(actions=None if out.actions is None else out.actions[:, count:])
+    return read_actions(model, own, embodiment_B, key_B, decode)
+
+
+def read_actions(
+    model: HMA, out: Outputs, embodiment_B: jax.Array, key_B: jax.Array, decode: DecodeConfig
+) -> jax.Array:
+    """Raw chunks [B, T, U] from what a pass says of actions. Raises ConfigError without a head."""
+    require(
+        model.action_head is not None and out.actions is not None,
+        "the model predicts no actions; train one with model.action_heads=true and a conditioning with concat",
+    )
+    config = model.config.diffusion
+    if config:
+        process = respace(make_process(config.steps), decode.sampler.steps)
+        shape = (*out.actions.shape[:2], model.table.action_width)
+        # In training padding and dead dimensions are 0 also when noised.
+        alive_BTU = jnp.asarray(model.table.alive())[embodiment_B][:, None]
+        head = model.action_head
+        network = lambda x, t: head(jnp.where(alive_BTU, x, 0), t, out.actions, embodiment_B)  # noqa: E731
+        normalised = sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)
+    else:
+        normalised = model.action_head(out.actions, embodiment_B)
+    return model.table.unnormalise(normalised, embodiment_B)
+
+
+def rollout_policy(
+    model: HMA,
+    prompt: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+) -> tuple[jax.Array, jax.Array]:
+    """The model acts in its own dreams: (new frames [B, T - T', S (, C)], raw chunks [B, T, U]).
+
+    `actions_BTU` are recorded for the T' - 1 transitions within the prompt; from its last frame
+    on the model chooses: it reads a chunk off the frame it sees and predicts what follows. The
+    last returned chunk, after the last frame, is as given.
+    """
+    frames, count = actions_BTU.shape[1], prompt.shape[1]
+    require(
+        1 <= count < frames <= model.config.frames,
+        f"a policy's rollout of {frames} frames from a prompt of {count} does not fit a window of "
+        f"{model.config.frames}",
+    )
+    shape = (len(prompt), frames)
+
+    def window(chunks: jax.Array, unknown_from: int | jax.Array) -> Window:
+        """While the chunks from some frame on are unknown."""
+        unknown = jnp.broadcast_to(jnp.arange(frames) >= unknown_from, shape)
+        return Window.over(model, chunks, unknown, embodiment_B)
+
+    cache = window(actions_BTU, count - 1).prefill(prompt[:, :-1], frames - 1)
+    nothing_masked = jnp.zeros((len(prompt), 1, model.config.tokens), bool)
+
+    def next_frame(carry: tuple[TemporalCache, jax.Array, jax.Array], t: jax.Array):
+        cache, last, chunks = carry
+        # The chunk after frame t - 1, read with that chunk hidden.
+        seen = jnp.append(jnp.arange(room_of(cache)) < t - 1, True)[None]
+        out = window(chunks, t - 1).pass_over(last[:, None], nothing_masked, t - 1, cache, seen)
+        keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(key_B)
+        chunk = read_actions(model, out, embodiment_B, keys[:, 0], decode)
+        chunks = jax.lax.dynamic_update_slice_in_dim(chunks, chunk, t - 1, axis=1)
+        # Now it is known; the one after frame t is not.
+        cache, frame = window(chunks, t).fill(cache, last, t, keys[:, 1], decode)
+        return (cache, frame, chunks), frame
+
+    carry = (cache, prompt[:, -1], actions_BTU)
+    (_, _, chunks), new = jax.lax.scan(next_frame, carry, jnp.arange(count, frames))
+    return jnp.moveaxis(new, 0, 1), chunks

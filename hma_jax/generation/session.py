@@ -1,0 +1,100 @@
+"""One frame at a time, for whoever acts on what it sees: the same frames as `rollout`'s.
+
+A session's arrays keep their shapes, so one compiled `advance` serves an episode of any length:
+
+    step = jax.jit(lambda p, s, a, k: advance(declared.merge(p), s, a, k, decode), donate_argnums=1)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.config import DecodeConfig, require
+from hma_jax.generation.window import Window
+from hma_jax.model.hma import HMA
+from hma_jax.model.trunk import TemporalCache
+
+
+class Session(NamedTuple):
+    """Where B simulated episodes stand; all are equally long."""
+
+    cache: TemporalCache  # of finished frames but the newest, room for T - 1
+    frames: jax.Array  # the newest T - 1, oldest first: [B, T - 1, S (, C)]
+    chunks_BTU: jax.Array  # raw, the one executed after each of them, then one spare
+    hidden_BT: jax.Array  # chunks the model is not shown
+    embodiment_B: jax.Array
+    count: jax.Array  # int32: frames so far
+
+
+def start(
+    model: HMA,
+    prompt: jax.Array,
+    chunks_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    *,
+    hidden_BT: jax.Array | None = None,
+) -> Session:
+    """A session that has seen `prompt` [B, T', S (, C)], of which the last T - 1 frames count.
+
+    `chunks_BTU` [B, T' - 1, U] are those executed between its frames. Raises ConfigError.
+    """
+    room, count = model.config.frames - 1, prompt.shape[1]
+    require(room >= 1, "a model of one frame cannot continue anything")
+    require(
+        chunks_BTU.shape[1] == count - 1,
+        f"{count} prompt frames have {count - 1} chunks between them, got {chunks_BTU.shape[1]}",
+    )
+    old = max(count - room, 0)
+    kept = count - old
+    hidden = jnp.zeros(chunks_BTU.shape[:2], bool) if hidden_BT is None else hidden_BT
+    whole = lambda x, size: jnp.pad(x[:, old:], [(0, 0), (0, size - x.shape[1] + old)] + [(0, 0)] * (x.ndim - 2))  # noqa: E731
+    chunks, hidden = whole(chunks_BTU, room + 1), whole(hidden, room + 1)
+    past = Window.over(model, chunks, hidden, embodiment_B).prefill(prompt[:, old:-1], room)
+    return Session(past, whole(prompt, room), chunks, hidden, embodiment_B, jnp.int32(kept))
+
+
+def advance(
+    model: HMA,
+    session: Session,
+    chunk_BU: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+    *,
+    next_chunk_BU: jax.Array | None = None,
+    hidden_B: jax.Array | None = None,
+) -> tuple[Session, jax.Array]:
+    """(session, frame [B, S (, C)]) after `chunk_BU`, raw, was executed.
+
+    Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also
+    shown the chunk that comes after it: `next_chunk_BU`, or the same again where nobody knows it
+    (as the release's simulator does). `hidden_B` marks chunks the model is not shown.
+    """
+    room, t = model.config.frames - 1, session.count
+    hidden_B = jnp.zeros(len(chunk_BU), bool) if hidden_B is None else hidden_B
+    last = jnp.minimum(t, room) - 1
+    both = jnp.stack([chunk_BU, chunk_BU if next_chunk_BU is None else next_chunk_BU], axis=1)
+    write = lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y.astype(x.dtype), last, axis=1)  # noqa: E731
+    chunks = write(session.chunks_BTU, both)
+    hidden = write(session.hidden_BT, jnp.stack([hidden_B, hidden_B], axis=1))
+    window = Window.over(model, chunks, hidden, session.embodiment_B)
+    newest = jax.lax.dynamic_index_in_dim(session.frames, last, axis=1, keepdims=False)
+    keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)
+
+    def fill() -> tuple[TemporalCache, jax.Array]:
+        return window.fill(session.cache, newest, t, keys, decode)
+
+    def past_the_window() -> tuple[TemporalCache, jax.Array]:
+        if decode.slide == "streaming":
+            return window.stream(session.cache, newest, t, keys, decode)
+        return session.cache, window.slide(session.frames, keys, decode)
+
+    cache, frame = jax.lax.cond(t <= room, fill, past_the_window)
+    full = t >= room  # then the oldest frame makes place
+    shift = lambda x: jnp.where(full, jnp.roll(x, -1, axis=1), x)  # noqa: E731
+    frames = jax.lax.dynamic_update_slice_in_dim(
+        shift(session.frames), frame[:, None].astype(session.frames.dtype), jnp.minimum(t, room - 1), axis=1
+    )
+    return Session(cache, frames, shift(chunks), shift(hidden), session.embodiment_B, t + 1), frame

@@ -1,0 +1,105 @@
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import pytest
+
+from experiments.bench.evaluate import time_evaluation
+from experiments.bench.models import make_subject
+from experiments.bench.record import Stage, make_record, read_record, write_record
+from experiments.bench.report import markdown
+from experiments.bench.rollout import agreement, time_rollouts
+from experiments.bench.timing import Timing, summarise, time_by_turns
+from experiments.bench.train import time_training
+from experiments.cli import main
+from hma_jax.config import ConfigError, DecodeConfig, EvalConfig
+
+
+@pytest.fixture(scope="module")
+def subject():
+    return make_subject("cpu", "float32", robots=2, layers=1)
+
+
+def test_stages_take_turns_and_are_warmed_up():
+    calls = []
+    timings = time_by_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 3)
+    assert calls == ["a", "b"] * 5
+    assert timings["a"].repeats == 3
+
+
+def test_a_summary_gives_median_and_p90():
+    timing = summarise([float(x) for x in range(1, 12)])
+    assert (timing.median, timing.p90, timing.best) == (6.0, 10.0, 1.0)
+
+
+@pytest.mark.slow
+def test_rollouts_are_timed_beside_recomputation_and_agree_with_it(subject):
+    stages = time_rollouts(subject, 2, 14, 4, DecodeConfig(2), repeats=1, naive=True)
+    assert [(s.name, s.frames) for s in stages] == [("rollout", 20), ("recompute", 20)]
+    assert stages[0].flops < stages[1].flops
+    assert agreement(subject, 2, 14, 4, DecodeConfig(2)) == 1
+
+
+@pytest.mark.slow
+def test_training_is_timed_beside_a_forward_pass(subject):
+    forward, step = time_training(subject, 2, repeats=1)
+    assert step.flops == 3 * forward.flops
+
+
+@pytest.mark.slow
+def test_the_fast_evaluation_has_the_numbers_of_the_literal_one(subject):
+    protocol, literal = time_evaluation(subject, 2, EvalConfig(random_actions=1), repeats=1)
+    assert (protocol.name, literal.name) == ("protocol", "literal")
+
+
+def test_an_unknown_model_is_refused_by_name():
+    with pytest.raises(ConfigError, match="unknown model 'huge'; known: base, xl"):
+        make_subject("huge", "float32")
+
+
+def test_inference_weights_are_read_in_the_type_they_are_used_in():
+    subject = make_subject("cpu", "bfloat16", layers=1)
+    kernels = [x for x in jax.tree.leaves(subject.inference_params) if x.ndim > 1]
+    assert {x.dtype.name for x in kernels} == {"bfloat16"}
+    assert {x.dtype.name for x in jax.tree.leaves(subject.params)} == {"float32"}
+
+
+def test_a_record_says_what_it_was_made_on_and_survives_the_disk(tmp_path: Path):
+    stage = Stage("fill", 1, Timing(0.5, 0.6, 0.4, 3), 1.5, 10, frames=1, flops=1e9)
+    record = make_record(
+        "generate", "cpu", "hma bench generate", dtype="float32", seed=0, settings={"robots": 1},
+        stages=(stage,), ratios={"recompute / fill, batch 1": 8.0}, matmul_flops_per_second=1e10,
+    )  # fmt: skip
+    path = write_record(record, tmp_path)
+    assert path.name == "generate-cpu-float32-cpu.json"
+    again = read_record(path)
+    assert again == replace(record, machine=again.machine)
+    assert {"commit", "packages", "processor", "devices"} <= set(again.machine)
+    text = markdown([again])
+    assert "| fill | 1 | 500.0 ms | 600.0 ms | 2.00 | 20.0% |" in text
+    assert "recompute / fill, batch 1: 8.00" in text
+
+
+def test_a_file_that_is_no_record_is_refused(tmp_path: Path):
+    (tmp_path / "x.json").write_text("{")
+    with pytest.raises(ConfigError, match="x.json: not a benchmark record"):
+        read_record(tmp_path / "x.json")
+
+
+def test_the_command_times_frames_every_way_and_the_report_reads_its_record(tmp_path: Path, capsys):
+    options = ["--model", "cpu", "--layers", "1", "--batch", "2", "--repeats", "1", "--out", str(tmp_path)]
+    assert main(["bench", "generate", *options]) == 0
+    assert "hma bench report" in capsys.readouterr().out
+    (file,) = tmp_path.glob("*.json")
+    record = read_record(file)
+    stages = {s.name: s for s in record.stages}
+    assert set(stages) == {"whole", "recompute", "slide", "fill", "stream"}
+    assert stages["recompute"].flops == 2 * stages["whole"].flops
+    assert stages["fill"].flops == pytest.approx(3 / 12 * stages["whole"].flops)
+    assert stages["slide"].flops == pytest.approx(13 / 12 * stages["whole"].flops)
+    assert all(s.timing.median > 0 and s.compile_seconds > 0 for s in stages.values())
+    assert set(record.ratios) == {
+        "recompute / fill, batch 2", "recompute / stream, batch 2", "slide / whole window pass, batch 2"
+    }  # fmt: skip
+    assert main(["bench", "report", str(tmp_path)]) == 0
+    assert "**generate cpu**" in capsys.readouterr().out
