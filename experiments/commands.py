@@ -23,7 +23,7 @@ from experiments import (
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
 from experiments.program import command_line
-from experiments.progress import SweepMonitor, console, tidy_table
+from experiments.progress import SweepMonitor, console
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_user_data, override
 from experiments.sweep import titles, unique_trials
