@@ -21,7 +21,7 @@ from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, U
 from data_pipelines.example import Feature, parse_example
 from data_pipelines.images import decode_image
 from data_pipelines.location import REMOTE_READS, is_remote
-from data_pipelines.schema import closest, listing, read_metadata, resolve_version, step_key
+from data_pipelines.schema import closest, field_slice, listing, read_metadata, resolve_version, step_key
 from data_pipelines.tfrecord import ShardIndex, open_record, scan_shard
 from hma_jax.config import ConfigError, require
 
@@ -125,12 +125,13 @@ class RldsDataset:
         """Episode `i` in bounded memory, however large its record: see `OpenEpisode`.
 
         Keys are relative to a step, as in features.json: `observation/image_0`, `action`,
-        `action/arm`. Raises ConfigError for keys that the dataset lacks, CorruptRecordError
+        `action/arm`, `action[:7]`. Raises ConfigError for keys that the dataset lacks, CorruptRecordError
         for damaged bytes and EpisodeError for contents that cannot be used.
         """
         self.check_keys(image_key, action_keys)
         image_key, action_keys = step_key(image_key), [step_key(k) for k in action_keys]
-        with self._open(i, [image_key, *action_keys, SUCCESS_KEY]) as record:
+        fields = [field_slice(key)[0] for key in action_keys]
+        with self._open(i, [image_key, *fields, SUCCESS_KEY]) as record:
             encoded = self._frames_of(i, record, image_key)
             actions = self._actions(i, record, action_keys, steps=len(encoded))
             success = record.get(SUCCESS_KEY)
@@ -190,15 +191,17 @@ class RldsDataset:
             f"{self.name}: {image_key!r} is not an image; images: {listing(cameras)}. Correct image_key.",
         )
         for n, key in enumerate(action_keys):
-            feature = self.features.get(step_key(key))
+            field, part = field_slice(key)
+            feature = self.features.get(step_key(field))
             if feature is None or not feature.size:
                 raise ConfigError(
-                    f"{self.name}: no numeric field {key!r} in {self.directory / 'features.json'}; "
-                    f"action fields there: {listing(numbers)}{closest(key, numbers)}. Correct action_keys."
+                    f"{self.name}: no numeric field {field!r} in {self.directory / 'features.json'}; "
+                    f"action fields there: {listing(numbers)}{closest(field, numbers)}. Correct action_keys."
                 )
-            if action_dims is not None and feature.size != action_dims[n]:
+            size = len(range(feature.size)[part])
+            if action_dims is not None and size != action_dims[n]:
                 raise ConfigError(
-                    f"{self.name}: field {key!r} has {feature.size} values per step in "
+                    f"{self.name}: field {key!r} has {size} values per step in "
                     f"{self.directory / 'features.json'}, but {action_dims[n]} were expected. "
                     "Correct action_dims, or read the version of the dataset it was written for."
                 )
@@ -306,7 +309,8 @@ class RldsDataset:
     def _actions(self, i: int, record: dict[str, Feature], keys: list[str], steps: int) -> np.ndarray:
         columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
         for key in keys:
-            values, size = record.get(key, []), self.features[key].size
+            field, part = field_slice(key)
+            values, size = record.get(field, []), self.features[field].size
             if not isinstance(values, np.ndarray) or len(values) != steps * size or not steps:
                 raise self._unusable(
                     i,
@@ -322,7 +326,7 @@ class RldsDataset:
                     f"{key!r} is not finite at step {step}: {values[step].tolist()}. "
                     "Repair the episode, or read with corrupt='skip'.",
                 )
-            columns.append(values)
+            columns.append(values[:, part])
         return np.concatenate(columns, axis=1)
 
 

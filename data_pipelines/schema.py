@@ -148,6 +148,15 @@ def _flatten(feature, key: str) -> dict[str, FlatFeature]:
     return {key: FlatFeature(image=False, size=int(np.prod(spec.shape)) if numeric else 0)}
 
 
+def field_slice(key: str) -> tuple[str, slice]:
+    """The field of an action key, and which of its values: `action[:7]` is ("action", slice(0, 7))."""
+    match = re.fullmatch(r"(.+)\[(\d*):(\d*)\]", key)
+    if not match:
+        return key, slice(0, None)
+    field, start, stop = match.groups()
+    return field, slice(int(start or 0), int(stop) if stop else None)
+
+
 def step_key(key: str) -> str:
     """The flat record key of a field of a step."""
     return key if key.startswith("steps/") else f"steps/{key}"

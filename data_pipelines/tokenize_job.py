@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -88,7 +88,7 @@ def tokenize_dataset(
     source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = Manifest(
-        spec=replace(spec, camera="", note=""),  # words for people do not change the data
+        spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
         settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
         source=source.fingerprint(),

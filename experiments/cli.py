@@ -18,7 +18,14 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import cli_bench, cli_convert, commands, model_commands, tokenize_commands
+from experiments import (
+    cli_bench,
+    cli_convert,
+    commands,
+    model_commands,
+    registry_commands,
+    tokenize_commands,
+)
 from experiments.cli_fit import fit
 from experiments.cli_tokenizer import tokenizer_app
 from experiments.program import PROGRAM
@@ -41,13 +48,19 @@ class Where:
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = ()
     """Your RLDS directories, paths or URLs such as gs://..., instead of the simulated suite. Their names must
     be in the registry."""
+    registry: Path | None = None
+    """TOML file with registry entries of your own, as `hma data inspect --entry` writes it."""
+    mixture: str | None = None
+    """Named list of datasets, such as dataset10; --data then takes the directories that hold them."""
     tokenizer: Path | None = None
     """Directory of a tokenizer to use, instead of training one on the data. The model's tokens follow it."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
     """Change one setting, such as --set model.frames=4 --set train.steps=100; may be repeated."""
 
     def setting(self) -> commands.Setting:
-        return commands.make_setting(self.preset, self.out, self.data, self.set, self.tokenizer)
+        return commands.make_setting(
+            self.preset, self.out, self.data, self.set, self.tokenizer, self.registry, self.mixture
+        )
 
 
 @dataclass(frozen=True)
@@ -99,9 +112,50 @@ def _run(where: Where, how: How, axes: tuple[str, ...]) -> None:
 
 
 @data_app.command(name="list")
-def data_list() -> None:
-    """List the datasets that the registry knows: camera, action size, rate."""
-    commands.list_datasets()
+def data_list(
+    words: Annotated[Positional[tuple[str, ...]], arg(metavar="[WORD ...]")] = (),
+    mixture: str | None = None,
+    registry: Path | None = None,
+) -> None:
+    """List the datasets that the registry knows: camera, action size, rate.
+
+    Args:
+        words: Only entries with all these words in name, note, camera or group ("open-x", "franka").
+        mixture: Only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
+        registry: TOML file with entries of your own.
+    """
+    registry_commands.list_datasets(words, mixture, registry)
+
+
+@data_app.command(name="inspect")
+def data_inspect(
+    directory: Positional[Path],
+    hz: float | None = None,
+    split: str = "train",
+    out: Path | None = None,
+    episodes: int = 32,
+    frames: int = 12,
+    json: Path | None = None,
+    entry: Path | None = None,
+    registry: Path | None = None,
+) -> None:
+    """Show what an RLDS directory holds, draw a contact sheet, and suggest its registry entry.
+
+    Args:
+        directory: The dataset: <name> or <name>/<version>, as tfds wrote it.
+        hz: Native rate of its frames; no file says it.
+        split: The split to look at.
+        out: Directory for contact_sheet.png; runs/inspect/NAME if not given.
+        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        frames: Frames of the model's window, to count windows.
+        json: Write everything there as JSON.
+        entry: Add the suggested entry to this TOML file, for --registry.
+        registry: TOML file with entries of your own.
+    """
+    registry_commands.inspect(
+        directory, split=split, hz=hz, out=out, episodes=episodes, frames=frames, as_json=json,
+        entry=entry, registry=registry,
+    )  # fmt: skip
 
 
 @data_app.command(name="suite")
@@ -201,7 +255,7 @@ def report(out: Path) -> None:
 
 
 app.command(fit, name="fit")
-app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
+app.command(data_app, name="data", help="The registry, what a directory holds, the simulated suite.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 app.command(cli_convert.convert_app, name="convert", help=cli_convert.HELP)
 app.command(cli_bench.bench_app, name="bench", help=cli_bench.HELP)

@@ -23,7 +23,7 @@ from experiments import (
 from experiments.ledger import FINISHED, Ledger
 from experiments.presets import get_preset
 from experiments.program import command_line
-from experiments.progress import SweepMonitor, console, tidy_table
+from experiments.progress import SweepMonitor, console
 from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_tokenizer, on_user_data, override
 from experiments.sweep import titles, unique_trials
@@ -54,6 +54,7 @@ class Setting:
     data: tuple[str, ...]
     workspace: Workspace
     tokenizer: Path | None = None  # a trained one to use; None: train one on the data
+    registry: Path | None = None  # a file of entries besides those of the project
 
 
 def make_setting(
@@ -62,22 +63,58 @@ def make_setting(
     data: Sequence[str],
     settings: Sequence[str],
     tokenizer: Path | None = None,
+    registry: Path | None = None,
+    mixture: str | None = None,
 ) -> Setting:
-    """The preset, on the user's data and tokenizer if given, with overrides. Touches no other file."""
-    study, directories = get_preset(preset), ()
-    if data:
-        from data_pipelines.location import absolute
+    """The preset, on the user's data and tokenizer if given, with overrides. Touches no other file.
+
+    A `mixture` names the datasets, which are then looked for in the directories of `data`.
+    """
+    from data_pipelines.location import absolute
+
+    study = get_preset(preset)
+    use_entries(registry)
+    if mixture is not None:
+        from data_pipelines.registry.mixtures import get_mixture
+
+        names = get_mixture(mixture)
+        study = on_user_data(study, names)
+        data = find_directories(names, data) if data else ()
+    elif data:
         from experiments.pipeline import name_datasets
 
         study = on_user_data(study, name_datasets(data))
-        directories = tuple(map(absolute, data))
     if tokenizer is not None:
         from hma_jax.tokenizers.io import load_config
 
         study = on_tokenizer(study, load_config(tokenizer))
     study = override(study, settings)
+    directories = tuple(map(absolute, data))
     workspace = Workspace((out or Path("runs") / study.name).absolute())
-    return Setting(study, directories, workspace, tokenizer and tokenizer.absolute())
+    return Setting(study, directories, workspace, tokenizer and tokenizer.absolute(), registry and registry.absolute())
+
+
+def use_entries(registry: Path | None) -> None:
+    """Adds the entries of a TOML file to the registry, for the rest of this process."""
+    if registry is not None:
+        from data_pipelines.registry import register
+        from data_pipelines.registry.toml_file import load_entries
+
+        register(load_entries(registry))
+
+
+def find_directories(names: Sequence[str], roots: Sequence[str]) -> list[str]:
+    """`<root>/<name>` for every name, in the first root that has it. ConfigError for those missing."""
+    from data_pipelines.location import locate
+
+    found = {n: locate(r) / n for r in reversed(roots) for n in names if (locate(r) / n).is_dir()}
+    missing = [n for n in names if n not in found]
+    if missing:
+        raise ConfigError(
+            f"no directory for {', '.join(missing)} in {', '.join(roots)}; with a mixture, --data takes the "
+            "directories that hold <name>/<version>"
+        )
+    return [str(found[n]) for n in names]
 
 
 def dry_run(study: Study, axes: Sequence[str]) -> None:
@@ -90,14 +127,11 @@ def run_study(
     setting: Setting, axes: Sequence[str], *, workers: int, retry_failed: bool, mesh: MeshConfig
 ) -> None:
     """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end."""
-    from experiments.pipeline import prepare
+    from experiments.pipeline import prepare, require_simulated
 
     study, workspace = setting.study, setting.workspace
-    if study.name == "paper" and not setting.data:
-        raise ConfigError(
-            "the paper's forty datasets are not simulated: give their RLDS directories with --data, or "
-            "add --dry-run to see the plan"
-        )
+    if not setting.data:
+        require_simulated(study.dataset_names())
     sweeps = [AXES[axis](study) for axis in axes]
     with workspace.claimed():
         all_axes = merge_axes(workspace, study, axes)
@@ -184,25 +218,6 @@ def short(path: Path) -> str:
 # --- Single steps ----------------------------------------------------------------------------
 
 
-def list_datasets() -> None:
-    from data_pipelines.registry import all_specs
-
-    table = tidy_table("Datasets that the registry knows", "name", "dims", "Hz", "stride")
-    table.add_column("image", overflow="fold")
-    table.add_column("what it is", min_width=30)
-    for spec in all_specs():
-        table.add_row(
-            spec.name,
-            f"{spec.action_dim}",
-            f"{spec.hz:g}",
-            f"{spec.stride}",
-            spec.image_key.removeprefix("observation/"),
-            spec.note,
-        )
-    console.print(table)
-    console.print("A dataset of your own is one more entry in data_pipelines/registry.py.")
-
-
 def write_suite(setting: Setting) -> None:
     from experiments.pipeline import make_suite
 
@@ -232,4 +247,5 @@ def next_command(command: str, setting: Setting) -> str:
     out = short(setting.workspace.root)
     data = " --data " + " ".join(map(shlex.quote, setting.data)) if setting.data else ""
     tokenizer = f" --tokenizer {shlex.quote(short(setting.tokenizer))}" if setting.tokenizer else ""
-    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}{tokenizer}"
+    registry = f" --registry {shlex.quote(short(setting.registry))}" if setting.registry else ""
+    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}{registry}{tokenizer}"

@@ -1,23 +1,26 @@
 """What a study will cost, before it runs: parameters, FLOPs and a time estimate per trial.
 
-Needs no data and no device: action sizes come from the registry (or, for the paper's mixture,
-from `paper_mixture`), parameter counts from the declared model without making an array.
+Needs no data and no device: action sizes come from the registry, parameter counts from the declared
+model without making an array.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from experiments.paper_mixture import PAPER_MIXTURE
 from experiments.progress import tidy_table
 from experiments.provenance import Provenance
 from experiments.study import Study
 from experiments.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
 from experiments.trial import Trial, trial_id
 from hma_jax.embodiments import Embodiment, EmbodimentTable
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
 
 UNKNOWN = Provenance("", "", "", "")
 """Stands in where only the trials' own fields matter."""
@@ -38,19 +41,15 @@ class Cost:
 def declared_table(names: Sequence[str]) -> EmbodimentTable:
     """Embodiments with the right action sizes and no statistics.
 
-    Raises ConfigError for a name that neither the registry nor the paper's mixture knows.
+    Raises ConfigError for a name that the registry does not know.
     """
     from data_pipelines.registry import get_spec
 
-    def entry(name: str) -> Embodiment:
-        if name in PAPER_MIXTURE:
-            dim, stride = PAPER_MIXTURE[name]
-        else:
-            spec = get_spec(name)
-            dim, stride = spec.action_dim, spec.stride
-        return Embodiment(name, dim, stride, mean=(0.0,) * dim, std=(1.0,) * dim)
+    def entry(spec: DatasetSpec) -> Embodiment:
+        dim = spec.action_dim
+        return Embodiment(spec.name, dim, spec.stride, mean=(0.0,) * dim, std=(1.0,) * dim)
 
-    return EmbodimentTable(tuple(entry(name) for name in names))
+    return EmbodimentTable(tuple(entry(get_spec(name)) for name in names))
 
 
 ONE_ROBOT = EmbodimentTable((Embodiment("one_robot", 2, 1, mean=(0.0, 0.0), std=(1.0, 1.0)),))

@@ -87,6 +87,19 @@ def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     return [(get_spec(name), named[name]) for name in study.dataset_names()]
 
 
+def require_simulated(names: Sequence[str]) -> None:
+    """Raises ConfigError unless every dataset is one of the suite, which needs no --data."""
+    from data_pipelines.suite.embodiments import EMBODIMENTS
+
+    simulated = {e.name for e in EMBODIMENTS}
+    real = [name for name in names if name not in simulated]
+    require(
+        not real,
+        f"{', '.join(real[:3])}{' and others' if len(real) > 3 else ''}: not simulated. Give RLDS directories "
+        "with --data, or add --dry-run to see the plan",
+    )
+
+
 def make_suite(study: Study, workspace: Workspace) -> list[Source]:
     """The simulated datasets of the study, written once."""
     from data_pipelines.registry import get_spec
@@ -94,6 +107,7 @@ def make_suite(study: Study, workspace: Workspace) -> list[Source]:
 
     names = study.dataset_names()
     specs = [get_spec(name) for name in names]  # a mistyped name is refused before any work
+    require_simulated(names)
     with step(f"simulate {len(names)} datasets") as update:
         paths = generate_suite(
             workspace.suite,

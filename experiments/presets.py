@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from experiments.paper_mixture import PAPER_MIXTURE
+from data_pipelines.registry.mixtures import FORTY
 from experiments.study import StoreConfig, Study, SuiteConfig, TransferConfig
 from hma_jax.config import (
     ConfigError,
@@ -90,7 +90,7 @@ ACCELERATOR = Study(
 
 PAPER = Study(
     name="paper",  # section 4 of the paper, as stated; bring the forty datasets with --data
-    datasets=tuple(PAPER_MIXTURE),
+    datasets=FORTY,
     tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=1024,
                               encoder_blocks=3, decoder_blocks=6),
     tokenizer_train=TokenizerTrainConfig(steps=200_000, batch=64, learning_rate=1e-4),

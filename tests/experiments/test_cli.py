@@ -15,10 +15,10 @@ from experiments.runner import read_states
 from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
-COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "tokenizer", "tokenizer train",
-            "tokenizer import", "tokenizer pixels", "tokenize", "train", "evaluate", "report", "convert",
-            "convert from-official", "convert to-official", "convert to-safetensors",
-            "convert from-safetensors", "convert to-stablehlo")  # fmt: skip
+COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer",
+            "tokenizer train", "tokenizer import", "tokenizer pixels", "tokenize", "train", "evaluate", "report",
+            "convert", "convert from-official", "convert to-official", "convert to-safetensors",
+            "convert from-safetensors", "convert to-stablehlo", "bench", "bench generate", "fit")  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -42,7 +42,7 @@ def test_help_needs_no_jax():
         (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot write"),
         (["study", "--preset", "smoke", "--data", "{empty}"], 1, "{empty}"),
         (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
-        (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge,b,c"], 2, "bridge_dataset"),
+        (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
         (["report", "--out", "{empty}"], 2, "no study"),
         (["evaluate", "{empty}", "--preset", "smoke"], 2, "checkpoint"),

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
-from experiments import commands, pipeline
+from experiments import pipeline, registry_commands
 from experiments.cli import main
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
@@ -186,7 +186,7 @@ def test_unknown_dataset_name(tmp_path, refused):
     rlds = write_rlds(tmp_path, make_spec("two_link_arm_joint_target", (2,)), LENGTHS)
     message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
     assert "unknown dataset 'two_link_arm_joint_target'; did you mean two_link_arm_joint_targets" in message
-    assert "data_pipelines/registry.py" in message
+    assert "data_pipelines/registry/own.py" in message and "hma data inspect" in message
 
 
 def test_unknown_dataset_of_the_suite(tmp_path, refused):
@@ -412,9 +412,9 @@ def test_background_readers_of_a_damaged_checkpoint_stay_silent(study, tmp_path)
 
 
 def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch):
-    def broken():
+    def broken(*_):
         raise KeyError("oops")
 
-    monkeypatch.setattr(commands, "list_datasets", broken)
+    monkeypatch.setattr(registry_commands, "list_datasets", broken)
     with pytest.raises(KeyError, match="oops"):
         main(["data", "list"])

@@ -1,0 +1,72 @@
+"""The numbers of an action field, value by value, and what they look like.
+
+Hints are guesses from statistics, for a person to judge: they never change how data is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hma_jax.embodiments import DEAD_STD
+
+SWITCH_SHARE = 0.8
+"""A value that is one of two numbers at least so often is a switch."""
+
+
+@dataclass(frozen=True)
+class DimensionFacts:
+    """One value of an action field over all sampled steps."""
+
+    minimum: float
+    maximum: float
+    mean: float
+    std: float
+    distinct: int  # different numbers, counted up to 100
+    smoothness: float  # step-to-step change over that of independent values; nan for a constant
+    not_finite: int
+    hint: str  # constant, end flag, switch, wrapping angle, absolute, delta, or nothing
+
+
+def dimension_facts(episodes: Sequence[np.ndarray]) -> tuple[DimensionFacts, ...]:
+    """Facts per value of `episodes`, each [N, A] of one dataset."""
+    width = episodes[0].shape[1] if episodes else 0
+    return tuple(_one([rows[:, d].astype(np.float64) for rows in episodes]) for d in range(width))
+
+
+def _one(columns: list[np.ndarray]) -> DimensionFacts:
+    values = np.concatenate(columns)
+    finite = np.isfinite(values)
+    good = values[finite]
+    if not len(good):
+        nan = float("nan")
+        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), "")
+    mean, std = float(good.mean()), float(good.std())
+    changes = np.concatenate([np.diff(column[np.isfinite(column)]) for column in columns])
+    alive = std > DEAD_STD and len(changes)
+    # Independent draws change by sqrt(2) standard deviations from one step to the next.
+    smoothness = float(np.sqrt((changes**2).mean()) / (np.sqrt(2) * std)) if alive else float("nan")
+    counts = np.sort(np.unique(good, return_counts=True)[1])
+    distinct = min(len(counts), 100)
+    hint = _hint(columns, mean, std, counts[-2:].sum() / len(good), smoothness)
+    extremes = float(good.min()), float(good.max())
+    return DimensionFacts(*extremes, mean, std, distinct, smoothness, int((~finite).sum()), hint)
+
+
+def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, smoothness: float) -> str:
+    """`commonest`: share of the two most frequent numbers."""
+    if std <= DEAD_STD:
+        return "constant"
+    if commonest >= SWITCH_SHARE:
+        ends = all(not column[:-1].any() for column in columns) and any(column[-1] for column in columns)
+        return "end flag" if ends else "switch"
+    if all(np.abs(column).max() < np.pi + 0.01 for column in columns) and any(
+        np.abs(np.diff(column)).max(initial=0) > 1.9 * np.pi for column in columns
+    ):
+        return "wrapping angle"
+    # Targets drift slowly about wherever the robot is; changes jump about zero.
+    if smoothness < 0.2 or abs(mean) > 2 * std:
+        return "absolute"
+    return "delta" if abs(mean) < 0.5 * std else ""

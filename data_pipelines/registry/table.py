@@ -1,0 +1,92 @@
+"""Finding an entry: the registry's own tables, and what the user registered besides."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from collections.abc import Iterable
+
+from data_pipelines.registry.openx import OPENX
+from data_pipelines.registry.openx_more import OPENX_MORE
+from data_pipelines.registry.others import OTHERS
+from data_pipelines.registry.own import OWN
+from data_pipelines.registry.spec import DatasetSpec
+from hma_jax.config import ConfigError
+
+LISTED = 12
+"""Names that a message shows at most; `hma data list` shows all."""
+
+_registered: dict[str, DatasetSpec] = {}
+
+
+def register(specs: Iterable[DatasetSpec]) -> None:
+    """Adds entries for the rest of this process. One with a known name takes its place."""
+    _registered.update({spec.name: spec for spec in specs})
+
+
+def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
+    """Every entry, by where it comes from."""
+    groups = {
+        "given by you": tuple(_registered.values()),
+        "own and samples": OWN,
+        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE,
+        "other datasets of the paper": OTHERS,
+        "embedded suite (simulated)": _suite(),
+    }
+    return {title: specs for title, specs in groups.items() if specs}
+
+
+def all_specs() -> tuple[DatasetSpec, ...]:
+    """Every known dataset: one's own, Open-X, then the suite in its own order."""
+    return tuple(_table().values())
+
+
+def get_spec(name: str) -> DatasetSpec:
+    """The entry called `name`; ConfigError with the closest names otherwise."""
+    table = _table()
+    if name in table:
+        return table[name]
+    close = difflib.get_close_matches(name, table, n=3, cutoff=0.4)
+    if close:
+        hint = f"did you mean {', '.join(close)}?"
+    else:
+        hint = f"known: {', '.join([*table][:LISTED])}, ... (`hma data list` shows all)."
+    raise ConfigError(
+        f"unknown dataset {name!r}; {hint} A new one is an entry: `hma data inspect DIR` suggests it, for "
+        "data_pipelines/registry/own.py or for a file given with --registry."
+    )
+
+
+def find_spec(name: str) -> DatasetSpec | None:
+    """The entry called `name`, if there is one."""
+    return _table().get(name)
+
+
+def _table() -> dict[str, DatasetSpec]:
+    return _built_in() | _registered
+
+
+@functools.cache
+def _built_in() -> dict[str, DatasetSpec]:
+    return {spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OTHERS, *_suite())}
+
+
+@functools.cache
+def _suite() -> tuple[DatasetSpec, ...]:
+    from data_pipelines.suite.embodiments import EMBODIMENTS  # not needed to know the real ones
+
+    specs = []
+    for e in EMBODIMENTS:
+        prefix = "action/" if e.dict_actions else ""
+        specs.append(
+            DatasetSpec(
+                e.name,
+                image_key=f"observation/{e.image_keys[0]}",
+                action_keys=tuple(prefix + key for key, _ in e.action_layout),
+                action_dims=tuple(dim for _, dim in e.action_layout),
+                hz=e.hz,
+                camera=e.image_keys[0],
+                note=f"simulated {e.kind}, {e.convention} actions",
+            )
+        )
+    return tuple(specs)

@@ -1,0 +1,49 @@
+"""Entries in a file outside this project: a TOML table per dataset, fields as in `DatasetSpec`.
+
+    [my_robot]
+    image_key = "observation/image"
+    action_keys = ["action[:7]"]
+    action_dims = [7]
+    hz = 10
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tomllib
+from pathlib import Path
+
+from data_pipelines.registry.spec import DatasetSpec
+from hma_jax.config import ConfigError, from_dict
+
+
+def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
+    """The entries of a file. ConfigError, naming file and entry, for anything that is none."""
+    path = Path(path)
+    try:
+        tables = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path}: the registry file cannot be read ({error.strerror})") from error
+    except ValueError as error:  # of which TOMLDecodeError and UnicodeDecodeError are kinds
+        raise ConfigError(f"{path}: not a TOML file: {error}") from error
+    entries = []
+    for name, fields in tables.items():
+        try:
+            if not isinstance(fields, dict):
+                raise ConfigError(f"{name} = {fields!r} stands outside of a [dataset] table")
+            entries.append(from_dict(DatasetSpec, {"name": name} | fields, name))
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from error
+    return tuple(entries)
+
+
+def to_toml(spec: DatasetSpec) -> str:
+    """The table of one entry, without fields that have their default."""
+    lines = [f"[{json.dumps(spec.name)}]"]
+    for field in dataclasses.fields(DatasetSpec)[1:]:
+        value = getattr(spec, field.name)
+        if value != field.default:
+            # JSON's strings, numbers, booleans and lists are TOML's too.
+            lines.append(f"{field.name} = {json.dumps(value)}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,125 @@
+"""`hma data list` and `hma data inspect`, and entries that live outside the project."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_pipelines.inspect import Shown
+from data_pipelines.registry import table as registry_table
+from experiments.cli import main
+from experiments.commands import find_directories, make_setting
+from experiments.contact_sheet import TILE, draw_sheet
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch):
+    monkeypatch.setattr(registry_table, "_registered", {})
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """A dataset that the registry does not know, with a termination flag and pictures of noise."""
+    rng = np.random.default_rng(0)
+
+    def change(episode, features):
+        features["steps/action"][-1, 3] = 1
+        images = features["steps/observation/image"]
+        images[:] = [png(rng.integers(0, 256, (8, 8, 3), np.uint8)) for _ in images]
+
+    return write_rlds(tmp_path / "data", make_spec("my_robot", (4,)), [12, 13, 14, 15], change=change)
+
+
+def test_list_is_filtered_by_words_and_mixture(capsys):
+    assert main(["data", "list", "google", "robot"]) == 0
+    said = capsys.readouterr().out
+    assert "bc_z" in said and "fractal20220817_data" in said and "droid" not in said
+    assert main(["data", "list", "--mixture", "dataset5"]) == 0
+    assert "5 entries" in capsys.readouterr().out
+    assert main(["data", "list", "open-x", "wrist"]) == 0
+    assert "berkeley_mvp" in capsys.readouterr().out
+    assert main(["data", "list", "no_such_word"]) == 2
+
+
+def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, capsys):
+    """Inspect, one entry, tokenise: nothing else is needed for a dataset nobody knew."""
+    entries, sheets = str(tmp_path / "my.toml"), str(tmp_path / "sheets")
+    assert main(["data", "inspect", str(robot), "--hz", "4", "--entry", entries, "--out", sheets]) == 0
+    said = capsys.readouterr().out
+    assert "not in the registry" in said and 'action_keys=("action[:3]",),' in said
+    assert Image.open(tmp_path / "sheets" / "contact_sheet.png").height > 4 * TILE
+    out = str(tmp_path / "out")
+    common = ["--preset", "smoke", "--out", out, "--data", str(robot), "--set", "model.frames=4"]
+    assert main(["tokenize", *common]) == 2
+    assert main(["tokenize", *common, "--registry", entries]) == 0
+    manifest = json.loads((tmp_path / "out" / "tokens" / "my_robot" / "manifest.json").read_text())
+    assert manifest["spec"]["action_keys"] == ["action[:3]"] and len(manifest["action_mean"]) == 3
+    assert f"--registry {entries}" in capsys.readouterr().out
+
+
+def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsys):
+    json_file = tmp_path / "facts.json"
+    arguments = [str(REAL_DATA), "--out", str(tmp_path), "--json", str(json_file)]
+    assert main(["data", "inspect", *arguments]) == 0
+    said = capsys.readouterr().out
+    assert "rate 5 Hz (registry): stride 2" in said and "as its contents suggest" in said
+    facts = json.loads(json_file.read_text())
+    assert facts["episodes"] == 3 and len(facts["actions"][0]["dimensions"]) == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["{robot}", "--entry", "x.toml"], 2, "add --hz"),
+        (["{robot}", "--hz", "-3"], 2, "--hz must be positive"),
+        (["{robot}", "--split", "test"], 2, "splits there: train"),
+        (["{robot}/none"], 1, "no such directory"),
+        (["{robot}", "--registry", "none.toml"], 2, "none.toml: the registry file cannot be read"),
+    ],
+)
+def test_mistakes_are_one_message(arguments, code, message, robot, capsys):
+    assert main(["data", "inspect", *(a.format(robot=robot) for a in arguments)]) == code
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and message in said
+
+
+def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path):
+    file = tmp_path / "my.toml"
+    for hz in ("4", "5"):
+        arguments = ["--hz", hz, "--entry", str(file), "--out", str(tmp_path)]
+        assert main(["data", "inspect", str(robot), *arguments]) == 0
+    text = file.read_text()
+    assert text.count('["my_robot"]') == 1 and "hz = 5.0" in text and "hz = 4" not in text
+
+
+def test_mixture_names_the_datasets_of_a_study(tmp_path, capsys):
+    assert make_setting("paper", tmp_path, (), (), mixture="dataset10").study.dataset_counts == (5, 10)
+    assert main(["study", "--preset", "smoke", "--mixture", "dataset5", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "bridge_data_v2, fractal20220817_data, language_table and others: not simulated" in said
+
+
+def test_mixture_is_looked_for_in_the_given_directories(tmp_path):
+    for root, name in (("a", "x"), ("b", "x"), ("b", "y")):
+        (tmp_path / root / name).mkdir(parents=True)
+    roots = [str(tmp_path / "a"), str(tmp_path / "b")]
+    assert find_directories(["x", "y"], roots) == [f"{roots[0]}/x", f"{roots[1]}/y"]
+    with pytest.raises(ConfigError, match="no directory for z in"):
+        find_directories(["x", "z"], roots)
+
+
+def test_contact_sheet_shows_every_frame_where_it_says():
+    colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
+    frames = [np.full((56, 40, 3), c, np.uint8) for c in colours]
+    cameras = {"observation/a": frames, "observation/b": frames}
+    example = Shown(7, 30, True, "push the red thing", (0, 14, 29), cameras)
+    pixels = np.asarray(draw_sheet("title", [example, example]))
+    for colour in colours:  # a tile is 112 x 80: doubled, pixels kept; two cameras, two episodes
+        assert (pixels == colour).all(axis=2).sum() == pytest.approx(4 * 112 * 80, rel=0.05)
+    columns = [np.flatnonzero((pixels == c).all(axis=2).any(axis=0)).mean() for c in colours]
+    assert columns == sorted(columns)
