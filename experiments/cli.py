@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction, arg
 from tyro.extras import SubcommandApp
 
-from experiments import commands, model_commands
+from experiments import cli_data, commands, model_commands
 from experiments.cli_convert import HELP, convert_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -183,6 +183,8 @@ def report(out: Path) -> None:
     commands.draw_again(out)
 
 
+data_app.command(cli_data.convert_app, name="convert", help=cli_data.HELP)
+data_app.command(cli_data.import_tokens, name="import-tokens")
 app.command(data_app, name="data", help="Simulated datasets, and what the registry knows.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 app.command(convert_app, name="convert", help=HELP)

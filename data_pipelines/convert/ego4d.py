@@ -12,8 +12,8 @@ from the video at these times, positions interpolated linearly between annotated
 DIFFERS from the release (reference sections 5.4 and 5.5):
 * it calls annotated frames an even 1 Hz and joins four actions whatever time lies between them;
 * its images are BGR; here they are RGB;
-* its frames lack boxes of which it only counts three; here both hands are required by name;
-* frame n of the annotations is the n-th behind the first, where the release reads one earlier.
+* it counts boxes of any kind before it looks for hands; here both hands are required by name;
+* frame n is what the video shows at n / fps seconds; the release reads the frame before it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.convert.episode import Episode, LeftOut, UnitError
-from data_pipelines.convert.hands import LAYOUT, SHORT_SIDE, TEXT, cut_episodes, destination
+from data_pipelines.convert.hands import LAYOUT, cut_episodes, destination
+from data_pipelines.convert.settings import Ego4dSettings
 from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.rlds_writer import encode_jpeg
+from hma_jax.config import to_dict
 
 HZ = 2.0
-MAX_GAP = 1.0  # seconds between annotated frames of one episode
-MIN_FRAMES = 16  # as the release asks for
 MAX_STEPS = 600
 HANDS = ("left_hand", "right_hand")
 
@@ -52,13 +52,9 @@ class Ego4dSource:
         self,
         annotations: str | Path,
         videos: str | Path,
-        *,
-        max_gap: float = MAX_GAP,
-        min_frames: int = MIN_FRAMES,
-        short_side: int | None = SHORT_SIDE,
+        settings: Ego4dSettings = Ego4dSettings(),
     ):
-        self.path, self.videos = Path(annotations), Path(videos)
-        self.max_gap, self.min_frames, self.short_side = max_gap, min_frames, short_side
+        self.path, self.videos, self.settings = Path(annotations), Path(videos), settings
         data = self._read()
         if not isinstance(data, dict) or not isinstance(data.get("videos"), list):
             raise DataError(f"{self.path}: no list 'videos' in it; give fho_main.json of the v2 annotations.")
@@ -77,7 +73,7 @@ class Ego4dSource:
             "format": "ego4d",
             "annotations": self._hash,
             "videos": {uid: self._video(uid).stat().st_size for uid in self.units},
-            "settings": [self.max_gap, self.min_frames, self.short_side],
+            "settings": to_dict(self.settings),
         }
 
     def read(self, unit: int) -> Iterator[Episode | LeftOut]:
@@ -85,7 +81,7 @@ class Ego4dSource:
         with open_video(self._video(uid)) as video:
             for number, interval in enumerate(self._field(self._labels[uid], "annotated_intervals", uid)):
                 times, positions = self._annotated(uid, number, interval, video)
-                for first, last in _stretches(times, self.max_gap):
+                for first, last in _stretches(times, self.settings.max_gap):
                     yield from self._episodes(uid, video, times[first:last], positions[first:last])
 
     def _episodes(
@@ -95,12 +91,11 @@ class Ego4dSource:
         even = np.stack([np.interp(grid, times, column) for column in positions.T], axis=1)
         yield from cut_episodes(
             even,
-            lambda rows: [encode_jpeg(shrink(f, self.short_side)) for f in video.frames(grid[rows])],
+            lambda rows: [encode_jpeg(shrink(f, self.settings.short_side)) for f in video.frames(grid[rows])],
             action=destination,
-            min_frames=self.min_frames,
+            min_frames=self.settings.min_frames,
             max_steps=MAX_STEPS,
             origin=lambda row: f"{uid}/{grid[row]:.3f}s",
-            text=TEXT,
         )
 
     def _annotated(

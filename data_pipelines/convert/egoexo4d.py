@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.convert.episode import Episode, LeftOut, UnitError
-from data_pipelines.convert.hands import LAYOUT, SHORT_SIDE, cut_episodes, destination
+from data_pipelines.convert.hands import LAYOUT, cut_episodes, destination
+from data_pipelines.convert.settings import EgoExo4dSettings
 from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.rlds_writer import encode_jpeg
+from hma_jax.config import to_dict
 
 HZ = 30.0
-CAMERA = "cam01"
-MIN_FRAMES = 300
 MAX_STEPS = 900  # half a minute
 FULL_SIZE = (3840, 2160)
 """Pixels of the exo cameras, in which poses are given; needed where only a downscaled video is there."""
@@ -41,18 +41,9 @@ class EgoExo4dSource:
     layout = LAYOUT
     hz = HZ
 
-    def __init__(
-        self,
-        root: str | Path,
-        *,
-        camera: str = CAMERA,
-        split: str = "train",
-        min_frames: int = MIN_FRAMES,
-        short_side: int | None = SHORT_SIDE,
-    ):
-        self.root, self.camera = Path(root), camera
-        self.min_frames, self.short_side = min_frames, short_side
-        self._poses = self.root / "annotations" / "ego_pose" / split / "hand" / "automatic"
+    def __init__(self, root: str | Path, settings: EgoExo4dSettings = EgoExo4dSettings()):
+        self.root, self.settings, self.camera = Path(root), settings, settings.camera
+        self._poses = self.root / "annotations" / "ego_pose" / settings.split / "hand" / "automatic"
         takes = _json(self.root / "takes.json", DataError)
         if not isinstance(takes, list) or not all(isinstance(t, dict) and "take_uid" in t for t in takes):
             raise DataError(f"{self.root / 'takes.json'}: not a list of takes with a take_uid. Fetch it again.")
@@ -61,15 +52,15 @@ class EgoExo4dSource:
         if not self.units:
             raise DataError(
                 f"{self.root}: none of the {len(takes)} takes of takes.json has both a video "
-                f"takes/<take_name>/frame_aligned_videos/{camera}.mp4 and poses in {self._poses}."
+                f"takes/<take_name>/frame_aligned_videos/{self.camera}.mp4 and poses in {self._poses}."
             )
-        self.description = f"Ego-Exo4D, camera {camera}, both wrists, {self.hz:g} Hz."
+        self.description = f"Ego-Exo4D, camera {self.camera}, both wrists, {self.hz:g} Hz."
 
     def identity(self) -> dict[str, Any]:
         return {
             "format": "egoexo4d",
             "takes": {n: self._facts(t) for n, t in zip(self.units, self._takes, strict=True)},
-            "settings": [self.camera, self.min_frames, self.short_side],
+            "settings": to_dict(self.settings),
         }
 
     def read(self, unit: int) -> Iterator[Episode | LeftOut]:
@@ -85,9 +76,9 @@ class EgoExo4dSource:
                 raise UnitError(f"{path}: {video.rate:g} frames per second, not {HZ:g}. {ADVICE}")
             yield from cut_episodes(
                 rows,
-                lambda at: [encode_jpeg(shrink(f, self.short_side)) for f in video.frames(at / video.rate)],
+                lambda at: [encode_jpeg(shrink(f, self.settings.short_side)) for f in video.frames(at / video.rate)],
                 action=destination,
-                min_frames=self.min_frames,
+                min_frames=self.settings.min_frames,
                 max_steps=MAX_STEPS,
                 origin=lambda row: f"{name}/{self.camera}/{row}",
             )

@@ -28,17 +28,17 @@ import numpy as np
 
 from data_pipelines.convert.detections import ADVICE, read_hands
 from data_pipelines.convert.episode import Episode, LeftOut, UnitError
-from data_pipelines.convert.hands import LAYOUT, SHORT_SIDE, cut_episodes, displacement
+from data_pipelines.convert.hands import LAYOUT, cut_episodes, displacement
+from data_pipelines.convert.settings import EpicKitchensSettings
 from data_pipelines.convert.video import stored_jpeg
 from data_pipelines.errors import DataError
+from hma_jax.config import to_dict
 
 HZ = 10
 FIRST_RATE, EXTENSION_RATE = 60, 50
 EXTRACTED_AT_60 = {"P01_109": 222_487, "P27_103": 146_918}
 """Frames of the extension's two videos whose first published extraction has 60 per second."""
 
-MIN_SCORE = 0.5
-MIN_FRAMES = 61  # 6 s: 12 model frames at 2 Hz
 MAX_STEPS = 600  # one minute
 
 
@@ -52,13 +52,9 @@ class EpicKitchensSource:
         self,
         frames: str | Path,
         detections: str | Path,
-        *,
-        min_score: float = MIN_SCORE,
-        min_frames: int = MIN_FRAMES,
-        short_side: int | None = SHORT_SIDE,
+        settings: EpicKitchensSettings = EpicKitchensSettings(),
     ):
-        self.frames, self.detections = Path(frames), Path(detections)
-        self.min_score, self.min_frames, self.short_side = min_score, min_frames, short_side
+        self.frames, self.detections, self.settings = Path(frames), Path(detections), settings
         found = sorted(p.name for p in self.frames.glob("P*/rgb_frames/P*_*") if p.is_dir())
         self.units = [video for video in found if self._pickle(video).is_file()]
         if not self.units:
@@ -73,12 +69,12 @@ class EpicKitchensSource:
         return {
             "format": "epic-kitchens",
             "detections": {video: self._pickle(video).stat().st_size for video in self.units},
-            "settings": [self.min_score, self.min_frames, self.short_side],
+            "settings": to_dict(self.settings),
         }
 
     def read(self, unit: int) -> Iterator[Episode | LeftOut]:
         video = self.units[unit]
-        positions = read_hands(self._pickle(video), self.min_score)
+        positions = read_hands(self._pickle(video), self.settings.min_score)
         folder = self.frames / _participant(video) / "rgb_frames" / video
         surplus = folder / _frame_name(len(positions) + 1)
         if surplus.exists():
@@ -96,7 +92,7 @@ class EpicKitchensSource:
             positions[kept],
             load,
             action=displacement,
-            min_frames=self.min_frames,
+            min_frames=self.settings.min_frames,
             max_steps=MAX_STEPS,
             origin=lambda row: f"{video}/{_frame_name(int(kept[row]) + 1)}",
         )
@@ -106,7 +102,7 @@ class EpicKitchensSource:
             data = path.read_bytes()
         except OSError as error:
             raise UnitError(f"{path}: the frame cannot be read ({error.strerror}). {ADVICE}") from error
-        return stored_jpeg(data, self.short_side, f"{path}: the frame")
+        return stored_jpeg(data, self.settings.short_side, f"{path}: the frame")
 
     def _pickle(self, video: str) -> Path:
         return self.detections / _participant(video) / f"{video}.pkl"

@@ -4,7 +4,7 @@ A position row is [left x, left y, right x, right y] as fractions of the image's
 from its top left corner; NaN where a hand is not seen. An episode is a run of frames, evenly
 spaced in time, in each of which both hands are seen; nothing is joined over a gap. Its state is
 the row of the frame, its action is made of this row and the next one, so that the last frame of
-a run is a target only. Long runs are cut into pieces without losing a step.
+a run is a target only. Long runs are cut into equal pieces without losing a step.
 """
 
 from __future__ import annotations
@@ -20,9 +20,6 @@ IMAGE, STATE, ACTION = "observation/image", "observation/state", "action"
 LAYOUT = Layout({IMAGE: image_field(None, None)}, {ACTION: 4, STATE: 4}, knows_success=False)
 
 TEXT = "use both hands"
-
-SHORT_SIDE = 256
-"""Pixels of the shorter side of stored frames: what the release's tokenizers see."""
 
 Reader = Callable[[np.ndarray], list[bytes]]
 """Encoded frames at these row numbers."""
@@ -64,16 +61,15 @@ def cut_episodes(
         if stop - start < min_frames:
             yield LeftOut(f"fewer than {min_frames} frames in a row with both hands")
             continue
-        # Pieces share the frame between them: the last action of one leads to the first row of the next.
-        for first in range(start, stop - 1, max_steps):
-            last = min(first + max_steps, stop - 1)
-            if last - first < min(min_frames - 1, max_steps) and first > start:
-                yield LeftOut(f"the rest of a run cut into pieces of {max_steps} steps")
-                continue
+        # Equal pieces that share the frame between them: the last action of one leads to the first row
+        # of the next.
+        steps = stop - 1 - start
+        bounds = np.linspace(start, stop - 1, -(-steps // max_steps) + 1).round().astype(int)
+        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
             rows = positions[first : last + 1]
             yield Episode(
-                origin=origin(first),
+                origin=origin(int(first)),
                 images={IMAGE: read_frames(np.arange(first, last))},
                 vectors={STATE: rows[:-1], ACTION: action(rows[:-1], rows[1:])},
-                instructions=[text] * (last - first),
+                instructions=[text] * int(last - first),
             )

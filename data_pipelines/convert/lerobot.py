@@ -10,7 +10,7 @@ Depth cameras are left out.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from data_pipelines.convert.episode import Episode, Layout, UnitError, choose
 from data_pipelines.convert.lerobot_meta import EpisodeEntry, read_meta, read_table
+from data_pipelines.convert.settings import LeRobotSettings
 from data_pipelines.convert.video import ADVICE, open_video, shrink, stored_jpeg
 from data_pipelines.errors import DataError
 from data_pipelines.rlds_writer import encode_jpeg, image_field
@@ -26,19 +27,19 @@ SUCCESS, REWARD = "next.success", "next.reward"
 
 
 class LeRobotSource:
-    """`cameras` by their full or short name (`observation.images.top` or `top`); all if none is given.
+    """Cameras go by their full or short name, `observation.images.top` or `top`.
 
     Raises DataError for a directory that is no such dataset, ConfigError for an unknown camera.
     """
 
-    def __init__(self, root: str | Path, *, cameras: Sequence[str] = (), short_side: int | None = None):
-        self.root, self.short_side = Path(root), short_side
+    def __init__(self, root: str | Path, settings: LeRobotSettings = LeRobotSettings()):
+        self.root, self.short_side = Path(root), settings.short_side
         self.meta = read_meta(self.root)
         features = self.meta.features
         there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
         if not there:
             raise DataError(f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels.")
-        wanted = [_short(camera) for camera in cameras]
+        wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(there), "camera", str(self.root))
         self._cameras = {f"observation/{name}": there[name] for name in names}
         self._vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}

@@ -13,13 +13,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from data_pipelines.convert.episode import Episode, Layout, UnitError, choose, require_module
+from data_pipelines.convert.settings import RobomimicSettings
 from data_pipelines.convert.video import shrink
 from data_pipelines.errors import DataError
 from data_pipelines.rlds_writer import encode_jpeg, image_field
@@ -35,30 +36,21 @@ ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damag
 class RobomimicSource:
     """Opens the file once to learn its layout, and again for each demonstration.
 
-    `cameras` are names such as `agentview`; all if none is given. `filter_key` takes the
-    demonstrations of one mask. Raises DataError for a file of another layout or without images,
-    ConfigError for a camera or mask that it lacks.
+    Raises DataError for a file of another layout or without images, ConfigError for a camera or
+    mask that it lacks.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        cameras: Sequence[str] = (),
-        filter_key: str | None = None,
-        hz: float | None = None,
-        short_side: int | None = None,
-    ):
-        self.path, self.short_side, self.filter_key = Path(path), short_side, filter_key
+    def __init__(self, path: str | Path, settings: RobomimicSettings = RobomimicSettings()):
+        self.path, self.short_side = Path(path), settings.short_side
         self._h5py = require_module("h5py")
         with self._open() as file:
             if "data" not in file:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
-            self.units = _demonstrations(self.path, file, filter_key)
-            self.layout, self.cameras = self._read_layout(file["data"][self.units[0]], tuple(cameras))
+            self.units = _demonstrations(self.path, file, settings.filter_key)
+            self.layout, self.cameras = self._read_layout(file["data"][self.units[0]], settings.camera)
         self.task = str(args.get("env_name", "robomimic"))
-        self.hz = float(hz or args.get("env_kwargs", {}).get("control_freq") or CONTROL_RATE)
+        self.hz = float(settings.hz or args.get("env_kwargs", {}).get("control_freq") or CONTROL_RATE)
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
     def identity(self) -> dict[str, Any]:
