@@ -75,8 +75,8 @@ def import_tokens(
         ]
         require(
             not changes,
-            f"{final}: already in the store, made in another way ({'; '.join(changes)}). Choose another store "
-            "or --name, or remove this dataset from the store.",
+            f"{final}: already in the store, made in another way ({'; '.join(changes)}). Choose "
+            "another store or --name, or remove this dataset from the store.",
         )
         return there
     aside = final.with_name(f".{plan.spec.name}.partial")
@@ -124,8 +124,8 @@ def _plan(
             have, want = getattr(tokenizer, field), getattr(decoder, field)
             require(
                 have == want,
-                f"{train.path}: its tokens have {field} {want}, but the tokenizer makes {have}; give the one that "
-                f"made them (latents here are joined by --patch {patch})",
+                f"{train.path}: its tokens have {field} {want}, but the tokenizer makes {have}; "
+                f"give the one that made them (latents here are joined by --patch {patch})",
             )
         facts[0] = decoder
     name = name or train.name
@@ -158,7 +158,9 @@ def _facts(folder: ReleaseFolder, patch: int) -> TokenizerFacts:
     pixels = PIXELS.get(str(folder.metadata.get("encoder_type")))
     image_size = side * pixels if pixels else IMAGE_SIZE
     if folder.channels:
-        require(patch >= 1 and side % patch == 0, f"{folder.path}: patch {patch} does not divide the grid {side}")
+        require(
+            patch >= 1 and side % patch == 0, f"{folder.path}: patch {patch} does not divide the grid {side}"
+        )
         grid = side // patch
         return TokenizerFacts(folder.encoder, image_size, grid, grid**2, 0, 0, 0, patch**2 * folder.channels)
     factors = round(np.log(vocab) / np.log(FACTOR_VOCAB))
@@ -186,7 +188,9 @@ def _write(
         actions = np.asarray(folder.actions[start:stop])
         if not np.isfinite(actions).all():
             frame = int(start + np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
-            raise DataError(f"{folder.path}/actions: not finite at frame {frame}: {folder.actions[frame].tolist()}.")
+            raise DataError(
+                f"{folder.path}/actions: not finite at frame {frame}: {folder.actions[frame].tolist()}."
+            )
         wide = tokens.astype(np.float32 if folder.channels else np.int32)
         frames = None if decode is None else decode(wide)
         record = encode_episode(StoredEpisode(first + episode, None, tokens, actions, frames))
@@ -207,12 +211,14 @@ def _tokens(folder: ReleaseFolder, start: int, stop: int, step: int, patch: int)
     if not folder.channels:
         if part.max() >= folder.vocab_size:
             raise DataError(
-                f"{folder.path / 'video.bin'}: id {part.max()} in frames {start} to {stop - 1}, but vocab_size is "
-                f"{folder.vocab_size}. Fetch the folder again."
+                f"{folder.path / 'video.bin'}: id {part.max()} in frames {start} to {stop - 1}, "
+                f"but vocab_size is {folder.vocab_size}. Fetch the folder again."
             )
         return part.reshape(len(part), -1).astype(token_dtype(folder.vocab_size))
     if not np.isfinite(part).all():
-        raise DataError(f"{folder.path / 'video.bin'}: latents of frames {start} to {stop - 1} are not finite.")
+        raise DataError(
+            f"{folder.path / 'video.bin'}: latents of frames {start} to {stop - 1} are not finite."
+        )
     frames, channels, side, _ = part.shape
     grid = side // patch
     # As the models read a patch: cells row by row, channels of a cell together.
@@ -231,7 +237,9 @@ def _fingerprint(folders: dict[str, ReleaseFolder]) -> str:
     digest = hashlib.sha256()
     for folder in folders.values():
         digest.update(repr(sorted(folder.metadata.items())).encode())
-        digest.update(folder.bounds.astype("<i8").tobytes() + np.ascontiguousarray(folder.actions, "<f4").tobytes())
+        digest.update(
+            folder.bounds.astype("<i8").tobytes() + np.ascontiguousarray(folder.actions, "<f4").tobytes()
+        )
         digest.update(np.ascontiguousarray(folder.video[:: max(len(folder.video) // 64, 1)]).tobytes())
     return digest.hexdigest()[:16]
 
@@ -241,11 +249,16 @@ def pair_folders(folders: Sequence[Path]) -> list[tuple[str, Path, Path]]:
     stems: dict[Path, dict[str, Path]] = {}
     for folder in folders:
         stem, _, split = folder.name.rpartition("_")
-        require(split in ("train", "val") and bool(stem), f"{folder}: the folder's name must end in _train or _val")
+        require(
+            split in ("train", "val") and bool(stem),
+            f"{folder}: the folder's name must end in _train or _val",
+        )
         stems.setdefault(folder.with_name(stem), {})[split] = folder
     pairs = []
     for stem, found in stems.items():
-        mates = {split: found.get(split, stem.with_name(f"{stem.name}_{split}")) for split in ("train", "val")}
+        mates = {
+            split: found.get(split, stem.with_name(f"{stem.name}_{split}")) for split in ("train", "val")
+        }
         missing = [str(mate) for mate in mates.values() if not mate.is_dir()]
         require(not missing, f"{', '.join(missing)}: no such folder; a dataset is a pair of _train and _val")
         pairs.append((stem.name, mates["train"], mates["val"]))

@@ -79,8 +79,8 @@ def open_folder(path: str | Path) -> ReleaseFolder:
     if (steps < 0).any():
         frame = int(np.flatnonzero(steps < 0)[0])
         raise DataError(
-            f"{path / 'segment_ids.bin'}: the episode falls from {segments[frame]} to {segments[frame + 1]} at "
-            f"frame {frame + 1}; they must not decrease. {ADVICE}"
+            f"{path / 'segment_ids.bin'}: the episode falls from {segments[frame]} to "
+            f"{segments[frame + 1]} at frame {frame + 1}; they must not decrease. {ADVICE}"
         )
     bounds = np.concatenate([[0], np.flatnonzero(steps) + 1, [frames]]).astype(np.int64)
     return ReleaseFolder(path, str(meta.get("name") or path.name), meta, video, actions, bounds)
@@ -90,7 +90,9 @@ def _metadata(path: Path) -> dict[str, Any]:
     try:
         meta = json.loads(path.read_text())
     except FileNotFoundError:
-        raise DataError(f"{path} is missing: give a folder of the release, with video.bin beside it.") from None
+        raise DataError(
+            f"{path} is missing: give a folder of the release, with video.bin beside it."
+        ) from None
     except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be read ({error}). {ADVICE}") from error
     if not isinstance(meta, dict):
@@ -106,11 +108,15 @@ def _video_shape(path: Path, meta: dict[str, Any]) -> tuple[int, tuple[int, ...]
     frames, grid, channels = meta["num_images"], (meta["h"], meta["w"]), meta.get("latent_channels")
     dtype = np.dtype(meta.get("token_dtype", "float16" if channels else "uint32"))
     if grid[0] != grid[1]:
-        raise DataError(f"{path / 'metadata.json'}: a grid of {grid[0]} x {grid[1]}; only square ones can be read.")
+        raise DataError(
+            f"{path / 'metadata.json'}: a grid of {grid[0]} x {grid[1]}; only square ones can be read."
+        )
     if dtype.kind == "f":
         return frames, (frames, int(channels or 4), *grid), dtype
     if dtype == np.uint8:
-        raise ConfigError(f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents.")
+        raise ConfigError(
+            f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents."
+        )
     if type(meta.get("vocab_size")) is not int or meta["vocab_size"] < 2:
         raise DataError(f"{path / 'metadata.json'}: vocab_size is {meta.get('vocab_size')!r}. {ADVICE}")
     return frames, (frames, *grid), dtype
@@ -122,7 +128,8 @@ def _map(path: Path, dtype: Any, shape: tuple[int, ...], because: str) -> np.nda
         found = path.stat().st_size
         if found != expected:
             raise DataError(
-                f"{path}: {found} bytes, but {because} make {expected} ({np.dtype(dtype)} {list(shape)}). {ADVICE}"
+                f"{path}: {found} bytes, but {because} make {expected} "
+                f"({np.dtype(dtype)} {list(shape)}). {ADVICE}"
             )
         return np.memmap(path, dtype, "r", shape=shape)
     except OSError as error:
@@ -133,6 +140,7 @@ def _actions(path: Path, frames: int) -> np.ndarray:
     size = path.stat().st_size
     if not size or size % (4 * frames):
         raise DataError(
-            f"{path}: {size} bytes are no float32 [{frames}, A], for the num_images of metadata.json. {ADVICE}"
+            f"{path}: {size} bytes are no float32 [{frames}, A], for the num_images "
+            f"of metadata.json. {ADVICE}"
         )
     return np.memmap(path, np.float32, "r", shape=(frames, size // (4 * frames)))

@@ -1,4 +1,4 @@
-"""What `hma data convert` and `hma data import-tokens` do. Each ends by saying what it wrote and what is next."""
+"""What `hma data convert` and `hma data import-tokens` do. Each says what it wrote, and what is next."""
 
 from __future__ import annotations
 
@@ -78,7 +78,9 @@ def _convert(source: Source, to: To, default_name: str) -> None:
 
 def entry(spec: DatasetSpec) -> str:
     """The registry entry as it is written there."""
-    keys, dims = (f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims))
+    keys, dims = (
+        f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims)
+    )
     return (
         f'DatasetSpec("{spec.name}", image_key="{spec.image_key}", action_keys={keys}, '
         f"action_dims={dims}, hz={spec.hz:g}),"
@@ -112,11 +114,14 @@ def import_tokens(
         what = f"latents of {facts.channels} values" if facts.channels else f"ids of {facts.vocab_size:,}"
         _say(
             f"{spec.name}: {len(manifest.train.episodes):,} + {len(manifest.val.episodes):,} episodes, "
-            f"{facts.tokens} tokens per frame, {what}, by {facts.identity}; {spec.hz:g} Hz, stride {spec.stride}"
+            f"{facts.tokens} tokens per frame, {what}, by {facts.identity}; "
+            f"{spec.hz:g} Hz, stride {spec.stride}"
         )
         wrote(store / spec.name)
     if tokenizer is None:
-        _say("note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets")
+        _say(
+            "note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets"
+        )
 
 
 def _say(line: str) -> None:

@@ -59,7 +59,15 @@ def _messages(path: Path) -> Iterator[Any]:
             records = _Refusing(file).load()
     except OSError as error:
         raise UnitError(f"{path}: the detections cannot be read ({error.strerror}). {ADVICE}") from error
-    except (pickle.UnpicklingError, EOFError, ValueError, IndexError, TypeError, KeyError, AttributeError) as error:
+    except (
+        pickle.UnpicklingError,
+        EOFError,
+        ValueError,
+        IndexError,
+        TypeError,
+        KeyError,
+        AttributeError,
+    ) as error:
         raise UnitError(f"{path}: not a pickled list of bytes ({error}); it was not run. {ADVICE}") from error
     if not isinstance(records, list) or not all(isinstance(r, bytes) for r in records):
         raise UnitError(f"{path}: the pickle holds something else than a list of bytes. {ADVICE}")

@@ -125,7 +125,9 @@ class Ego4dSource:
         centres = []
         for hand in HANDS:
             box = self._field(boxes[hand], "bbox", f"{where}, {hand}")
-            x, y, width, height = (float(self._field(box, k, f"{where}, {hand}")) for k in ("x", "y", "width", "height"))
+            x, y, width, height = (
+                float(self._field(box, k, f"{where}, {hand}")) for k in ("x", "y", "width", "height")
+            )
             centres += [(x + width / 2) / size[0], (y + height / 2) / size[1]]
         return np.clip(centres, 0, 1)  # a box may reach over the edge by a pixel
 

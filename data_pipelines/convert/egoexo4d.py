@@ -46,7 +46,9 @@ class EgoExo4dSource:
         self._poses = self.root / "annotations" / "ego_pose" / settings.split / "hand" / "automatic"
         takes = _json(self.root / "takes.json", DataError)
         if not isinstance(takes, list) or not all(isinstance(t, dict) and "take_uid" in t for t in takes):
-            raise DataError(f"{self.root / 'takes.json'}: not a list of takes with a take_uid. Fetch it again.")
+            raise DataError(
+                f"{self.root / 'takes.json'}: not a list of takes with a take_uid. Fetch it again."
+            )
         self._takes = [t for t in takes if self._pose(t).is_file() and self._video(t) is not None]
         self.units = [str(t.get("take_name")) for t in self._takes]
         if not self.units:
@@ -76,7 +78,9 @@ class EgoExo4dSource:
                 raise UnitError(f"{path}: {video.rate:g} frames per second, not {HZ:g}. {ADVICE}")
             yield from cut_episodes(
                 rows,
-                lambda at: [encode_jpeg(shrink(f, self.settings.short_side)) for f in video.frames(at / video.rate)],
+                lambda at: [
+                    encode_jpeg(shrink(f, self.settings.short_side)) for f in video.frames(at / video.rate)
+                ],
                 action=destination,
                 min_frames=self.settings.min_frames,
                 max_steps=MAX_STEPS,
@@ -100,7 +104,9 @@ class EgoExo4dSource:
                     xy = [float(joints[wrist][axis]) for wrist in WRISTS for axis in ("x", "y")]
                     found[int(frame)] = np.array(xy) / size
             except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-                raise UnitError(f"{path}: frame {frame!r} has no usable annotation2D ({error!r}). {ADVICE}") from error
+                raise UnitError(
+                    f"{path}: frame {frame!r} has no usable annotation2D ({error!r}). {ADVICE}"
+                ) from error
         numbers = sorted(found)
         if numbers and numbers[0] < 0:
             raise UnitError(f"{path}: frame {numbers[0]} is negative. {ADVICE}")
@@ -112,8 +118,8 @@ class EgoExo4dSource:
             return np.array([video.width, video.height], float)
         if abs(video.width / video.height - FULL_SIZE[0] / FULL_SIZE[1]) > 0.02:
             raise UnitError(
-                f"{self.camera}: a downscaled video of {video.width} x {video.height} pixels is no copy of one of "
-                f"{FULL_SIZE[0]} x {FULL_SIZE[1]}, in which poses are given. Fetch the full-scale video."
+                f"{self.camera}: a downscaled video of {video.width} x {video.height} pixels is no copy of "
+                f"one of {FULL_SIZE[0]} x {FULL_SIZE[1]}, in which poses are given. Fetch the full-scale video."
             )
         return np.array(FULL_SIZE, float)
 
@@ -123,7 +129,10 @@ class EgoExo4dSource:
     def _video(self, take: dict[str, Any]) -> Path | None:
         """The full-scale video, or a downscaled copy of it."""
         folder = self.root / "takes" / str(take.get("take_name")) / "frame_aligned_videos"
-        places = [folder / f"{self.camera}.mp4", *sorted(folder.glob(f"downscaled/*/{self.camera}.mp4"), reverse=True)]
+        places = [
+            folder / f"{self.camera}.mp4",
+            *sorted(folder.glob(f"downscaled/*/{self.camera}.mp4"), reverse=True),
+        ]
         return next((place for place in places if place.is_file()), None)
 
     def _facts(self, take: dict[str, Any]) -> list[Any]:

@@ -58,10 +58,12 @@ class EpicKitchensSource:
         found = sorted(p.name for p in self.frames.glob("P*/rgb_frames/P*_*") if p.is_dir())
         self.units = [video for video in found if self._pickle(video).is_file()]
         if not self.units:
-            what = f"{found[0]} has no {self._pickle(found[0])}" if found else "it has no P*/rgb_frames/<video>/"
+            what = (
+                f"{found[0]} has no {self._pickle(found[0])}" if found else "it has no P*/rgb_frames/<video>/"
+            )
             raise DataError(
-                f"{frames}: no video with frames and detections ({what}). Extract the tar files of rgb_frames, "
-                "and give the folder hand-objects with --detections."
+                f"{frames}: no video with frames and detections ({what}). Extract the tar files of "
+                "rgb_frames, and give the folder hand-objects with --detections."
             )
         self.description = f"EPIC-KITCHENS-100, both hands as detected, {self.hz:g} Hz."
 
@@ -79,8 +81,8 @@ class EpicKitchensSource:
         surplus = folder / _frame_name(len(positions) + 1)
         if surplus.exists():
             raise UnitError(
-                f"{folder}: it has {surplus.name}, but {self._pickle(video)} ends with frame {len(positions)}: "
-                f"frames and detections are of different extractions. {ADVICE}"
+                f"{folder}: it has {surplus.name}, but {self._pickle(video)} ends with frame "
+                f"{len(positions)}: frames and detections are of different extractions. {ADVICE}"
             )
         step = _rate(video, len(positions)) // HZ
         kept = np.arange(0, len(positions), step)

@@ -38,13 +38,18 @@ class LeRobotSource:
         features = self.meta.features
         there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
         if not there:
-            raise DataError(f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels.")
+            raise DataError(
+                f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels."
+            )
         wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(there), "camera", str(self.root))
         self._cameras = {f"observation/{name}": there[name] for name in names}
         self._vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self._vectors}:
-            raise DataError(f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among {', '.join(features)}.")
+            raise DataError(
+                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among "
+                f"{', '.join(features)}."
+            )
         sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self._vectors.items()}
         self.layout = Layout({k: image_field(None, None) for k in self._cameras}, sizes, SUCCESS in features)
         self.hz = self.meta.fps
@@ -53,7 +58,9 @@ class LeRobotSource:
         self._open_table: tuple[Path, Any] | None = None
 
     def identity(self) -> dict[str, Any]:
-        files = {e.data for e in self.meta.episodes} | {f for e in self.meta.episodes for f, _ in e.videos.values()}
+        files = {e.data for e in self.meta.episodes} | {
+            f for e in self.meta.episodes for f, _ in e.videos.values()
+        }
         sizes = {str(f.relative_to(self.root)): f.stat().st_size if f.exists() else -1 for f in sorted(files)}
         return {
             "format": self.meta.version,
@@ -98,7 +105,11 @@ class LeRobotSource:
                 table = read_table(entry.data)
             except DataError as error:
                 raise UnitError(str(error)) from error
-            missing = [n for n in ("episode_index", "timestamp", *self._vectors.values()) if n not in table.column_names]
+            missing = [
+                n
+                for n in ("episode_index", "timestamp", *self._vectors.values())
+                if n not in table.column_names
+            ]
             if missing:
                 raise UnitError(f"{entry.data}: no column {missing[0]!r}. {ADVICE}")
             self._open_table = entry.data, table.select([n for n in names if n in table.column_names])
@@ -106,7 +117,9 @@ class LeRobotSource:
         mask = np.asarray(table["episode_index"]) == entry.index
         rows = np.flatnonzero(mask)
         if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
-            raise UnitError(f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}")
+            raise UnitError(
+                f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}"
+            )
         return table.slice(int(rows[0]), len(rows))
 
     def _times(self, table: Any, where: str) -> np.ndarray:
@@ -117,12 +130,14 @@ class LeRobotSource:
         if len(wrong):
             row = int(wrong[0])
             raise UnitError(
-                f"{where}: timestamp {times[row]:.4f} s at row {row}, where {self.hz:g} frames per second make "
-                f"{expected[row]:.4f} s. {ADVICE}"
+                f"{where}: timestamp {times[row]:.4f} s at row {row}, where {self.hz:g} frames per second "
+                f"make {expected[row]:.4f} s. {ADVICE}"
             )
         return times
 
-    def _images(self, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str) -> list[bytes]:
+    def _images(
+        self, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str
+    ) -> list[bytes]:
         if name in entry.videos:
             path, begin = entry.videos[name]
             with open_video(path) as video:
@@ -152,7 +167,9 @@ class LeRobotSource:
         try:
             rows = np.asarray(table[name].to_pylist(), np.float64)
         except (TypeError, ValueError) as error:
-            raise UnitError(f"{where}: {name!r} is not one array of numbers per row ({error}). {ADVICE}") from error
+            raise UnitError(
+                f"{where}: {name!r} is not one array of numbers per row ({error}). {ADVICE}"
+            ) from error
         return rows.reshape(len(rows), -1)
 
     def _texts(self, entry: EpisodeEntry, table: Any, where: str) -> list[str]:
@@ -162,7 +179,9 @@ class LeRobotSource:
         unknown = [(row, i) for row, i in enumerate(indices) if i not in self.meta.tasks]
         if unknown:
             row, index = unknown[0]
-            raise UnitError(f"{where}: task_index {index} at row {row} is not among the tasks of meta. {ADVICE}")
+            raise UnitError(
+                f"{where}: task_index {index} at row {row} is not among the tasks of meta. {ADVICE}"
+            )
         return [self.meta.tasks[i] for i in indices]
 
 

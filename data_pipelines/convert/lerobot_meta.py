@@ -112,7 +112,9 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     if version != "v3.0":
         path = root / "meta" / "tasks.jsonl"
         rows = _json_lines(path) if path.exists() else []
-        return {int(row["task_index"]): str(row["task"]) for row in rows if "task_index" in row and "task" in row}
+        return {
+            int(row["task_index"]): str(row["task"]) for row in rows if "task_index" in row and "task" in row
+        }
     path = root / "meta" / "tasks.parquet"
     if not path.exists():
         return {}
@@ -120,7 +122,9 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     # pandas stores the tasks as the index, which has had several names.
     text = [c for c in ("task", "__index_level_0__", "index") if c in table.column_names]
     if not text or "task_index" not in table.column_names:
-        raise DataError(f"{path}: the columns are {', '.join(table.column_names)}; task and task_index are needed.")
+        raise DataError(
+            f"{path}: the columns are {', '.join(table.column_names)}; task and task_index are needed."
+        )
     return dict(zip(table["task_index"].to_pylist(), map(str, table[text[0]].to_pylist()), strict=True))
 
 
@@ -137,14 +141,18 @@ def _fill(info: dict[str, Any], field: str, **place: Any) -> str:
     try:
         return info[field].format(**place)
     except (KeyError, ValueError, IndexError) as error:
-        raise DataError(f"meta/info.json: {field} {info[field]!r} cannot be filled in ({error}). {ADVICE}") from error
+        raise DataError(
+            f"meta/info.json: {field} {info[field]!r} cannot be filled in ({error}). {ADVICE}"
+        ) from error
 
 
 def _json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except FileNotFoundError:
-        raise DataError(f"{path} is missing: give the root of a LeRobot dataset, with meta, data and videos.") from None
+        raise DataError(
+            f"{path} is missing: give the root of a LeRobot dataset, with meta, data and videos."
+        ) from None
     except (OSError, ValueError) as error:
         raise DataError(f"{path} cannot be read ({error}). {ADVICE}") from error
     if not isinstance(value, dict):

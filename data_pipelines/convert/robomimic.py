@@ -73,7 +73,12 @@ class RobomimicSource:
             images = {}
             for camera in self.cameras:
                 frames = self._array(demo, f"obs/{camera}_image", where)
-                if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) != steps:
+                if (
+                    frames.dtype != np.uint8
+                    or frames.ndim != 4
+                    or frames.shape[3] != 3
+                    or len(frames) != steps
+                ):
                     raise UnitError(
                         f"{where}/obs/{camera}_image is {frames.dtype} {list(frames.shape)}; {steps} actions "
                         f"need uint8 images [{steps}, H, W, 3]. {ADVICE}"
@@ -113,9 +118,9 @@ class RobomimicSource:
         there = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
         if not there:
             raise DataError(
-                f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a low-dimensional "
-                "or raw file. Download the image file of the task, or render one from its states with robomimic's "
-                "dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
+                f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a "
+                "low-dimensional or raw file. Download the image file of the task, or render one from its "
+                "states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
             )
         cameras = choose(wanted, there, "camera", where)
         if "actions" not in demo:

@@ -68,9 +68,13 @@ class Video:
         for time in times:
             while after is not None and after[0] < time:
                 before, after = after, next(source, None)
-            nearest = min((f for f in (before, after) if f is not None), key=lambda f: abs(f[0] - time), default=None)
+            nearest = min(
+                (f for f in (before, after) if f is not None), key=lambda f: abs(f[0] - time), default=None
+            )
             if nearest is None or abs(nearest[0] - time) > near:
-                found = "the video has no frame" if nearest is None else f"the nearest is at {nearest[0]:.4f} s"
+                found = (
+                    "the video has no frame" if nearest is None else f"the nearest is at {nearest[0]:.4f} s"
+                )
                 raise UnitError(
                     f"{self._path}: no frame at {time:.4f} s within {near:.4f} s: {found}. {ADVICE}"
                 )
@@ -83,7 +87,9 @@ class Video:
         base = float(self._stream.time_base)
         for target in (self._start + int(max(time - 0.5 / self.rate, 0) / base), None):
             # Where the index of a file misleads, decode it from its beginning.
-            self._container.seek(self._start if target is None else target, stream=self._stream, backward=True)
+            self._container.seek(
+                self._start if target is None else target, stream=self._stream, backward=True
+            )
             frames = self._decode(base)
             first = next(frames, None)
             if first is not None and (first[0] <= time or target is None):

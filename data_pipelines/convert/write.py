@@ -82,7 +82,13 @@ def convert(
     )
     final = Path(out) / name / VERSION
     mark = stable_hash(
-        {"converter": CONVERTER, "name": name, "skip": skip_damaged, "shard": shard_bytes, **source.identity()}
+        {
+            "converter": CONVERTER,
+            "name": name,
+            "skip": skip_damaged,
+            "shard": shard_bytes,
+            **source.identity(),
+        }
     )
     if final.exists():
         return _finished(final, mark, source, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ from data_pipelines.errors import DataError
 from data_pipelines.import_tokens import LATENT_SCALE, import_tokens, pair_folders
 from data_pipelines.release_folder import open_folder
 from data_pipelines.store import TokenStore
-from data_pipelines.windows import train_windows
+from data_pipelines.windows import cut_actions, cut_tokens, train_windows
 from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import GOLDEN
 
+CASE = GOLDEN / "15_windows"
 GRID, DIM = 4, 3
 
 
@@ -25,7 +28,9 @@ def write_folder(path: Path, lengths=(7, 5, 9), latents=False, first=0, action_f
     cells = count[:, None] + np.arange(GRID**2)
     video = cells.reshape(frames, GRID, GRID).astype(np.uint32)
     if latents:
-        video = (cells.reshape(frames, 1, GRID, GRID) + np.array([0, 100, 200, 300]).reshape(4, 1, 1)).astype(np.float16)
+        video = (cells.reshape(frames, 1, GRID, GRID) + np.array([0, 100, 200, 300]).reshape(4, 1, 1)).astype(
+            np.float16
+        )
     actions = np.stack([count, count / 2, -count], axis=1).astype(np.float32)
     (path / "actions").mkdir(parents=True)
     video.tofile(path / "video.bin")
@@ -52,7 +57,11 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
     manifest = import_tokens(*pair, tmp_path / "store", hz=4)
     facts = manifest.tokenizer
     assert (facts.vocab_size, facts.factors, facts.factor_vocab, facts.channels) == (262144, 2, 512, 0)
-    assert (facts.identity, facts.image_size, facts.tokens) == ("magvit magvit2.ckpt (release folder)", 64, 16)
+    assert (facts.identity, facts.image_size, facts.tokens) == (
+        "magvit magvit2.ckpt (release folder)",
+        64,
+        16,
+    )
     assert (manifest.spec.name, manifest.stride, manifest.frame_step) == ("toy_arm", 2, 2)
     store = TokenStore(tmp_path / "store")
     for split, lengths, first in (("train", (7, 5, 9), 0), ("val", (4, 6), 500)):
@@ -68,7 +77,9 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
     rows = np.arange(21)
     np.testing.assert_allclose(manifest.action_mean, [10, 5, -10])
     np.testing.assert_allclose(manifest.action_std[0], rows.std())
-    assert len(train_windows(store, "toy_arm", 3)) == 1 + 0 + 2  # 6 native frames each, starts every other one
+    assert (
+        len(train_windows(store, "toy_arm", 3)) == 1 + 0 + 2
+    )  # 6 native frames each, starts every other one
 
 
 def test_latents_become_scaled_patches_in_the_order_the_models_read(tmp_path):
@@ -87,6 +98,38 @@ def test_latents_become_scaled_patches_in_the_order_the_models_read(tmp_path):
     assert (single.tokenizer.tokens, single.tokenizer.channels) == (16, 4)
     with pytest.raises(ConfigError, match="patch 3 does not divide the grid 4"):
         import_tokens(*pair, tmp_path / "none", hz=2, patch=3)
+
+
+@pytest.mark.parametrize("kind, tolerance", [("tokens", 0), ("latents", 2**-11)])
+def test_windows_of_an_imported_store_are_what_the_release_reads(tmp_path, kind, tolerance):
+    """Golden case 15. The release's own windows that leave an episode are not followed."""
+    folder = open_folder(CASE / kind)
+    items, compared = np.load(CASE / "items.npz"), 0
+    for key in items:
+        frames, stride, start = map(int, re.findall(r"\d+", key))
+        field = key.rpartition("__")[2]
+        episode = int(np.searchsorted(folder.bounds, start, side="right") - 1)
+        first = start - folder.bounds[episode]
+        if field == ("latents" if kind == "tokens" else "input_ids") or (
+            start + frames * stride > folder.bounds[episode + 1]
+        ):
+            continue
+        root = tmp_path / f"{stride}"
+        manifest = import_tokens(CASE / kind, CASE / kind, root, hz=2 * stride, patch=1)
+        item = TokenStore(root).episode("toy_arm", "train", episode)
+        if field == "action_ids":
+            got = cut_actions(item, first, frames, manifest, width=items[key].shape[1])
+        elif first % stride:
+            continue  # a phase that is not stored
+        else:
+            got = cut_tokens(item, first // stride, frames, manifest)
+        np.testing.assert_allclose(got.reshape(items[key].shape), items[key], rtol=tolerance)
+        compared += 1
+    assert compared >= 6
+    facts = json.loads((CASE / "windows.json").read_text())
+    np.testing.assert_allclose(manifest.action_mean, facts["action_mean"], rtol=1e-5)
+    np.testing.assert_allclose(manifest.action_std, facts["action_std"], rtol=1e-5)
+    assert len(folder) == facts["episodes"]
 
 
 def test_actions_in_several_files_are_joined_by_name(tmp_path):
@@ -175,15 +218,21 @@ def meta(**change):
         (meta(action_dim=4), "3 values per frame, but metadata.json says action_dim 4"),
         (meta(vocab_size=None), "vocab_size is None"),
         (rewrite("segment_ids.bin", np.int32([0] * 10 + [2] * 5 + [1] * 6)), "falls from 2 to 1 at frame 15"),
-        (rewrite("video.bin", np.full((21, 4, 4), 300000, np.uint32)), "id 300000 in frames 0 to 6, but vocab_size"),
-        (rewrite("actions/part_0.bin", np.full((21, 3), np.nan, np.float32)), "actions: not finite at frame 0"),
+        (
+            rewrite("video.bin", np.full((21, 4, 4), 300000, np.uint32)),
+            "id 300000 in frames 0 to 6, but vocab_size",
+        ),
+        (
+            rewrite("actions/part_0.bin", np.full((21, 3), np.nan, np.float32)),
+            "actions: not finite at frame 0",
+        ),
     ],
 )
 def test_damage_is_named_with_file_and_sizes(tmp_path, pair, damage, message):
     damage(pair[0])
     with pytest.raises(DataError, match=message):
         import_tokens(*pair, tmp_path / "store", hz=4)
-    assert not list((tmp_path / "store").glob("*")) if (tmp_path / "store").exists() else True
+    assert not (tmp_path / "store").exists() or not any((tmp_path / "store").iterdir())
 
 
 def test_raw_images_and_odd_vocabularies_are_refused(tmp_path, pair):

@@ -39,7 +39,9 @@ def write_video(path: Path, frames: list[int], fps: int, size=(HEIGHT, WIDTH)) -
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=fps, options={"crf": "8", "g": "10", "preset": "ultrafast"})
+        stream = container.add_stream(
+            "libx264", rate=fps, options={"crf": "8", "g": "10", "preset": "ultrafast"}
+        )
         stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
         for i in frames:
             frame = av.VideoFrame.from_ndarray(picture(i, *size), format="rgb24")
@@ -129,7 +131,10 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
         "action": {"dtype": "float32", "shape": [3], "names": None},
         "next.success": {"dtype": "bool", "shape": [1], "names": None},
         "next.reward": {"dtype": "float32", "shape": [1], "names": None},
-        **{k: {"dtype": "int64", "shape": [1]} for k in ("episode_index", "frame_index", "index", "task_index")},
+        **{
+            k: {"dtype": "int64", "shape": [1]}
+            for k in ("episode_index", "frame_index", "index", "task_index")
+        },
         "timestamp": {"dtype": "float32", "shape": [1]},
     }
     old = version != "v3.0"
@@ -171,7 +176,9 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
     tasks = ["stack", "push"]
     shown = [[24 * e + t for t in range(steps)] for e, steps in enumerate(lengths)]
     if old:
-        (meta / "tasks.jsonl").write_text("".join(json.dumps({"task_index": i, "task": t}) + "\n" for i, t in enumerate(tasks)))
+        (meta / "tasks.jsonl").write_text(
+            "".join(json.dumps({"task_index": i, "task": t}) + "\n" for i, t in enumerate(tasks))
+        )
         lines = [{"episode_index": e, "tasks": [tasks[1 - e]], "length": n} for e, n in enumerate(lengths)]
         (meta / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         for e, table in enumerate(tables):
@@ -179,7 +186,11 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
             path.parent.mkdir(parents=True, exist_ok=True)
             pq.write_table(table, path)
             if camera == "video":
-                write_video(root / info["video_path"].format(episode_chunk=0, episode_index=e, video_key=CAMERA), shown[e], FPS)
+                write_video(
+                    root / info["video_path"].format(episode_chunk=0, episode_index=e, video_key=CAMERA),
+                    shown[e],
+                    FPS,
+                )
         return root
     pq.write_table(pa.table({"task_index": [0, 1], "__index_level_0__": tasks}), meta / "tasks.parquet")
     starts = np.cumsum([0, *lengths]) / FPS
@@ -199,7 +210,9 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
         }.items():
             rows[f"videos/{CAMERA}/{name}"] = values
         write_video(
-            root / info["video_path"].format(video_key=CAMERA, chunk_index=0, file_index=0), sum(shown, []), FPS
+            root / info["video_path"].format(video_key=CAMERA, chunk_index=0, file_index=0),
+            sum(shown, []),
+            FPS,
         )
     (meta / "episodes" / "chunk-000").mkdir(parents=True)
     pq.write_table(pa.table(rows), meta / "episodes" / "chunk-000" / "file-000.parquet")
@@ -266,5 +279,7 @@ def write_epic(root: Path, video: str, frames: list[list[bytes]], shown=lambda n
         (folder / f"frame_{n:010d}.jpg").write_bytes(jpeg)
     path = root / "hand-objects" / participant / f"{video}.pkl"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(pickle.dumps([detections(video, n, hands) for n, hands in enumerate(frames, 1)], protocol=3))
+    path.write_bytes(
+        pickle.dumps([detections(video, n, hands) for n, hands in enumerate(frames, 1)], protocol=3)
+    )
     return root / "EPIC", root / "hand-objects"

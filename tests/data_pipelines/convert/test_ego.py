@@ -14,7 +14,6 @@ from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, number, read_back, write_video
 
-pytest.importorskip("av", reason="the extra 'convert' is not installed")
 
 # --- Ego4D: a video of 10 frames per second, whose frame n is number n ---------------------------
 
@@ -23,7 +22,11 @@ UID = "0a1b"
 
 def box(kind: str, x: float, y: float) -> dict:
     """Centre (x, y) in pixels of an image of 200 x 100."""
-    return {"object_type": kind, "structured_noun": None, "bbox": {"x": x - 5, "y": y - 10, "width": 10, "height": 20}}
+    return {
+        "object_type": kind,
+        "structured_noun": None,
+        "bbox": {"x": x - 5, "y": y - 10, "width": 10, "height": 20},
+    }
 
 
 def annotated(n: int, hands=("left_hand", "right_hand")) -> dict:
@@ -34,7 +37,12 @@ def annotated(n: int, hands=("left_hand", "right_hand")) -> dict:
 
 
 def action(*frames: dict, **flags) -> dict:
-    kinds = {"is_rejected": False, "is_invalid_annotation": False, "stage": "x", "narration_text": "#C C cuts"}
+    kinds = {
+        "is_rejected": False,
+        "is_invalid_annotation": False,
+        "stage": "x",
+        "narration_text": "#C C cuts",
+    }
     return {**kinds, **flags, "frames": list(frames) or None}
 
 
@@ -63,7 +71,9 @@ def test_annotated_frames_are_joined_in_time_and_sampled_evenly(tmp_path):
     assert [number(image) for image in episode.images] == [5, 10, 15, 20]
     expected = np.array([[n / 200, 0.5, (100 + n) / 200, 0.5] for n in (5, 10, 15, 20, 25)])
     np.testing.assert_allclose(episode.actions, expected[1:], atol=1e-6)
-    np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
+    np.testing.assert_allclose(
+        dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6
+    )
 
 
 def test_a_pause_ends_an_episode_and_unusable_frames_do_not_bridge_it(tmp_path):
@@ -91,7 +101,11 @@ def test_short_stretches_are_left_out_and_counted(tmp_path):
             {},
             "0a1b, interval 0, frame 4, left_hand has no 'bbox'",
         ),
-        ((action(*(annotated(n) for n in (30, 35, 40, 45, 50))),), {}, r"0a1b.mp4: no frame at 4.0000 s|no frame at"),
+        (
+            (action(*(annotated(n) for n in (30, 35, 40, 45, 50))),),
+            {},
+            r"0a1b.mp4: no frame at 4.0000 s|no frame at",
+        ),
     ],
 )
 def test_malformed_annotations_are_named_to_the_field(tmp_path, actions, change, message):
@@ -122,21 +136,31 @@ def pose(n: int, camera: str = "cam01") -> list[dict]:
         "left_wrist": {"x": 30.0 * n, "y": 540.0, **point},
         "right_wrist": {"x": 1920.0 + 30 * n, "y": 1080.0, **point},
     }
-    return [{"metadata": {"frame_number": n}, "annotation2D": {camera: wrists, "cam02": {}}, "annotation3D": {}}]
+    return [
+        {"metadata": {"frame_number": n}, "annotation2D": {camera: wrists, "cam02": {}}, "annotation3D": {}}
+    ]
 
 
 def egoexo4d(tmp_path, poses: dict, settings=EgoExo4dSettings(min_frames=10), fps=30, size=(HEIGHT, WIDTH)):
-    (tmp_path / "takes.json").write_text(json.dumps([TAKE, {**TAKE, "take_uid": "uid-2", "take_name": "other"}]))
+    (tmp_path / "takes.json").write_text(
+        json.dumps([TAKE, {**TAKE, "take_uid": "uid-2", "take_name": "other"}])
+    )
     path = tmp_path / "annotations/ego_pose/train/hand/automatic/uid-1.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(poses))
-    write_video(tmp_path / "takes/cooking_1/frame_aligned_videos/downscaled/448/cam01.mp4", list(range(47)), fps, size)
+    write_video(
+        tmp_path / "takes/cooking_1/frame_aligned_videos/downscaled/448/cam01.mp4", list(range(47)), fps, size
+    )
     return EgoExo4dSource(tmp_path, settings)
 
 
 def test_clips_of_enough_labelled_frames_are_kept_and_shorter_ones_are_not(tmp_path):
     labelled = [*range(2, 11), *range(14, 40)]  # 9 frames, then 26
-    poses = {str(n): pose(n) for n in labelled} | {"11": [], "12": [{"annotation2D": {}}], "13": pose(13, "cam03")}
+    poses = {str(n): pose(n) for n in labelled} | {
+        "11": [],
+        "12": [{"annotation2D": {}}],
+        "13": pose(13, "cam03"),
+    }
     source = egoexo4d(tmp_path, poses)
     assert source.units == ["cooking_1"]
     done = convert(source, tmp_path, "exoego4d")
@@ -146,7 +170,9 @@ def test_clips_of_enough_labelled_frames_are_kept_and_shorter_ones_are_not(tmp_p
     n = np.arange(14, 40)[:, None]
     expected = np.concatenate([30 * n / 3840, 0 * n + 0.25, (1920 + 30 * n) / 3840, 0 * n + 0.5], axis=1)
     np.testing.assert_allclose(episode.actions, expected[1:], atol=1e-6)
-    np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
+    np.testing.assert_allclose(
+        dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6
+    )
 
 
 def test_wrists_outside_the_image_are_not_seen(tmp_path):

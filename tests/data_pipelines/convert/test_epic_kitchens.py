@@ -41,10 +41,13 @@ def test_frames_positions_and_displacements_at_10_hz(tmp_path, video, step):
     assert [number(image) for image in episode.images] == kept[:-1].tolist()
     expected = rows(1, step, len(kept))
     np.testing.assert_allclose(episode.actions, np.diff(expected, axis=0), atol=1e-6)
-    np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
-    assert dataset.record(0)["steps/observation/image"][1] == (
-        tmp_path / f"EPIC/{video[:3]}/rgb_frames/{video}/frame_{kept[1]:010d}.jpg"
-    ).read_bytes()  # not encoded a second time
+    np.testing.assert_allclose(
+        dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6
+    )
+    assert (
+        dataset.record(0)["steps/observation/image"][1]
+        == (tmp_path / f"EPIC/{video[:3]}/rgb_frames/{video}/frame_{kept[1]:010d}.jpg").read_bytes()
+    )  # not encoded a second time
 
 
 def test_episodes_end_where_a_hand_is_missing_and_nothing_is_joined(tmp_path):
@@ -61,7 +64,12 @@ def test_episodes_end_where_a_hand_is_missing_and_nothing_is_joined(tmp_path):
 
 def test_the_best_hand_of_each_side_counts_from_the_threshold_on(tmp_path):
     frames = [
-        [hand(RIGHT, 0.9, 0.9, 0.6), hand(RIGHT, 0.6, 0.6, 0.8), hand(LEFT, 0.1, 0.2, 0.55), hand(LEFT, 0.3, 0.4, 0.5)],
+        [
+            hand(RIGHT, 0.9, 0.9, 0.6),
+            hand(RIGHT, 0.6, 0.6, 0.8),
+            hand(LEFT, 0.1, 0.2, 0.55),
+            hand(LEFT, 0.3, 0.4, 0.5),
+        ],
         [hand(LEFT, 0.1, 0.2, 0.49), hand(RIGHT, 0.6, 0.6)],
     ]
     _, folder = write_epic(tmp_path, "P01_01", frames)
@@ -76,7 +84,9 @@ def test_long_runs_are_cut_into_equal_pieces_without_losing_a_step(tmp_path, mon
     done = convert(EpicKitchensSource(*write_epic(tmp_path, "P01_01", frames), SHORT), tmp_path, "epic")
     _, episodes = read_back(done.directory, "observation/image")
     assert [[number(i) for i in e.images] for e in episodes] == [[1, 7, 13], [19, 25, 31, 37], [43, 49, 55]]
-    np.testing.assert_allclose(np.concatenate([e.actions for e in episodes]), np.diff(rows(1, 6, 11), axis=0), atol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate([e.actions for e in episodes]), np.diff(rows(1, 6, 11), axis=0), atol=1e-6
+    )
 
 
 def test_a_pickle_that_is_a_program_is_refused_and_not_run(tmp_path):
@@ -89,7 +99,9 @@ def test_a_pickle_that_is_a_program_is_refused_and_not_run(tmp_path):
     frames, folder = write_epic(tmp_path, "P01_01", [moving(1)])
     path = folder / "P01" / "P01_01.pkl"
     path.write_bytes(pickle.dumps([Program()]))
-    with pytest.raises(DataError, match=r"P01_01.pkl: not a pickled list of bytes \(it asks for .*it was not run"):
+    with pytest.raises(
+        DataError, match=r"P01_01.pkl: not a pickled list of bytes \(it asks for .*it was not run"
+    ):
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
     assert not ran.exists()
 
@@ -101,7 +113,10 @@ def test_a_pickle_that_is_a_program_is_refused_and_not_run(tmp_path):
         (pickle.dumps([b"", "text"]), "something else than a list of bytes"),
         (b"not a pickle", "not a pickled list of bytes"),
         (pickle.dumps([detections("P01_01", 1, []), b"\xff\xff"]), "record 1 is no detection message"),
-        (pickle.dumps([detections("P01_01", 1, []), detections("P01_01", 3, [])]), "record 1 is of frame 3, not 2"),
+        (
+            pickle.dumps([detections("P01_01", 1, []), detections("P01_01", 3, [])]),
+            "record 1 is of frame 3, not 2",
+        ),
     ],
 )
 def test_malformed_detections_are_named_to_the_record(tmp_path, content, message):
@@ -123,7 +138,9 @@ def test_frames_that_are_missing_damaged_or_of_another_extraction_are_named(tmp_
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
     frame.write_bytes(whole)
     frame.with_name("frame_0000000031.jpg").write_bytes(whole)
-    with pytest.raises(DataError, match="ends with frame 30: frames and detections are of different extractions"):
+    with pytest.raises(
+        DataError, match="ends with frame 30: frames and detections are of different extractions"
+    ):
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
 
 

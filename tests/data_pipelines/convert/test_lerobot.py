@@ -22,9 +22,6 @@ from tests.data_pipelines.convert.sources import (
     write_video,
 )
 
-pytest.importorskip("pyarrow", reason="the extra 'convert' is not installed")
-pytest.importorskip("av", reason="the extra 'convert' is not installed")
-
 
 @pytest.mark.parametrize("camera", ["video", "image"])
 @pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
@@ -85,7 +82,11 @@ def no_bytes(e, rows):
     [
         (late, "video", r"episode 1: timestamp 0.8000 s at row 5, where 10 frames per second make 0.5000 s"),
         (unknown_task, "video", "episode 0: task_index 7 at row 0 is not among the tasks"),
-        (not_numbers, "video", "episode 0: 'action' is not one array of numbers per row|'action' has the shape"),
+        (
+            not_numbers,
+            "video",
+            "episode 0: 'action' is not one array of numbers per row|'action' has the shape",
+        ),
         (no_bytes, "image", f"episode 0: '{CAMERA}' at row 0 holds neither bytes nor a path"),
         (lambda e, rows: rows.pop("action"), "video", "no column 'action'"),
     ],
@@ -101,7 +102,9 @@ def test_a_video_that_ends_too_early_or_is_none_is_named(tmp_path):
     root = write_lerobot(tmp_path / "toy", "v3.0")
     path = next(root.rglob("*.mp4"))
     write_video(path, list(range(12)), FPS)
-    with pytest.raises(DataError, match=r"file-000.mp4: no frame at 1.2000 s within 0.0501 s: the nearest is at 1.1"):
+    with pytest.raises(
+        DataError, match=r"file-000.mp4: no frame at 1.2000 s within 0.0501 s: the nearest is at 1.1"
+    ):
         convert(LeRobotSource(root), tmp_path, "arm")
     path.write_bytes(b"no video")
     with pytest.raises(DataError, match="file-000.mp4: no readable video"):

@@ -12,8 +12,6 @@ from data_pipelines.errors import DataError
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import demo_actions, number, read_back, write_robomimic
 
-pytest.importorskip("h5py", reason="the extra 'convert' is not installed")
-
 
 def test_demonstrations_keep_their_order_frames_actions_and_success(tmp_path):
     source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5"))

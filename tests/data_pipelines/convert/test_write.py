@@ -134,7 +134,10 @@ def spoil(part, key, value):
     "change, message",
     [
         (spoil("vectors", "action", np.zeros((2, 2))), r"u1/0: 'action' has the shape \[2, 2\], but 3 steps"),
-        (spoil("vectors", "action", np.array([[0, 0], [0, np.nan], [0, 0]])), "u1/0: 'action' is not finite at step 1"),
+        (
+            spoil("vectors", "action", np.array([[0, 0], [0, np.nan], [0, 0]])),
+            "u1/0: 'action' is not finite at step 1",
+        ),
         (spoil("images", "observation/image", [b""]), "u1/0: 1 frames in 'observation/image' for 3 steps"),
         (spoil("rewards", None, np.zeros(9)), r"u1/0: \(9,\) rewards for 3 steps"),
     ],
