@@ -9,7 +9,7 @@ time, whichever action they belong to; a pause longer than `max_gap` seconds end
 annotated frames are not evenly spaced, an episode is sampled at 2 Hz from its first one: frames
 from the video at these times, positions interpolated linearly between annotated frames.
 
-DIFFERS from the release (reference sections 5.4 and 5.5):
+DIFFERS: from the release (reference sections 5.4 and 5.5) in these points:
 * it calls annotated frames an even 1 Hz and joins four actions whatever time lies between them;
 * its images are BGR; here they are RGB;
 * it counts boxes of any kind before it looks for hands; here both hands are required by name;
@@ -54,6 +54,7 @@ class Ego4dSource:
         videos: str | Path,
         settings: Ego4dSettings = Ego4dSettings(),
     ):
+        settings.check()
         self.path, self.videos, self.settings = Path(annotations), Path(videos), settings
         data = self._read()
         if not isinstance(data, dict) or not isinstance(data.get("videos"), list):

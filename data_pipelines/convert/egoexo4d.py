@@ -42,6 +42,7 @@ class EgoExo4dSource:
     hz = HZ
 
     def __init__(self, root: str | Path, settings: EgoExo4dSettings = EgoExo4dSettings()):
+        settings.check()
         self.root, self.settings, self.camera = Path(root), settings, settings.camera
         self._poses = self.root / "annotations" / "ego_pose" / settings.split / "hand" / "automatic"
         takes = _json(self.root / "takes.json", DataError)
@@ -119,7 +120,7 @@ class EgoExo4dSource:
         if abs(video.width / video.height - FULL_SIZE[0] / FULL_SIZE[1]) > 0.02:
             raise UnitError(
                 f"{self.camera}: a downscaled video of {video.width} x {video.height} pixels is no copy of "
-                f"one of {FULL_SIZE[0]} x {FULL_SIZE[1]}, in which poses are given. Fetch the full-scale video."
+                f"one of {FULL_SIZE[0]} x {FULL_SIZE[1]}, in which poses are given. Fetch the full-scale one."
             )
         return np.array(FULL_SIZE, float)
 

@@ -9,7 +9,7 @@ whatever the camera's rate, those of the extension (P01_101 ..) at 50, as the pu
 and durations show; two videos were first extracted at 60 by mistake and are told by their counts.
 Every 6th and every 5th frame is kept, so that all videos become 10 Hz.
 
-DIFFERS from the release (reference sections 5.4 and 5.5):
+DIFFERS: from the release (reference sections 5.4 and 5.5) in these points:
 * it calls the rate 30 Hz; here it is the true one;
 * it takes detection i with frame i, but detections count from 0 and frames from 1;
 * it drops frames without two hands and joins the rest over the gaps into one episode per video;
@@ -54,6 +54,7 @@ class EpicKitchensSource:
         detections: str | Path,
         settings: EpicKitchensSettings = EpicKitchensSettings(),
     ):
+        settings.check()
         self.frames, self.detections, self.settings = Path(frames), Path(detections), settings
         found = sorted(p.name for p in self.frames.glob("P*/rgb_frames/P*_*") if p.is_dir())
         self.units = [video for video in found if self._pickle(video).is_file()]

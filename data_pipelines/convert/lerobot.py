@@ -33,6 +33,7 @@ class LeRobotSource:
     """
 
     def __init__(self, root: str | Path, settings: LeRobotSettings = LeRobotSettings()):
+        settings.check()
         self.root, self.short_side = Path(root), settings.short_side
         self.meta = read_meta(self.root)
         features = self.meta.features

@@ -41,6 +41,7 @@ class RobomimicSource:
     """
 
     def __init__(self, path: str | Path, settings: RobomimicSettings = RobomimicSettings()):
+        settings.check()
         self.path, self.short_side = Path(path), settings.short_side
         self._h5py = require_module("h5py")
         with self._open() as file:
@@ -119,8 +120,8 @@ class RobomimicSource:
         if not there:
             raise DataError(
                 f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a "
-                "low-dimensional or raw file. Download the image file of the task, or render one from its "
-                "states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
+                "low-dimensional or raw file. Download the image file of the task, or render one from "
+                "its states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
             )
         cameras = choose(wanted, there, "camera", where)
         if "actions" not in demo:

@@ -32,7 +32,8 @@ class RobomimicSettings:
     short_side: int | None = None
     """Shrink images to this shorter side."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
         _check_side(self.short_side)
         require(self.hz is None or self.hz > 0, f"hz must be positive, got {self.hz}")
 
@@ -46,7 +47,8 @@ class LeRobotSettings:
     short_side: int | None = None
     """Shrink images to this shorter side."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
         _check_side(self.short_side)
 
 
@@ -61,7 +63,8 @@ class EpicKitchensSettings:
     short_side: int | None = HUMAN_SHORT_SIDE
     """Shrink frames to this shorter side."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
         _check_side(self.short_side)
         require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
 
@@ -77,7 +80,8 @@ class Ego4dSettings:
     short_side: int | None = HUMAN_SHORT_SIDE
     """Shrink frames to this shorter side."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
         _check_side(self.short_side)
         require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
         require(self.max_gap > 0, f"max_gap must be positive, got {self.max_gap}")
@@ -96,6 +100,7 @@ class EgoExo4dSettings:
     short_side: int | None = HUMAN_SHORT_SIDE
     """Shrink frames to this shorter side."""
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
         _check_side(self.short_side)
         require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")

@@ -55,12 +55,12 @@ class Video:
         self.rate = float(self._stream.average_rate or self._stream.guessed_rate or 0)
         self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
 
-    def frames(self, times: Sequence[float], tolerance: float | None = None) -> Iterator[np.ndarray]:
+    def frames(self, times: Sequence[float]) -> Iterator[np.ndarray]:
         """The frame nearest to each of `times` (ascending), uint8 [H, W, 3], RGB.
 
-        Raises UnitError where none lies within `tolerance`, by default half a frame.
+        Raises UnitError where none lies within half a frame's time.
         """
-        near = 0.5 / self.rate + 1e-4 if tolerance is None else tolerance
+        near = 0.5 / self.rate + 1e-4
         source = self._from(times[0]) if len(times) else iter(())
         before: tuple[float, Any] | None = None
         after = next(source, None)

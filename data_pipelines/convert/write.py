@@ -73,8 +73,9 @@ def convert(
     """Writes every episode of `source` into `<out>/<name>/1.0.0`.
 
     The same source and settings again: goes on where it was, or finds it done. With
-    `skip_damaged` damaged units are left out and counted. Raises UnitError for a damaged unit
-    otherwise, DataError if no episode is left, ConfigError for a name or place that cannot be used.
+    `skip_damaged`, which may be added after damage was met, damaged units are left out and
+    counted. Raises UnitError for a damaged unit otherwise, DataError if no episode is left,
+    ConfigError for a name or place that cannot be used.
     """
     require(
         re.fullmatch(r"[a-z][a-z0-9_]*", name) is not None,
@@ -85,7 +86,6 @@ def convert(
         {
             "converter": CONVERTER,
             "name": name,
-            "skip": skip_damaged,
             "shard": shard_bytes,
             **source.identity(),
         }
