@@ -51,20 +51,22 @@ def import_tokens(
     name: str | None = None,
     hz: float | None = None,
     patch: int = 2,
+    frame_step: int | None = None,
     tokenizer: Tokenizer | None = None,
     progress: Progress | None = None,
 ) -> Manifest:
     """Reads a pair of folders into `<store_root>/<name>` and returns the manifest.
 
     The rate is `hz`, else that of the registry's entry `name`; the folders' own is refused, as the
-    release's table is wrong for many. Latents become tokens of `patch` x `patch` cells. With
-    `tokenizer`, which must be the one that made the tokens, validation frames are decoded and kept.
+    release's table is wrong for many. Latents become tokens of `patch` x `patch` cells.
+    `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz frames).
+    With `tokenizer`, which must be the one that made the tokens, validation frames are decoded and kept.
     A dataset that the store has already, made of the same folders in the same way, is left as it is.
     Raises ConfigError for folders that do not belong together or a store that cannot be
     written, DataError for damaged ones.
     """
     folders = {"train": open_folder(train), "val": open_folder(val)}
-    plan = _plan(folders, name, hz, patch, tokenizer)
+    plan = _plan(folders, name, hz, patch, frame_step, tokenizer)
     final = Path(store_root) / plan.spec.name
     if final.exists():
         there = load_manifest(final / FILE)
@@ -112,6 +114,7 @@ def _plan(
     name: str | None,
     hz: float | None,
     patch: int,
+    frame_step: int | None,
     tokenizer: Tokenizer | None,
 ) -> Manifest:
     train, val = folders["train"], folders["val"]
@@ -138,11 +141,16 @@ def _plan(
     )
     # Where these frames came from is not known here, so the keys say no more than what they are.
     spec = DatasetSpec(name, "video", ("actions",), (train.actions.shape[1],), float(rate))
+    frame_step = spec.stride if frame_step is None else frame_step
+    require(
+        frame_step >= 1 and spec.stride % frame_step == 0,
+        f"{name!r}: frame_step {frame_step} does not divide the stride {spec.stride}",
+    )
     mean, std = _moments(train.actions)
     return Manifest(
         spec=spec,
         tokenizer=facts[0],
-        settings=JobSettings(0.0, 0, 0, "none" if tokenizer is None else "val", spec.stride),
+        settings=JobSettings(0.0, 0, 0, "none" if tokenizer is None else "val", frame_step),
         source=_fingerprint(folders),
         source_version="release" if tokenizer is None else "release, frames decoded",
         action_mean=mean,

@@ -122,6 +122,7 @@ def import_tokens(
     name: str | None = None,
     hz: float | None = None,
     patch: int = 2,
+    frame_step: Annotated[int | None, arg(name="frame-step")] = None,
     tokenizer: Path | None = None,
 ) -> None:
     """Read token folders of the official release (video.bin, actions, segment_ids.bin) into a token store.
@@ -135,7 +136,8 @@ def import_tokens(
         name: Name of the dataset, if there is one only; the folders' own if not given.
         hz: Native frames per second, if the registry does not know the dataset.
         patch: Latent cells along one side of a token; of no effect on ids.
+        frame_step: Every how many native frames one is stored; the stride, for frames at 2 Hz, if not given.
         tokenizer: Directory of the tokenizer that made the tokens. It decodes the validation frames that
             evaluation in pixels compares with.
     """
-    commands.import_tokens(folders, store, name, hz, patch, tokenizer)
+    commands.import_tokens(folders, store, name, hz, patch, frame_step, tokenizer)

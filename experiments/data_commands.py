@@ -93,6 +93,7 @@ def import_tokens(
     name: str | None,
     hz: float | None,
     patch: int,
+    frame_step: int | None,
     tokenizer: Path | None,
 ) -> None:
     from data_pipelines.import_tokens import import_tokens as import_pair
@@ -108,7 +109,15 @@ def import_tokens(
     for stem, train, val in pairs:
         with step(f"import {stem}") as update:
             manifest = import_pair(
-                train, val, store, name=name, hz=hz, patch=patch, tokenizer=decoder, progress=update
+                train,
+                val,
+                store,
+                name=name,
+                hz=hz,
+                patch=patch,
+                frame_step=frame_step,
+                tokenizer=decoder,
+                progress=update,
             )
         facts, spec = manifest.tokenizer, manifest.spec
         what = f"latents of {facts.channels} values" if facts.channels else f"ids of {facts.vocab_size:,}"
