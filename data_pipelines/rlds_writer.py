@@ -100,19 +100,18 @@ def build_features(step: Mapping[str, Field], episode: Mapping[str, Field]) -> A
 
 def write_info(
     directory: Path,
-    *,
     name: str,
     features: Any,
     lengths: Sequence[int],
     size: int,
     description: str,
     metadata: Mapping[str, Any],
-    module: str,
+    module: str = "data_pipelines.suite",
 ) -> None:
     """features.json, dataset_info.json and metadata.json, by tfds itself.
 
     `lengths` are records per shard, `size` the bytes of all payloads, `metadata` what
-    metadata.json shall hold.
+    metadata.json shall hold, `module` what made the dataset.
     """
     import tensorflow_datasets as tfds
     from tensorflow_datasets.core.dataset_info import DatasetIdentity

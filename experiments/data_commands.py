@@ -73,7 +73,7 @@ def _convert(source: Source, to: To, default_name: str) -> None:
         _say(f"left out {count:,} x: {reason}")
     _say("to read it, add this entry to data_pipelines/registry.py, unless it has one of this name:")
     _say(f"    {entry(done.spec)}")
-    wrote(done.directory, then=f"hma data inspect {shlex.quote(str(done.directory))}")
+    wrote(done.directory, then=f"hma data inspect {shlex.quote(str(done.directory))} --hz {done.spec.hz:g}")
 
 
 def entry(spec: DatasetSpec) -> str:

@@ -71,7 +71,6 @@ def write_dataset(spec: EmbodimentSpec, directory: Path, *, episodes: int, seed:
         size=size,
         description=f"Simulated embodiment ({spec.kind}, {spec.convention} actions, {spec.hz} Hz).",
         metadata=metadata,
-        module="data_pipelines.suite",
     )
     return frames
 
