@@ -27,6 +27,12 @@ from data_pipelines.scratch import scratch
 from data_pipelines.share import Share
 from hma_jax.config import ConfigError, diff, require, stable_hash
 
+PART_SIZE = 256 * 2**20
+"""Bytes of records in one part: what a killed process has to do again, at most."""
+
+MOST_PARTS = 1024
+"""Parts of a dataset: of one larger than this many times PART_SIZE the parts are larger."""
+
 Progress = Callable[[int, int], None]
 """Called with the episodes done and all, of this process's share."""
 

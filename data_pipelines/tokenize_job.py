@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from data_pipelines.dataset_writer import Progress, cut_parts, write_dataset
+from data_pipelines.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.episode_record import StoredEpisode, token_dtype
 from data_pipelines.errors import EpisodeError
 from data_pipelines.images import fit_image
@@ -37,13 +37,6 @@ from hma_jax.config import require
 if TYPE_CHECKING:
     from data_pipelines.location import Location
     from hma_jax.tokenizers.base import Tokenizer
-
-PART_SIZE = 256 * 2**20
-"""Bytes of records in one part: what a killed process has to do again, at most."""
-
-MOST_PARTS = 1024
-"""Parts of a dataset: of one larger than this many times PART_SIZE the parts are larger."""
-
 
 def tokenize_dataset(
     spec: DatasetSpec,

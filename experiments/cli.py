@@ -21,6 +21,7 @@ from tyro.extras import SubcommandApp
 from experiments import (
     cli_bench,
     cli_convert,
+    cli_data,
     commands,
     model_commands,
     registry_commands,
@@ -254,8 +255,10 @@ def report(out: Path) -> None:
     commands.draw_again(out)
 
 
+data_app.command(cli_data.convert_app, name="convert", help=cli_data.HELP)
+data_app.command(cli_data.import_tokens, name="import-tokens")
 app.command(fit, name="fit")
-app.command(data_app, name="data", help="The registry, what a directory holds, the simulated suite.")
+app.command(data_app, name="data", help="The registry, what a directory holds, other formats, the simulated suite.")
 app.command(tokenizer_app, name="tokenizer", help="The image tokenizer.")
 app.command(cli_convert.convert_app, name="convert", help=cli_convert.HELP)
 app.command(cli_bench.bench_app, name="bench", help=cli_bench.HELP)

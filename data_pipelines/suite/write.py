@@ -1,6 +1,6 @@
 """One dataset of the suite on disk, laid out as tensorflow_datasets writes RLDS.
 
-Owns features, records, shards and metadata of one dataset. What happens in an episode comes
+Owns fields, records and shards of one dataset. What happens in an episode comes
 from `rollout`, its pictures from `render`.
 """
 
@@ -11,17 +11,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import simplejpeg
 
+from data_pipelines import rlds_writer
 from data_pipelines.example import encode_example
+from data_pipelines.rlds_writer import (
+    STEP_FIELDS,
+    TEXT,
+    Field,
+    encode_jpeg,
+    image_field,
+    shard_name,
+    step_features,
+    vector_field,
+    write_info,
+)
 from data_pipelines.suite.appearance import Appearance, draw_appearance
 from data_pipelines.suite.render import frame_index, render_frames
 from data_pipelines.suite.rollout import Rollout, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.tfrecord import write_shard
 
-VERSION = "1.0.0"
-JPEG_QUALITY = 95
 SHARD_FRAMES = 4000
 """About this many native frames go into one shard."""
 
@@ -31,36 +40,12 @@ BLOCK = 16
 
 def build_features(spec: EmbodimentSpec) -> Any:
     """The tfds features of this embodiment's episodes."""
-    # Costs over a second and is not needed to simulate or to read the table.
-    from tensorflow_datasets import features as tf
-
-    def tensor(size: int) -> Any:
-        return tf.Tensor(shape=(size,), dtype=np.float32)
-
-    images = {
-        c.key: tf.Image(shape=(c.height, c.width, 3), dtype=np.uint8, encoding_format="jpeg")
-        for c in spec.cameras
-    }
-    if spec.dict_actions:
-        action = tf.FeaturesDict({key: tensor(dim) for key, dim in spec.action_layout})
-    else:
-        action = tensor(spec.action_dim)
-    step = {
-        "observation": tf.FeaturesDict(images | {"state": tensor(spec.body.size)}),
-        "action": action,
-        "discount": tf.Scalar(dtype=np.float32),
-        "reward": tf.Scalar(dtype=np.float32),
-        "is_first": tf.Scalar(dtype=np.bool_),
-        "is_last": tf.Scalar(dtype=np.bool_),
-        "is_terminal": tf.Scalar(dtype=np.bool_),
-        "language_instruction": tf.Text(),
-    }
-    episode = {
-        "file_path": tf.Text(),
-        "success": tf.Scalar(dtype=np.bool_),
-        "seed": tf.Scalar(dtype=np.int64),
-    }
-    return tf.FeaturesDict({"steps": tf.Dataset(step), "episode_metadata": tf.FeaturesDict(episode)})
+    prefix = "action/" if spec.dict_actions else ""
+    step = {f"observation/{c.key}": image_field(c.height, c.width) for c in spec.cameras}
+    step["observation/state"] = vector_field(spec.body.size)
+    step |= {prefix + key: vector_field(dim) for key, dim in spec.action_layout}
+    episode = {"file_path": Field(TEXT), "success": Field("bool"), "seed": Field("int64")}
+    return rlds_writer.build_features(step | STEP_FIELDS, episode)
 
 
 def write_dataset(spec: EmbodimentSpec, directory: Path, *, episodes: int, seed: int, metadata: dict) -> int:
@@ -74,11 +59,19 @@ def write_dataset(spec: EmbodimentSpec, directory: Path, *, episodes: int, seed:
     bounds = np.linspace(0, episodes, shards + 1).astype(int)
     lengths, size = [], 0
     for k in range(shards):
-        path = directory / f"{spec.name}-train.tfrecord-{k:05d}-of-{shards:05d}"
+        path = directory / shard_name(spec.name, k, shards)
         records = episode_records(spec, rollout, looks, bounds[k], bounds[k + 1], seed)
         lengths.append(write_shard(path, records))
         size += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
-    _write_info(spec, directory, lengths, size, metadata)
+    write_info(
+        directory,
+        name=spec.name,
+        features=build_features(spec),
+        lengths=lengths,
+        size=size,
+        description=f"Simulated embodiment ({spec.kind}, {spec.convention} actions, {spec.hz} Hz).",
+        metadata=metadata,
+    )
     return frames
 
 
@@ -101,60 +94,21 @@ def episode_features(
 ) -> dict[str, np.ndarray | list[bytes]]:
     """Flattened tf.Example features of episode i; `images[key]` is uint8 [T, H, W, 3]."""
     steps = int(rollout.lengths[i])
-    flags = np.zeros((2, steps), np.int64)
-    flags[0, 0] = flags[1, -1] = 1
     reward = np.zeros(steps, np.float32)
     if rollout.success[i]:
         reward[rollout.reached[i]] = 1.0
     features: dict[str, np.ndarray | list[bytes]] = {
+        **step_features(reward, [spec.instruction] * steps),
         "steps/observation/state": rollout.q[i, :steps].astype(np.float32).ravel(),
-        "steps/discount": np.ones(steps, np.float32),
-        "steps/reward": reward,
-        "steps/is_first": flags[0],
-        "steps/is_last": flags[1],
-        "steps/is_terminal": flags[1],
-        "steps/language_instruction": [spec.instruction.encode()] * steps,
         "episode_metadata/file_path": [f"suite/{spec.name}/{i:06d}".encode()],
         "episode_metadata/success": np.array([rollout.success[i]], np.int64),
         "episode_metadata/seed": np.array([seed], np.int64),
     }
     for key, frames in images.items():
-        features[f"steps/observation/{key}"] = [
-            simplejpeg.encode_jpeg(frame, quality=JPEG_QUALITY, colorsubsampling="444") for frame in frames
-        ]
+        features[f"steps/observation/{key}"] = [encode_jpeg(frame) for frame in frames]
     start = 0
     for key, dim in spec.action_layout:
         name = f"steps/action/{key}" if spec.dict_actions else "steps/action"
         features[name] = np.ascontiguousarray(rollout.actions[i, :steps, start : start + dim]).ravel()
         start += dim
     return features
-
-
-def _write_info(spec, directory: Path, lengths: list[int], size: int, metadata: dict) -> None:
-    """features.json, dataset_info.json and metadata.json, by tfds itself."""
-    import tensorflow_datasets as tfds
-    from tensorflow_datasets.core.dataset_info import DatasetIdentity
-
-    features = build_features(spec)
-    identity = DatasetIdentity(
-        name=spec.name,
-        version=tfds.core.Version(VERSION),
-        data_dir=str(directory),
-        module_name="data_pipelines.suite",
-    )
-    template = tfds.core.ShardedFileTemplate(
-        data_dir=directory, dataset_name=spec.name, split="train", filetype_suffix="tfrecord"
-    )
-    split = tfds.core.SplitInfo(
-        name="train", shard_lengths=lengths, num_bytes=size, filename_template=template
-    )
-    info = tfds.core.DatasetInfo(
-        builder=identity,
-        description=f"Simulated embodiment ({spec.kind}, {spec.convention} actions, {spec.hz} Hz).",
-        features=features,
-        metadata=tfds.core.MetadataDict(metadata),
-    )
-    info.set_file_format("tfrecord")
-    info.set_splits(tfds.core.splits.SplitDict([split]))
-    info.write_to_directory(directory)
-    features.save_config(str(directory))

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from data_pipelines.episode_record import StoredEpisode
+from data_pipelines.import_tokens import LATENT_SCALE
 from data_pipelines.moments import Moments, merge_all
+from data_pipelines.release_folder import open_folder
 from data_pipelines.windows import cut_actions, cut_frames, train_windows
 from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.convert.official import official_shapes
@@ -89,26 +91,16 @@ def _check_latents(case: Case, mode: str, first: int) -> None:
 
 # --- Windows -----------------------------------------------------------------------------------
 
-SCALE = 0.18215
-"""What the release multiplies stored latents by."""
-
-
 class OnDisk:
-    """A data set in the release's format."""
+    """A data set in the release's format, its episodes numbered from 0."""
 
-    def __init__(self, folder: Path):
-        meta = json.loads((folder / "metadata.json").read_text())
-        count, dtype = meta["num_images"], np.dtype(meta["token_dtype"])
-        self.segments = np.fromfile(folder / "segment_ids.bin", np.int32)
-        video = np.fromfile(folder / "video.bin", dtype)
-        self.actions = np.fromfile(folder / "actions" / "actions.bin", np.float32).reshape(count, -1)
-        if meta["latent_channels"]:
-            video = video.reshape(count, meta["latent_channels"], meta["h"], meta["w"])
-            self.frames = np.moveaxis(video, 1, -1).astype(np.float32) * np.float32(SCALE)
-        else:
-            self.frames = video.reshape(count, -1)
-        self.ends = np.flatnonzero(np.diff(self.segments, append=-1)) + 1
-        self.firsts = np.concatenate([[0], self.ends[:-1]])
+    def __init__(self, path: Path):
+        folder = open_folder(path)
+        self.actions, self.frames = folder.actions, folder.video.reshape(len(folder.video), -1)
+        if folder.channels:
+            self.frames = np.moveaxis(folder.video, 1, -1).astype(np.float32) * np.float32(LATENT_SCALE)
+        self.firsts, self.ends = folder.bounds[:-1], folder.bounds[1:]
+        self.segments = np.repeat(np.arange(len(folder)), self.ends - self.firsts)
 
 
 def check_windows(case: Case) -> None:

@@ -1,0 +1,75 @@
+"""Episodes of human video: two hands in the image, and where they are next.
+
+A position row is [left x, left y, right x, right y] as fractions of the image's width and height,
+from its top left corner; NaN where a hand is not seen. An episode is a run of frames, evenly
+spaced in time, in each of which both hands are seen; nothing is joined over a gap. Its state is
+the row of the frame, its action is made of this row and the next one, so that the last frame of
+a run is a target only. Long runs are cut into equal pieces without losing a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from data_pipelines.convert.episode import Episode, Layout, LeftOut
+from data_pipelines.rlds_writer import image_field
+
+IMAGE, STATE, ACTION = "observation/image", "observation/state", "action"
+LAYOUT = Layout({IMAGE: image_field(None, None)}, {ACTION: 4, STATE: 4}, knows_success=False)
+
+TEXT = "use both hands"
+
+Reader = Callable[[np.ndarray], list[bytes]]
+"""Encoded frames at these row numbers."""
+
+
+def runs(seen: np.ndarray) -> list[tuple[int, int]]:
+    """[start, stop) of each maximal run of True in bool [N]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], seen, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def both_seen(positions: np.ndarray) -> np.ndarray:
+    """bool [N]: both hands are there, inside the image."""
+    with np.errstate(invalid="ignore"):
+        return ((positions >= 0) & (positions <= 1)).all(axis=1)
+
+
+def displacement(now: np.ndarray, following: np.ndarray) -> np.ndarray:
+    return following - now
+
+
+def destination(now: np.ndarray, following: np.ndarray) -> np.ndarray:
+    del now
+    return following
+
+
+def cut_episodes(
+    positions: np.ndarray,
+    read_frames: Reader,
+    *,
+    action: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    min_frames: int,
+    max_steps: int,
+    origin: Callable[[int], str],
+    text: str = TEXT,
+) -> Iterator[Episode | LeftOut]:
+    """The episodes of [N, 4] positions of evenly spaced frames; `origin` names one by its first row."""
+    for start, stop in runs(both_seen(positions)):
+        if stop - start < min_frames:
+            yield LeftOut(f"fewer than {min_frames} frames in a row with both hands")
+            continue
+        # Equal pieces that share the frame between them: the last action of one leads to the first row
+        # of the next.
+        steps = stop - 1 - start
+        bounds = np.linspace(start, stop - 1, -(-steps // max_steps) + 1).round().astype(int)
+        for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+            rows = positions[first : last + 1]
+            yield Episode(
+                origin=origin(int(first)),
+                images={IMAGE: read_frames(np.arange(first, last))},
+                vectors={STATE: rows[:-1], ACTION: action(rows[:-1], rows[1:])},
+                instructions=[text] * int(last - first),
+            )

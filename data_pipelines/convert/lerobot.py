@@ -1,0 +1,209 @@
+"""LeRobot datasets, versions 2.0, 2.1 and 3.0: parquet tables with videos or images.
+
+Row t of an episode was recorded at t / fps seconds; its camera frame is the one that the video
+shows at the row's timestamp (plus, in 3.0, the time at which the episode begins in its file).
+Cameras become `observation/<name>`, other numeric features vectors under `observation/` and
+`action`; texts follow `task_index`. Success is the last `next.success`, where there is one.
+Depth cameras are left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.convert.episode import Episode, Layout, UnitError, choose
+from data_pipelines.convert.lerobot_meta import EpisodeEntry, read_meta, read_table
+from data_pipelines.convert.settings import LeRobotSettings
+from data_pipelines.convert.video import ADVICE, open_video, shrink, stored_jpeg
+from data_pipelines.errors import DataError
+from data_pipelines.rlds_writer import encode_jpeg, image_field
+
+SUCCESS, REWARD = "next.success", "next.reward"
+
+
+class LeRobotSource:
+    """Cameras go by their full or short name, `observation.images.top` or `top`.
+
+    Raises DataError for a directory that is no such dataset, ConfigError for an unknown camera.
+    """
+
+    def __init__(self, root: str | Path, settings: LeRobotSettings = LeRobotSettings()):
+        settings.check()
+        self.root, self.short_side = Path(root), settings.short_side
+        self.meta = read_meta(self.root)
+        features = self.meta.features
+        there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
+        if not there:
+            raise DataError(
+                f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels."
+            )
+        wanted = [_short(camera) for camera in settings.camera]
+        names = choose(wanted, tuple(there), "camera", str(self.root))
+        self._cameras = {f"observation/{name}": there[name] for name in names}
+        self._vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
+        if "action" not in {key.partition("/")[0] for key in self._vectors}:
+            raise DataError(
+                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among "
+                f"{', '.join(features)}."
+            )
+        sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self._vectors.items()}
+        self.layout = Layout({k: image_field(None, None) for k in self._cameras}, sizes, SUCCESS in features)
+        self.hz = self.meta.fps
+        self.units = [f"episode {entry.index}" for entry in self.meta.episodes]
+        self.description = f"LeRobot dataset {self.root.name} ({self.meta.version}), {self.hz:g} Hz."
+        self._open_table: tuple[Path, Any] | None = None
+
+    def identity(self) -> dict[str, Any]:
+        files = {e.data for e in self.meta.episodes} | {
+            f for e in self.meta.episodes for f, _ in e.videos.values()
+        }
+        sizes = {str(f.relative_to(self.root)): f.stat().st_size if f.exists() else -1 for f in sorted(files)}
+        return {
+            "format": self.meta.version,
+            "root": self.root.name,
+            "files": sizes,
+            "features": json.dumps(self.meta.features, sort_keys=True),
+            "cameras": list(self._cameras),
+            "hz": self.hz,
+            "short_side": self.short_side,
+        }
+
+    def read(self, unit: int) -> Iterator[Episode]:
+        entry = self.meta.episodes[unit]
+        where = f"{entry.data}: episode {entry.index}"
+        table = self._rows(entry)
+        steps = table.num_rows
+        if steps != entry.length:
+            raise UnitError(f"{where} has {steps} rows, but the meta folder says {entry.length}. {ADVICE}")
+        times = self._times(table, where)
+        images = {key: self._images(entry, name, table, times, where) for key, name in self._cameras.items()}
+        vectors = {key: self._numbers(table, name, where) for key, name in self._vectors.items()}
+        success = None
+        if SUCCESS in self.meta.features:
+            success = bool(self._numbers(table, SUCCESS, where)[-1].any())
+        has_reward = REWARD in table.column_names
+        yield Episode(
+            origin=f"{self.root.name}/episode_{entry.index:06d}",
+            images=images,
+            vectors=vectors,
+            instructions=self._texts(entry, table, where),
+            rewards=self._numbers(table, REWARD, where)[:, 0] if has_reward else None,
+            success=success,
+        )
+
+    def _rows(self, entry: EpisodeEntry) -> Any:
+        """The episode's rows, in order; the last file is kept, as its neighbours lie in it too."""
+        if self._open_table is None or self._open_table[0] != entry.data:
+            self._open_table = None  # freed before the next one is read
+            names = ["episode_index", "frame_index", "timestamp", "task_index", SUCCESS, REWARD]
+            names += [*self._vectors.values(), *self._cameras.values()]
+            try:
+                table = read_table(entry.data)
+            except DataError as error:
+                raise UnitError(str(error)) from error
+            missing = [
+                n
+                for n in ("episode_index", "timestamp", *self._vectors.values())
+                if n not in table.column_names
+            ]
+            if missing:
+                raise UnitError(f"{entry.data}: no column {missing[0]!r}. {ADVICE}")
+            self._open_table = entry.data, table.select([n for n in names if n in table.column_names])
+        table = self._open_table[1]
+        mask = np.asarray(table["episode_index"]) == entry.index
+        rows = np.flatnonzero(mask)
+        if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
+            raise UnitError(
+                f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}"
+            )
+        return table.slice(int(rows[0]), len(rows))
+
+    def _times(self, table: Any, where: str) -> np.ndarray:
+        """Seconds since the episode's first frame. Raises UnitError for a row out of step."""
+        times = np.asarray(table["timestamp"], np.float64)
+        expected = np.arange(len(times)) / self.hz
+        wrong = np.flatnonzero(~(np.abs(times - expected) < 0.5 / self.hz))
+        if len(wrong):
+            row = int(wrong[0])
+            raise UnitError(
+                f"{where}: timestamp {times[row]:.4f} s at row {row}, where {self.hz:g} frames per second "
+                f"make {expected[row]:.4f} s. {ADVICE}"
+            )
+        return times
+
+    def _images(
+        self, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str
+    ) -> list[bytes]:
+        if name in entry.videos:
+            path, begin = entry.videos[name]
+            with open_video(path) as video:
+                return [encode_jpeg(shrink(f, self.short_side)) for f in video.frames(times + begin)]
+        if name not in table.column_names:
+            raise UnitError(f"{where} has no column {name!r}, though the feature is an image. {ADVICE}")
+        images = []
+        for row, value in enumerate(table[name].to_pylist()):
+            here = f"{where}: {name!r} at row {row}"
+            images.append(stored_jpeg(self._image_bytes(value, here), self.short_side, here))
+        return images
+
+    def _image_bytes(self, value: Any, where: str) -> bytes:
+        """The bytes of an image, which lie in the table or in a file that it names."""
+        if isinstance(value, dict) and value.get("bytes"):
+            return value["bytes"]
+        if isinstance(value, dict) and value.get("path"):
+            path = self.root / value["path"]
+            try:
+                return path.read_bytes()
+            except OSError as error:
+                raise UnitError(f"{where}: {path} cannot be read ({error.strerror}). {ADVICE}") from error
+        raise UnitError(f"{where} holds neither bytes nor a path. {ADVICE}")
+
+    def _numbers(self, table: Any, name: str, where: str) -> np.ndarray:
+        """float64 [N, size] of a feature."""
+        try:
+            rows = np.asarray(table[name].to_pylist(), np.float64)
+        except (TypeError, ValueError) as error:
+            raise UnitError(
+                f"{where}: {name!r} is not one array of numbers per row ({error}). {ADVICE}"
+            ) from error
+        return rows.reshape(len(rows), -1)
+
+    def _texts(self, entry: EpisodeEntry, table: Any, where: str) -> list[str]:
+        if "task_index" not in table.column_names or not self.meta.tasks:
+            return [entry.tasks[0] if entry.tasks else ""] * table.num_rows
+        indices = table["task_index"].to_pylist()
+        unknown = [(row, i) for row, i in enumerate(indices) if i not in self.meta.tasks]
+        if unknown:
+            row, index = unknown[0]
+            raise UnitError(
+                f"{where}: task_index {index} at row {row} is not among the tasks of meta. {ADVICE}"
+            )
+        return [self.meta.tasks[i] for i in indices]
+
+
+def _is_camera(feature: dict[str, Any]) -> bool:
+    depth = (feature.get("info") or feature.get("video_info") or {}).get("video.is_depth_map", False)
+    return feature.get("dtype") in ("video", "image") and 3 in feature.get("shape", (3,)) and not depth
+
+
+def _is_vector(key: str, feature: dict[str, Any]) -> bool:
+    numeric = str(feature.get("dtype")).startswith(("float", "int", "uint", "bool"))
+    return numeric and key.partition(".")[0] in ("action", "observation")
+
+
+def _short(camera: str) -> str:
+    return camera.removeprefix("observation.").removeprefix("images.").replace(".", "_")
+
+
+def _key(feature: str) -> str:
+    """`observation.state` -> `observation/state`, `action` and `action.arm` -> `action`, `action_arm`."""
+    head, _, rest = feature.partition(".")
+    rest = rest.replace(".", "_").replace("/", "_")
+    if head == "observation":
+        return f"observation/{rest}"
+    return f"action_{rest}" if rest else head

@@ -1,0 +1,180 @@
+"""Robomimic demonstrations: one HDF5 file of `data/demo_*`, with camera images.
+
+Per demonstration of N steps: `actions` [N, A], `obs/<camera>_image` uint8 [N, H, W, 3] before each
+action, other `obs/*` as vectors, `states` of the simulator, `rewards` and `dones` [N].
+`mask/<key>` names demonstrations, such as the training ones (`train`, `valid`). The rate is the
+environment's `control_freq`: 20 Hz for every task that was published.
+DIFFERS: the release takes states only, renders them at 128 pixels, calls the rate 6 Hz, and has a
+held-out split of one task (reference sections 5.4 and 5.5); here episodes keep their images, state
+and rate, and the held-out ones are drawn by hash.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.convert.episode import Episode, Layout, UnitError, choose, require_module
+from data_pipelines.convert.settings import RobomimicSettings
+from data_pipelines.convert.video import shrink
+from data_pipelines.errors import DataError
+from data_pipelines.rlds_writer import encode_jpeg, image_field
+from hma_jax.config import ConfigError
+
+CONTROL_RATE = 20.0
+SUCCESS_REWARD = 1.0
+"""robosuite's reward of a solved task, sparse or shaped; shaping alone stays below it."""
+
+ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damaged."
+
+
+class RobomimicSource:
+    """Opens the file once to learn its layout, and again for each demonstration.
+
+    Raises DataError for a file of another layout or without images, ConfigError for a camera or
+    mask that it lacks.
+    """
+
+    def __init__(self, path: str | Path, settings: RobomimicSettings = RobomimicSettings()):
+        settings.check()
+        self.path, self.short_side = Path(path), settings.short_side
+        self._h5py = require_module("h5py")
+        with self._open() as file:
+            if "data" not in file:
+                raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
+            args = _env_args(self.path, file["data"].attrs.get("env_args"))
+            self.units = _demonstrations(self.path, file, settings.filter_key)
+            self.layout, self.cameras = self._read_layout(file["data"][self.units[0]], settings.camera)
+        self.task = str(args.get("env_name", "robomimic"))
+        self.hz = float(settings.hz or args.get("env_kwargs", {}).get("control_freq") or CONTROL_RATE)
+        self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
+
+    def identity(self) -> dict[str, Any]:
+        return {
+            "format": "robomimic",
+            "file": [self.path.name, self.path.stat().st_size],
+            "units": list(self.units),
+            "cameras": list(self.cameras),
+            "hz": self.hz,
+            "short_side": self.short_side,
+        }
+
+    def read(self, unit: int) -> Iterator[Episode]:
+        name = self.units[unit]
+        where = f"{self.path}: data/{name}"
+        with self._open() as file:
+            demo = file["data"][name]
+            actions = self._array(demo, "actions", where)
+            steps = len(actions)
+            images = {}
+            for camera in self.cameras:
+                frames = self._array(demo, f"obs/{camera}_image", where)
+                if (
+                    frames.dtype != np.uint8
+                    or frames.ndim != 4
+                    or frames.shape[3] != 3
+                    or len(frames) != steps
+                ):
+                    raise UnitError(
+                        f"{where}/obs/{camera}_image is {frames.dtype} {list(frames.shape)}; {steps} actions "
+                        f"need uint8 images [{steps}, H, W, 3]. {ADVICE}"
+                    )
+                images[f"observation/{camera}"] = [encode_jpeg(shrink(f, self.short_side)) for f in frames]
+            vectors = {"action": actions.reshape(steps, -1)}
+            for key in self.layout.vectors:
+                if key != "action":
+                    rows = self._array(demo, _source_key(key), where)
+                    vectors[key] = rows.reshape(len(rows), -1)
+            rewards = np.asarray(demo["rewards"]) if "rewards" in demo else None
+            dones = np.asarray(demo["dones"]) if "dones" in demo else None
+        yield Episode(
+            origin=f"{self.path.name}/data/{name}",
+            images=images,
+            vectors=vectors,
+            instructions=[self.task] * steps,
+            rewards=rewards,
+            success=succeeded(rewards, dones),
+        )
+
+    def _open(self) -> Any:
+        try:
+            return self._h5py.File(self.path, "r")
+        except OSError as error:
+            raise DataError(f"{self.path}: no readable HDF5 file ({error}). Fetch it again.") from error
+
+    def _array(self, demo: Any, key: str, where: str) -> np.ndarray:
+        try:
+            return np.asarray(demo[key])
+        except (KeyError, OSError) as error:
+            raise UnitError(f"{where}/{key} cannot be read ({error}). {ADVICE}") from error
+
+    def _read_layout(self, demo: Any, wanted: tuple[str, ...]) -> tuple[Layout, tuple[str, ...]]:
+        where = f"{self.path}: {demo.name.lstrip('/')}"
+        obs = demo.get("obs", {})
+        there = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
+        if not there:
+            raise DataError(
+                f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a "
+                "low-dimensional or raw file. Download the image file of the task, or render one from "
+                "its states with robomimic's dataset_states_to_obs.py --camera_names agentview robot0_eye_in_hand."
+            )
+        cameras = choose(wanted, there, "camera", where)
+        if "actions" not in demo:
+            raise DataError(f"{where} has no 'actions'; this is not a robomimic file.")
+        vectors = {"action": int(np.prod(demo["actions"].shape[1:]))}
+        for key in sorted(obs):
+            if np.dtype(obs[key].dtype).kind == "f" and obs[key].ndim <= 2:
+                vectors[f"observation/{key}"] = int(np.prod(obs[key].shape[1:]))
+        if "states" in demo and demo["states"].ndim == 2 and demo["states"].shape[1]:
+            vectors["observation/sim_state"] = int(demo["states"].shape[1])
+        images = {f"observation/{c}": image_field(None, None) for c in cameras}
+        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras
+
+
+def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | None:
+    """Whether a demonstration reached its goal; None if the file does not say.
+
+    By its rewards where it has them: `dones` also marks the end of a failed demonstration when a
+    file was extracted with `--done_mode 1` or 2.
+    """
+    if rewards is not None:
+        return bool(np.max(rewards, initial=0) >= SUCCESS_REWARD)
+    return None if dones is None else bool(np.max(dones, initial=0) > 0)
+
+
+def _source_key(key: str) -> str:
+    return "states" if key == "observation/sim_state" else f"obs/{key.removeprefix('observation/')}"
+
+
+def _env_args(path: Path, text: Any) -> dict[str, Any]:
+    if text is None:
+        return {}
+    try:
+        args = json.loads(text)
+    except ValueError as error:
+        raise DataError(f"{path}: the attribute env_args of 'data' is no JSON ({error}).") from error
+    return args if isinstance(args, dict) else {}
+
+
+def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:
+    """Names in the order of their numbers."""
+    there = [name for name in file["data"] if re.fullmatch(r"demo_\d+", name)]
+    if not there:
+        raise DataError(f"{path}: no demonstration 'data/demo_*' in it.")
+    if filter_key is not None:
+        masks = sorted(file["mask"]) if "mask" in file else []
+        if filter_key not in masks:
+            raise ConfigError(f"{path}: no mask {filter_key!r}; it has {', '.join(masks) or 'none'}.")
+        chosen = [n.decode() if isinstance(n, bytes) else str(n) for n in file["mask"][filter_key][()]]
+        missing = sorted(set(chosen) - set(there))
+        if missing:
+            raise DataError(f"{path}: mask/{filter_key} names {missing[0]!r}, which 'data' does not have.")
+        if not chosen:
+            raise DataError(f"{path}: mask/{filter_key} names no demonstration.")
+        there = chosen
+    return sorted(there, key=lambda name: int(name.removeprefix("demo_")))

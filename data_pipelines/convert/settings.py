@@ -1,0 +1,106 @@
+"""What a conversion may choose, per format. Needs no library, so that the command line can read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import arg
+
+from hma_jax.config import require
+
+HUMAN_SHORT_SIDE = 256
+"""Pixels of the shorter side of frames of human video: what the release's tokenizers see."""
+
+Cameras = Annotated[tuple[str, ...], arg(metavar="[NAME ...]")]
+
+
+def _check_side(short_side: int | None) -> None:
+    require(short_side is None or short_side >= 8, f"short_side must be at least 8 pixels, got {short_side}")
+
+
+@dataclass(frozen=True)
+class RobomimicSettings:
+    """What is taken of the file."""
+
+    camera: Cameras = ()
+    """Cameras to keep, such as agentview; all if not given."""
+    filter_key: str | None = None
+    """Take the demonstrations of this mask only."""
+    hz: float | None = None
+    """Control rate; the file's own, or 20, if not given."""
+    short_side: int | None = None
+    """Shrink images to this shorter side."""
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
+        _check_side(self.short_side)
+        require(self.hz is None or self.hz > 0, f"hz must be positive, got {self.hz}")
+
+
+@dataclass(frozen=True)
+class LeRobotSettings:
+    """What is taken of the dataset."""
+
+    camera: Cameras = ()
+    """Cameras to keep, such as top; all if not given."""
+    short_side: int | None = None
+    """Shrink images to this shorter side."""
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
+        _check_side(self.short_side)
+
+
+@dataclass(frozen=True)
+class EpicKitchensSettings:
+    """Which frames make episodes."""
+
+    min_score: float = 0.5
+    """A detection counts from this score on; the authors of the detections advise 0.5."""
+    min_frames: int = 61
+    """Shortest run of frames with both hands that makes an episode: 61 at 10 Hz are 6 s."""
+    short_side: int | None = HUMAN_SHORT_SIDE
+    """Shrink frames to this shorter side."""
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
+        _check_side(self.short_side)
+        require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
+
+
+@dataclass(frozen=True)
+class Ego4dSettings:
+    """Which frames make episodes."""
+
+    max_gap: float = 1.0
+    """Longest pause between annotated frames of one episode, in seconds."""
+    min_frames: int = 16
+    """Shortest episode, in frames at 2 Hz."""
+    short_side: int | None = HUMAN_SHORT_SIDE
+    """Shrink frames to this shorter side."""
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
+        _check_side(self.short_side)
+        require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")
+        require(self.max_gap > 0, f"max_gap must be positive, got {self.max_gap}")
+
+
+@dataclass(frozen=True)
+class EgoExo4dSettings:
+    """Which takes and frames make episodes."""
+
+    camera: str = "cam01"
+    """The fixed camera."""
+    split: str = "train"
+    """Which annotations: train, val or test."""
+    min_frames: int = 300
+    """Shortest run of labelled frames that makes an episode: 300 at 30 Hz are 10 s."""
+    short_side: int | None = HUMAN_SHORT_SIDE
+    """Shrink frames to this shorter side."""
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot work."""
+        _check_side(self.short_side)
+        require(self.min_frames >= 2, f"min_frames must be at least 2, got {self.min_frames}")

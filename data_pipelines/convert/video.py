@@ -1,0 +1,124 @@
+"""Frames of a video at given times, and frames as the bytes that a record holds.
+
+Owns decoding through PyAV (extra `convert`) and the size of what is stored. Times are seconds
+since the video's first frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from data_pipelines.convert.episode import UnitError, require_module
+from data_pipelines.images import decode_image
+from data_pipelines.rlds_writer import encode_jpeg
+
+ADVICE = "Fetch the file again, or leave it out with --skip-damaged."
+
+
+def shrink(image: np.ndarray, short_side: int | None) -> np.ndarray:
+    """`image`, uint8 [H, W, 3], antialiased down to `short_side`; never enlarged."""
+    height, width = image.shape[:2]
+    if short_side is None or min(height, width) <= short_side:
+        return image
+    scale = short_side / min(height, width)
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    return np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BILINEAR))
+
+
+def stored_jpeg(data: bytes, short_side: int | None, where: str) -> bytes:
+    """An encoded image as it is stored: its own bytes where they are a JPEG small enough.
+
+    Raises UnitError, naming `where`, if the bytes are no image.
+    """
+    try:
+        image = decode_image(data)
+    except ValueError as error:
+        raise UnitError(f"{where} cannot be decoded: {error}. {ADVICE}") from error
+    small = shrink(image, short_side)
+    return data if small is image and data.startswith(b"\xff\xd8\xff") else encode_jpeg(small)
+
+
+class Video:
+    """An opened video. `rate` in frames per second, `width` and `height` in pixels."""
+
+    def __init__(self, path: Path, container: Any):
+        self._path, self._container = path, container
+        self._stream = container.streams.video[0]
+        self._stream.thread_type = "AUTO"
+        self._start = self._stream.start_time or 0
+        self.rate = float(self._stream.average_rate or self._stream.guessed_rate or 0)
+        self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
+
+    def frames(self, times: Sequence[float]) -> Iterator[np.ndarray]:
+        """The frame nearest to each of `times` (ascending), uint8 [H, W, 3], RGB.
+
+        Raises UnitError where none lies within half a frame's time.
+        """
+        near = 0.5 / self.rate + 1e-4
+        source = self._from(times[0]) if len(times) else iter(())
+        before: tuple[float, Any] | None = None
+        after = next(source, None)
+        shown, pixels = None, None
+        for time in times:
+            while after is not None and after[0] < time:
+                before, after = after, next(source, None)
+            nearest = min(
+                (f for f in (before, after) if f is not None), key=lambda f: abs(f[0] - time), default=None
+            )
+            if nearest is None or abs(nearest[0] - time) > near:
+                found = (
+                    "the video has no frame" if nearest is None else f"the nearest is at {nearest[0]:.4f} s"
+                )
+                raise UnitError(
+                    f"{self._path}: no frame at {time:.4f} s within {near:.4f} s: {found}. {ADVICE}"
+                )
+            if nearest[1] is not shown:
+                shown, pixels = nearest[1], nearest[1].to_ndarray(format="rgb24")
+            yield pixels
+
+    def _from(self, time: float) -> Iterator[tuple[float, Any]]:
+        """(time, frame) in order, beginning at or before `time`."""
+        base = float(self._stream.time_base)
+        for target in (self._start + int(max(time - 0.5 / self.rate, 0) / base), None):
+            # Where the index of a file misleads, decode it from its beginning.
+            self._container.seek(
+                self._start if target is None else target, stream=self._stream, backward=True
+            )
+            frames = self._decode(base)
+            first = next(frames, None)
+            if first is not None and (first[0] <= time or target is None):
+                yield first
+                yield from frames
+                return
+
+    def _decode(self, base: float) -> Iterator[tuple[float, Any]]:
+        import av
+
+        try:
+            for frame in self._container.decode(self._stream):
+                yield (frame.pts - self._start) * base, frame
+        except (av.FFmpegError, TypeError) as error:  # TypeError: a frame without a time
+            raise UnitError(f"{self._path}: it cannot be decoded ({error}). {ADVICE}") from error
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[Video]:
+    """Raises UnitError for a file that is missing or no video."""
+    av = require_module("av")
+    try:
+        container = av.open(str(path))
+    except (OSError, av.FFmpegError) as error:
+        raise UnitError(f"{path}: no readable video ({error}). {ADVICE}") from error
+    with container:
+        if not container.streams.video:
+            raise UnitError(f"{path}: it has no video stream. {ADVICE}")
+        video = Video(path, container)
+        if not video.rate:
+            raise UnitError(f"{path}: it does not say how many frames it has per second. {ADVICE}")
+        yield video

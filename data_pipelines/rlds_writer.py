@@ -1,0 +1,137 @@
+"""An RLDS directory as tfds lays it out: the schema, a step's flags, and the files beside the shards.
+
+Owns what every writer of episodes shares; which fields a dataset has and what is in them is the
+writer's own business. Records are `example.encode_example`, shards `tfrecord.write_shard`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import simplejpeg
+
+VERSION = "1.0.0"
+JPEG_QUALITY = 95
+
+IMAGE, TEXT = "image", "text"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One feature: an image (`encoding` jpeg or png), text, or an array of `dtype`."""
+
+    dtype: str
+    shape: tuple[int | None, ...] = ()
+    encoding: str = "jpeg"
+
+
+def image_field(height: int | None, width: int | None, encoding: str = "jpeg") -> Field:
+    """An RGB image; None for sizes that differ between episodes."""
+    return Field(IMAGE, (height, width, 3), encoding)
+
+
+def vector_field(size: int) -> Field:
+    return Field("float32", (size,))
+
+
+STEP_FIELDS = {
+    "discount": Field("float32"),
+    "reward": Field("float32"),
+    "is_first": Field("bool"),
+    "is_last": Field("bool"),
+    "is_terminal": Field("bool"),
+    "language_instruction": Field(TEXT),
+}
+"""What every step has besides observations and actions."""
+
+
+def step_features(rewards: np.ndarray, instructions: Sequence[str]) -> dict[str, np.ndarray | list[bytes]]:
+    """The flat features of `STEP_FIELDS` for an episode of len(rewards) steps."""
+    steps = len(rewards)
+    first, last = np.zeros(steps, np.int64), np.zeros(steps, np.int64)
+    first[0] = last[-1] = 1
+    return {
+        "steps/discount": np.ones(steps, np.float32),
+        "steps/reward": np.asarray(rewards, np.float32),
+        "steps/is_first": first,
+        "steps/is_last": last,
+        "steps/is_terminal": last,
+        "steps/language_instruction": [text.encode() for text in instructions],
+    }
+
+
+def encode_jpeg(frame: np.ndarray) -> bytes:
+    """JPEG of uint8 [H, W, 3], RGB, without chroma subsampling."""
+    return simplejpeg.encode_jpeg(frame, quality=JPEG_QUALITY, colorsubsampling="444")
+
+
+def shard_name(dataset: str, index: int, count: int) -> str:
+    return f"{dataset}-train.tfrecord-{index:05d}-of-{count:05d}"
+
+
+def build_features(step: Mapping[str, Field], episode: Mapping[str, Field]) -> Any:
+    """The tfds features of episodes; keys such as `observation/image` nest at each slash."""
+    # Costs over a second and is needed only where a dataset is finished.
+    from tensorflow_datasets import features as tf
+
+    def leaf(field: Field) -> Any:
+        if field.dtype == IMAGE:
+            return tf.Image(shape=field.shape, dtype=np.uint8, encoding_format=field.encoding)
+        if field.dtype == TEXT:
+            return tf.Text()
+        dtype = np.dtype(field.dtype).type
+        return tf.Tensor(shape=field.shape, dtype=dtype) if field.shape else tf.Scalar(dtype=dtype)
+
+    def nest(fields: Mapping[str, Field]) -> Any:
+        groups: dict[str, dict[str, Field]] = {}
+        for key, field in fields.items():
+            head, _, rest = key.partition("/")
+            groups.setdefault(head, {})[rest] = field
+        return tf.FeaturesDict(
+            {head: leaf(inner[""]) if "" in inner else nest(inner) for head, inner in groups.items()}
+        )
+
+    return tf.FeaturesDict({"steps": tf.Dataset(nest(step)), "episode_metadata": nest(episode)})
+
+
+def write_info(
+    directory: Path,
+    name: str,
+    features: Any,
+    lengths: Sequence[int],
+    size: int,
+    description: str,
+    metadata: Mapping[str, Any],
+    module: str = "data_pipelines.suite",
+) -> None:
+    """features.json, dataset_info.json and metadata.json, by tfds itself.
+
+    `lengths` are records per shard, `size` the bytes of all payloads, `metadata` what
+    metadata.json shall hold, `module` what made the dataset.
+    """
+    import tensorflow_datasets as tfds
+    from tensorflow_datasets.core.dataset_info import DatasetIdentity
+
+    identity = DatasetIdentity(
+        name=name, version=tfds.core.Version(VERSION), data_dir=str(directory), module_name=module
+    )
+    template = tfds.core.ShardedFileTemplate(
+        data_dir=directory, dataset_name=name, split="train", filetype_suffix="tfrecord"
+    )
+    split = tfds.core.SplitInfo(
+        name="train", shard_lengths=list(lengths), num_bytes=size, filename_template=template
+    )
+    info = tfds.core.DatasetInfo(
+        builder=identity,
+        description=description,
+        features=features,
+        metadata=tfds.core.MetadataDict(metadata),
+    )
+    info.set_file_format("tfrecord")
+    info.set_splits(tfds.core.splits.SplitDict([split]))
+    info.write_to_directory(directory)
+    features.save_config(str(directory))

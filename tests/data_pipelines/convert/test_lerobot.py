@@ -1,0 +1,143 @@
+"""LeRobot directories of three versions, with videos and with images: alignment, texts, refusals."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from data_pipelines.convert.lerobot import LeRobotSource
+from data_pipelines.convert.settings import LeRobotSettings
+from data_pipelines.convert.write import convert
+from data_pipelines.errors import DataError
+from hma_jax.config import ConfigError
+from tests.data_pipelines.convert.sources import (
+    CAMERA,
+    FPS,
+    lerobot_actions,
+    number,
+    read_back,
+    write_lerobot,
+    write_video,
+)
+
+
+@pytest.mark.parametrize("camera", ["video", "image"])
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+def test_rows_frames_and_texts_stay_together(tmp_path, version, camera):
+    source = LeRobotSource(write_lerobot(tmp_path / "toy", version, camera=camera))
+    done = convert(source, tmp_path, "arm")
+    assert done.spec.hz == FPS and done.spec.image_key == "observation/top" and done.spec.action_dims == (3,)
+    dataset, episodes = read_back(done.directory, "observation/top")
+    assert [e.success for e in episodes] == [True, False]
+    for e, (steps, episode) in enumerate(zip((12, 9), episodes, strict=True)):
+        assert [number(image) for image in episode.images] == [24 * e + t for t in range(steps)]
+        np.testing.assert_array_equal(episode.actions, lerobot_actions(e, steps))
+        record = dataset.record(e)
+        assert record["steps/language_instruction"] == [[b"push", b"stack"][e]] * steps
+        assert record["steps/observation/state"].reshape(steps, 2).tolist() == [[e, t] for t in range(steps)]
+        assert record["steps/reward"].tolist() == [0] * (steps - 1) + [1]
+
+
+def test_a_camera_and_a_size_can_be_chosen(tmp_path):
+    root = write_lerobot(tmp_path / "toy", "v3.0")
+    for camera in ("top", CAMERA):
+        source = LeRobotSource(root, LeRobotSettings((camera,), short_side=18))
+        assert list(source.layout.images) == ["observation/top"]
+    assert next(source.read(1)).images["observation/top"] and source.units == ["episode 0", "episode 1"]
+    _, episodes = read_back(convert(source, tmp_path, "arm").directory, "observation/top")
+    assert episodes[0].images[0].shape == (18, 32, 3)
+    with pytest.raises(ConfigError, match="no camera 'wrist'; it has top"):
+        LeRobotSource(root, LeRobotSettings(("wrist",)))
+
+
+def late(e, rows):
+    import pyarrow as pa
+
+    if e == 1:
+        rows["timestamp"] = pa.array((np.arange(9) / FPS + (np.arange(9) > 4) * 0.3).astype(np.float32))
+
+
+def unknown_task(e, rows):
+    import pyarrow as pa
+
+    rows["task_index"] = pa.array([7] * len(rows["task_index"]))
+
+
+def not_numbers(e, rows):
+    import pyarrow as pa
+
+    rows["action"] = pa.array([None] * len(rows["task_index"]), pa.list_(pa.float32()))
+
+
+def no_bytes(e, rows):
+    import pyarrow as pa
+
+    rows[CAMERA] = pa.array([{"bytes": b"", "path": None}] * len(rows["task_index"]))
+
+
+@pytest.mark.parametrize(
+    "change, camera, message",
+    [
+        (late, "video", r"episode 1: timestamp 0.8000 s at row 5, where 10 frames per second make 0.5000 s"),
+        (unknown_task, "video", "episode 0: task_index 7 at row 0 is not among the tasks"),
+        (
+            not_numbers,
+            "video",
+            "episode 0: 'action' is not one array of numbers per row|'action' has the shape",
+        ),
+        (no_bytes, "image", f"episode 0: '{CAMERA}' at row 0 holds neither bytes nor a path"),
+        (lambda e, rows: rows.pop("action"), "video", "no column 'action'"),
+    ],
+)
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_malformed_tables_are_named_to_row_and_field(tmp_path, version, change, camera, message):
+    source = LeRobotSource(write_lerobot(tmp_path / "toy", version, camera=camera, change=change))
+    with pytest.raises(DataError, match=message):
+        convert(source, tmp_path, "arm")
+
+
+def test_a_video_that_ends_too_early_or_is_none_is_named(tmp_path):
+    root = write_lerobot(tmp_path / "toy", "v3.0")
+    path = next(root.rglob("*.mp4"))
+    write_video(path, list(range(12)), FPS)
+    with pytest.raises(
+        DataError, match=r"file-000.mp4: no frame at 1.2000 s within 0.0501 s: the nearest is at 1.1"
+    ):
+        convert(LeRobotSource(root), tmp_path, "arm")
+    path.write_bytes(b"no video")
+    with pytest.raises(DataError, match="file-000.mp4: no readable video"):
+        convert(LeRobotSource(root), tmp_path, "arm")
+    done = pytest.raises(DataError, convert, LeRobotSource(root), tmp_path, "arm", skip_damaged=True)
+    assert "no episode can be made of it: 2 x" in str(done.value)
+
+
+def test_length_and_rows_must_agree(tmp_path):
+    root = write_lerobot(tmp_path / "toy", "v2.1")
+    lines = (root / "meta/episodes.jsonl").read_text().replace('"length": 9', '"length": 8')
+    (root / "meta/episodes.jsonl").write_text(lines)
+    with pytest.raises(DataError, match="episode 1 has 9 rows, but the meta folder says 8"):
+        convert(LeRobotSource(root), tmp_path, "arm")
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"codebase_version": "v1.6"}, "codebase_version is 'v1.6'; v2.0, v2.1, v3.0 can be read"),
+        ({"fps": None}, "no 'fps'"),
+        ({"video_path": None}, "no 'video_path'"),
+        ({"features": {"action": {"dtype": "float32", "shape": [2]}}}, "no feature is a video or an image"),
+    ],
+)
+def test_info_of_another_kind_is_named(tmp_path, change, message):
+    root = write_lerobot(tmp_path / "toy", "v2.1")
+    info = json.loads((root / "meta/info.json").read_text()) | change
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match=message):
+        LeRobotSource(root)
+
+
+def test_a_directory_that_is_none_is_refused(tmp_path):
+    with pytest.raises(DataError, match="info.json is missing: give the root of a LeRobot dataset"):
+        LeRobotSource(tmp_path)

@@ -1,0 +1,89 @@
+"""Robomimic files of the real layout: images, actions, success, order, masks and refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_pipelines.convert.robomimic import RobomimicSource, succeeded
+from data_pipelines.convert.settings import RobomimicSettings
+from data_pipelines.convert.write import convert
+from data_pipelines.errors import DataError
+from hma_jax.config import ConfigError
+from tests.data_pipelines.convert.sources import demo_actions, number, read_back, write_robomimic
+
+
+def test_demonstrations_keep_their_order_frames_actions_and_success(tmp_path):
+    source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5"))
+    done = convert(source, tmp_path, "lift")
+    assert done.spec.hz == 20 and done.spec.image_key == "observation/agentview"
+    dataset, episodes = read_back(done.directory, "observation/agentview")
+    assert [e.success for e in episodes] == [True, False, True]  # by reward; every one ends with a done
+    for k, (steps, episode) in enumerate(zip((5, 7, 4), episodes, strict=True)):  # demo_9, demo_10, demo_11
+        assert [number(image) for image in episode.images] == [24 * k + t for t in range(steps)]
+        np.testing.assert_array_equal(episode.actions, demo_actions(k, steps).astype(np.float32))
+    wrist = dataset.episode(1, "observation/robot0_eye_in_hand", ["observation/sim_state"])
+    assert number(wrist.images[0]) == 24 + 6 and (wrist.actions == 1).all() and wrist.actions.shape == (7, 11)
+    record = dataset.record(2)
+    assert record["steps/observation/robot0_eef_pos"].tolist() == [2.0] * 12
+    assert record["steps/language_instruction"] == [b"Lift"] * 4
+    assert record["steps/reward"].tolist() == [0, 0, 0, 1]
+
+
+def test_a_mask_a_camera_a_rate_and_a_size_can_be_chosen(tmp_path):
+    settings = RobomimicSettings(("agentview",), "train", hz=10, short_side=16)
+    source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5"), settings)
+    assert list(source.units) == ["demo_9", "demo_11"] and source.hz == 10
+    assert list(source.layout.images) == ["observation/agentview"]
+    _, episodes = read_back(convert(source, tmp_path, "lift").directory, "observation/agentview")
+    assert [number(e.images[1]) for e in episodes] == [1, 49] and episodes[0].images[0].shape == (16, 16, 3)
+    with pytest.raises(ConfigError, match="no mask 'half'; it has train, valid"):
+        RobomimicSource(tmp_path / "image.hdf5", RobomimicSettings(filter_key="half"))
+    with pytest.raises(ConfigError, match="no camera 'side'; it has agentview, robot0_eye_in_hand"):
+        RobomimicSource(tmp_path / "image.hdf5", RobomimicSettings(("side",)))
+
+
+def test_low_dimensional_files_are_refused_with_the_remedy(tmp_path):
+    path = write_robomimic(tmp_path / "low_dim.hdf5", images=False)
+    with pytest.raises(DataError, match=r"demo_9/obs has no \*_image .*dataset_states_to_obs"):
+        RobomimicSource(path)
+
+
+def test_success_without_rewards_is_by_done_and_otherwise_unknown():
+    assert succeeded(np.array([0.0, 0.9]), np.array([0, 1])) is False  # shaped reward, done at the end
+    assert succeeded(None, np.array([0, 1])) is True
+    assert succeeded(None, np.array([0, 0])) is False
+    assert succeeded(None, None) is None
+
+
+def drop(key):
+    return lambda file: file.__delitem__(key)
+
+
+def shorten(file):
+    frames = file["data/demo_10/obs/agentview_image"][:-1]
+    del file["data/demo_10/obs/agentview_image"]
+    file["data/demo_10/obs/agentview_image"] = frames
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (drop("data"), "no group 'data'"),
+        (drop("data/demo_10/actions"), "data/demo_10/actions cannot be read"),
+        (drop("data/demo_10/obs/agentview_image"), "data/demo_10/obs/agentview_image cannot be read"),
+        (shorten, r"demo_10/obs/agentview_image is uint8 \[6, 32, 32, 3\]; 7 actions need"),
+        (lambda f: f["data"].attrs.__setitem__("env_args", "{"), "env_args of 'data' is no JSON"),
+    ],
+)
+def test_malformed_files_are_named_to_the_field(tmp_path, change, message):
+    path = write_robomimic(tmp_path / "image.hdf5", change=change)
+    with pytest.raises(DataError, match=message):
+        convert(RobomimicSource(path), tmp_path, "lift")
+    assert not list(tmp_path.glob("lift/1.0.0"))
+
+
+def test_something_else_than_hdf5_is_refused(tmp_path):
+    (tmp_path / "x.hdf5").write_text("no")
+    with pytest.raises(DataError, match="no readable HDF5 file"):
+        RobomimicSource(tmp_path / "x.hdf5")

@@ -1,0 +1,121 @@
+"""`hma data convert` and `hma data import-tokens` from the command line."""
+
+from __future__ import annotations
+
+import pytest
+
+from data_pipelines.store import TokenStore
+from experiments.cli import main
+from tests.data_pipelines.convert.sources import hand, write_epic, write_lerobot, write_robomimic
+from tests.data_pipelines.test_import_tokens import write_folder
+
+FORMATS = ("robomimic", "lerobot", "epic-kitchens", "ego4d", "egoexo4d")
+
+
+@pytest.mark.parametrize("command", ["convert", *(f"convert {f}" for f in FORMATS), "import-tokens"])
+def test_help_of_every_command(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["data", *command.split(), "--help"])
+    assert end.value.code == 0 and "usage: hma data" in capsys.readouterr().out
+
+
+def said(capsys) -> str:
+    return capsys.readouterr().out
+
+
+def test_a_conversion_says_what_it_wrote_the_entry_and_what_is_next(tmp_path, capsys):
+    path = write_robomimic(tmp_path / "image.hdf5")
+    command = [
+        "data",
+        "convert",
+        "robomimic",
+        str(path),
+        "--out",
+        str(tmp_path / "rlds"),
+        "--camera",
+        "agentview",
+    ]
+    assert main(command) == 0
+    out = said(capsys)
+    assert "3 episodes at 20 Hz in 1 shards" in out
+    assert (
+        'DatasetSpec("robomimic_lift", image_key="observation/agentview", action_keys=("action",), '
+        "action_dims=(7,), hz=20)," in out
+    )
+    assert f"wrote {tmp_path}/rlds/robomimic_lift/1.0.0" in out
+    assert f"next: hma data inspect {tmp_path}/rlds/robomimic_lift/1.0.0 --hz 20" in out
+    assert main(command) == 0 and "3 episodes" in said(capsys)  # found done
+
+
+def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):
+    from data_pipelines.registry import DatasetSpec
+    from data_pipelines.rlds import RldsDataset
+
+    root = write_lerobot(tmp_path / "My Robot", "v3.0")
+    assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0
+    (line,) = [line for line in said(capsys).splitlines() if "DatasetSpec(" in line]
+    (spec,) = eval(f"({line.strip()})", {"DatasetSpec": DatasetSpec})
+    assert (spec.name, spec.hz) == ("my_robot", 10)
+    RldsDataset(tmp_path / "my_robot").check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+
+
+def test_what_is_left_out_is_told(tmp_path, capsys):
+    hands = [hand(0, 0.2, 0.5), hand(1, 0.7, 0.5)]
+    frames, detections = write_epic(tmp_path, "P01_01", [hands] * 31 + [[]] * 12 + [hands] * 12)
+    command = ["data", "convert", "epic-kitchens", str(frames), "--detections", str(detections)]
+    assert main([*command, "--out", str(tmp_path), "--min-frames", "4"]) == 0
+    out = said(capsys)
+    assert "1 episodes at 10 Hz" in out and "left out 1 x: fewer than 4 frames in a row" in out
+
+
+@pytest.mark.parametrize(
+    "arguments, code, message",
+    [
+        (["convert", "robomimic", "{there}/no.hdf5", "--out", "{there}"], 1, "no readable HDF5 file"),
+        (["convert", "lerobot", "{there}", "--out", "{there}"], 1, "give the root of a LeRobot dataset"),
+        (
+            ["convert", "ego4d", "{there}/a.json", "--videos", "{there}", "--out", "{there}"],
+            1,
+            "cannot be read",
+        ),
+        (
+            ["convert", "egoexo4d", "{there}", "--out", "{there}", "--min-frames", "1"],
+            2,
+            "min_frames must be at least 2",
+        ),
+        (["convert", "lerobot", "{there}/image.hdf5", "--out", "{there}"], 1, "info.json"),
+        (
+            ["convert", "robomimic", "{there}/image.hdf5", "--out", "{there}", "--camera", "x"],
+            2,
+            "no camera 'x'",
+        ),
+        (
+            ["convert", "robomimic", "{there}/image.hdf5", "--out", "{there}", "--name", "A-b"],
+            2,
+            "'A-b' cannot be",
+        ),
+        (["import-tokens", "{there}/x_train", "--store", "{there}/s"], 2, "no such folder"),
+    ],
+)
+def test_a_mistake_is_one_message_and_an_exit_code(tmp_path, capsys, arguments, code, message):
+    write_robomimic(tmp_path / "image.hdf5")
+    assert main(["data", *(a.format(there=tmp_path) for a in arguments)]) == code
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "Traceback" not in error and message in error
+
+
+def test_token_folders_are_imported_in_pairs(tmp_path, capsys):
+    for split in ("train", "val"):
+        write_folder(tmp_path / f"arm_magvit_max1000000_{split}")
+        write_folder(tmp_path / f"leg_vae_max1000000_{split}", latents=True, name="toy_leg")
+    folders = [str(tmp_path / f"{name}_max1000000_train") for name in ("arm_magvit", "leg_vae")]
+    assert main(["data", "import-tokens", *folders, "--store", str(tmp_path / "store"), "--hz", "4"]) == 0
+    out = said(capsys)
+    assert "toy_arm: 3 + 3 episodes, 16 tokens per frame, ids of 262,144, by magvit magvit2.ckpt" in out
+    assert "toy_leg: 3 + 3 episodes, 4 tokens per frame, latents of 16 values" in out
+    assert "note: without --tokenizer" in out
+    assert TokenStore(tmp_path / "store").names == ("toy_arm", "toy_leg")
+    assert (
+        main(["data", "import-tokens", *folders, "--store", str(tmp_path), "--name", "x", "--hz", "4"]) == 2
+    )
+    assert "--name can be given for one dataset, not for 2" in capsys.readouterr().err
