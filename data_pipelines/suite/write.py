@@ -78,7 +78,8 @@ def write_dataset(spec: EmbodimentSpec, directory: Path, *, episodes: int, seed:
         records = episode_records(spec, rollout, looks, bounds[k], bounds[k + 1], seed)
         lengths.append(write_shard(path, records))
         size += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
-    _write_info(spec, directory, lengths, size, metadata)
+    description = f"Simulated embodiment ({spec.kind}, {spec.convention} actions, {spec.hz} Hz)."
+    write_info(directory, spec.name, build_features(spec), lengths, size, description, metadata)
     return frames
 
 
@@ -130,27 +131,38 @@ def episode_features(
     return features
 
 
-def _write_info(spec, directory: Path, lengths: list[int], size: int, metadata: dict) -> None:
-    """features.json, dataset_info.json and metadata.json, by tfds itself."""
+def write_info(
+    directory: Path,
+    name: str,
+    features: Any,
+    lengths: list[int],
+    size: int,
+    description: str,
+    metadata: dict,
+    module: str = "data_pipelines.suite",
+) -> None:
+    """features.json, dataset_info.json and metadata.json of one split, by tfds itself.
+
+    `lengths`: records of each shard; `size`: bytes of all their payloads; `module` made them.
+    """
     import tensorflow_datasets as tfds
     from tensorflow_datasets.core.dataset_info import DatasetIdentity
 
-    features = build_features(spec)
     identity = DatasetIdentity(
-        name=spec.name,
+        name=name,
         version=tfds.core.Version(VERSION),
         data_dir=str(directory),
-        module_name="data_pipelines.suite",
+        module_name=module,
     )
     template = tfds.core.ShardedFileTemplate(
-        data_dir=directory, dataset_name=spec.name, split="train", filetype_suffix="tfrecord"
+        data_dir=directory, dataset_name=name, split="train", filetype_suffix="tfrecord"
     )
     split = tfds.core.SplitInfo(
         name="train", shard_lengths=lengths, num_bytes=size, filename_template=template
     )
     info = tfds.core.DatasetInfo(
         builder=identity,
-        description=f"Simulated embodiment ({spec.kind}, {spec.convention} actions, {spec.hz} Hz).",
+        description=description,
         features=features,
         metadata=tfds.core.MetadataDict(metadata),
     )
