@@ -1,7 +1,7 @@
 """The dataset registry: which camera and which action fields of a dataset are used, at what rate.
 
 One table. A dataset of one's own is one more `DatasetSpec` in `REAL`; the entries of the
-embedded suite are derived from the suite's own table. Reads no file.
+embedded suite and of the simulator suite are derived from their own tables. Reads no file.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import difflib
 import functools
 from dataclasses import dataclass
 
+from data_pipelines.sim.embodiments import EMBODIMENTS as SIMULATED
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from hma_jax.config import ConfigError, require
 
@@ -101,6 +102,16 @@ def _table() -> dict[str, DatasetSpec]:
             hz=e.hz,
             camera=e.image_keys[0],
             note=f"simulated {e.kind}, {e.convention} actions",
+        )
+    for s in SIMULATED:
+        table[s.name] = DatasetSpec(
+            s.name,
+            image_key="observation/image",
+            action_keys=("action",),
+            action_dims=(s.action_dim,),
+            hz=s.hz,
+            camera=s.view.title,
+            note=f"{s.package}: {s.instruction or f'{len(s.envs)} tasks'}",
         )
     return table
 

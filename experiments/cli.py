@@ -21,6 +21,7 @@ from tyro.extras import SubcommandApp
 
 from experiments import commands, model_commands
 from experiments.cli_convert import HELP, convert_app
+from experiments.cli_sim import data_sim, data_sim_table
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError, MeshConfig
@@ -109,6 +110,10 @@ def data_list() -> None:
 def data_suite(where: OmitArgPrefixes[Where]) -> None:
     """Write the study's simulated datasets as RLDS directories."""
     commands.write_suite(where.setting())
+
+
+data_app.command(name="sim")(data_sim)
+data_app.command(name="sim-table")(data_sim_table)
 
 
 @tokenizer_app.command(name="train")

@@ -54,8 +54,8 @@ def write_sim(
         paths = generate_sim(
             out,
             names=[spec.name for spec in specs],
-            episodes=episodes or chosen.episodes,
-            size=size or chosen.size,
+            episodes=chosen.episodes if episodes is None else episodes,
+            size=chosen.size if size is None else size,
             seed=seed,
             workers=workers,
             progress=lambda name, done, total: update(done, total, name),

@@ -16,7 +16,7 @@ S = SimSpec
 TABLE_TOP = View(lookat=(-0.15, 0.0, 1.0), distance=1.7)
 """robosuite, one arm: from the side and above. Its own cameras show little of the robot."""
 
-STANDING = View(lookat=(-0.25, 0.0, 1.0), distance=2.4)
+STANDING = View(lookat=(-0.25, 0.0, 1.0), distance=2.1)
 """robosuite, two arms and humanoids."""
 
 HAND = View("vil_camera")
@@ -78,14 +78,15 @@ EMBODIMENTS: tuple[SimSpec, ...] = (
       hz=20, view=TABLE_TOP, kwargs={"robots": "Panda", "part": "OSC_POSITION"}, instruction=LIFT,
       expert="lift script", success=True, tau=1.0, gain=0.35),
     S("so101", "lerobot-env-so101", "so101", ("SO101PickPlace",), (("position delta", 3), ("gripper", 1)), hz=10,
-      view=View("front"), instruction="put the cube onto the mark", expert="shipped script", success=True,
+      view=View(lookat=(0.18, 0, 0.08), distance=0.75, azimuth=145, elevation=-28),
+      instruction="put the cube onto the mark", expert="shipped script", success=True,
       tau=0.8, noise=0.5),
     S("dmc_hopper", "dm-control", "dm_control", ("hopper-hop",), (("torque", 4),), hz=25, repeat=2,
       view=View("cam0"), instruction="hop forward"),
     # --- 5 and 6 -------------------------------------------------------------------------
     S("ogbench_ur5e", "ogbench", "gymnasium", ("cube-single-v0", "cube-double-v0", "scene-v0", "puzzle-3x3-v0"),
       (("position delta", 3), ("yaw delta", 1), ("gripper delta", 1)), hz=20,
-      view=View(lookat=(0.4, 0, 0.1), distance=1.1, azimuth=180, elevation=-30),
+      view=View(lookat=(0.3, 0, 0.15), distance=1.35, azimuth=145, elevation=-28),
       kwargs={"mode": "data_collection", "terminate_at_goal": False, "visualize_info": False},
       instruction="bring the object where it belongs", expert="oracle", success=True, tau=0.8),
     S("dmc_manipulator", "dm-control", "dm_control", ("manipulator-bring_ball",), (("torque", 5),), hz=25,
@@ -120,7 +121,8 @@ EMBODIMENTS: tuple[SimSpec, ...] = (
       view=View(lookat=(-0.2, 0.5, 2.0), distance=2.2, azimuth=70, elevation=-35),
       instruction="open and switch on what you can", success=True, tau=1.0, gain=0.7),
     S("dmc_jaco", "dm-control", "dm_control", ("manipulation/reach_site_features",),
-      (("joint velocity", 6), ("fingers", 3)), hz=25, view=View("front_close"), instruction="reach the mark",
+      (("joint velocity", 6), ("fingers", 3)), hz=25,
+      view=View(lookat=(0, 0, 0.35), distance=1.9, azimuth=140, elevation=-25), instruction="reach the mark",
       tau=1.0),
     S("robosuite_spot_arm", "robosuite", "robosuite", ("Lift",), (("arm and base", 10),), hz=20, view=STANDING,
       kwargs={"robots": "SpotWithArmFloating"}, instruction=LIFT, success=True, tau=1.0, gain=0.35),
@@ -134,7 +136,7 @@ EMBODIMENTS: tuple[SimSpec, ...] = (
       view=View("x"), instruction="walk"),
     S("aloha", "gym-aloha", "aloha", ("transfer_cube", "insertion"),
       (("left joints", 6), ("left gripper", 1), ("right joints", 6), ("right gripper", 1)), hz=25, repeat=2,
-      view=View("top"), success=True, tau=1.5, gain=0.8, note="absolute joint angles"),
+      view=View(lookat=(0, 0.5, 0.15), distance=1.7, azimuth=90, elevation=-40), success=True, tau=1.5, gain=0.8, note="absolute joint angles"),
     S("robosuite_baxter", "robosuite", "robosuite", ("TwoArmLift",),
       (("right arm delta", 6), ("right gripper", 1), ("left arm delta", 6), ("left gripper", 1)), hz=20,
       view=STANDING, kwargs={"robots": "Baxter"}, instruction="lift the pot", success=True, tau=1.0, gain=0.35),
@@ -161,7 +163,7 @@ EMBODIMENTS: tuple[SimSpec, ...] = (
       repeat=4, view=View(lookat=(0, -0.15, 0.25), distance=0.7, azimuth=-45, elevation=-40),
       instruction="turn the pen as shown", success=True, gain=0.7, tau=0.8),
     S("robosuite_gr1", "robosuite", "robosuite", ("TwoArmLift",), (("arms and hands", 24),), hz=20, view=STANDING,
-      kwargs={"robots": "GR1ArmsOnly"}, instruction="lift the pot", success=True, tau=1.0, gain=0.35),
+      kwargs={"robots": "GR1ArmsOnly", "controller": "BASIC"}, instruction="lift the pot", success=True, tau=1.0, gain=0.35),
     S("adroit_hammer", "gymnasium-robotics", "gymnasium", ("AdroitHandHammer-v2",),
       (("wrist and arm", 2), ("joint target", 24)), hz=25, repeat=4, view=HAND,
       instruction="hammer the nail in", success=True, gain=0.6, tau=0.8),

@@ -13,12 +13,13 @@ SPAN = 0.7  # radians that a joint may go from where it starts
 
 
 class Backend(PhysicsBackend):
-    def reset(self, env: str, seed: int) -> None:
-        np.random.seed(seed)
+    def make(self, env: str) -> None:
         self.env = AlohaEnv(env, obs_type="pixels_agent_pos")
         # Every step draws 640 x 480 pixels for an observation that nobody sees.
         blank = np.zeros((480, 640, 3), np.uint8)
         self.env._env.physics.render = lambda **kwargs: blank
+
+    def reset(self, seed: int) -> None:
         self.env.reset(seed=seed)
         physics = self.env._env.physics
         self.model, self.data = physics.model.ptr, physics.data.ptr

@@ -9,13 +9,16 @@ from data_pipelines.sim.backends.physics import PhysicsBackend
 
 
 class Backend(PhysicsBackend):
-    def reset(self, env: str, seed: int) -> None:
-        group, _, name = env.rpartition("/")
-        if group == "manipulation":
-            self.env = manipulation.load(name, seed=seed)
+    def make(self, env: str) -> None:
+        self.group, _, self.task = env.rpartition("/")
+
+    def reset(self, seed: int) -> None:
+        # Made anew for every episode: it is cheap, and the seed is given to the constructor.
+        if self.group == "manipulation":
+            self.env = manipulation.load(self.task, seed=seed)
             self.env._time_limit = np.inf
         else:
-            domain, _, task = env.partition("-")
+            domain, _, task = self.task.partition("-")
             self.env = suite.load(domain, task, task_kwargs={"random": seed, "time_limit": np.inf})
         self.env.reset()
         self.model, self.data = self.env.physics.model.ptr, self.env.physics.data.ptr

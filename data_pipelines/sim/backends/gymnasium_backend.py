@@ -17,10 +17,10 @@ EXPERTS = {"fetch script": fetch.expert, "straight line": point.expert, "oracle"
 
 
 class Backend(PhysicsBackend):
-    def reset(self, env: str, seed: int) -> None:
-        np.random.seed(seed)  # OGBench draws from it
-        self.id = env
+    def make(self, env: str) -> None:
         self.env = gymnasium.make(env, disable_env_checker=True, **self.spec.kwargs).unwrapped
+
+    def reset(self, seed: int) -> None:
         self.observation, self.info = self.env.reset(seed=seed)
         inner = getattr(self.env, "point_env", self.env).unwrapped
         self.model = inner._model if hasattr(inner, "_model") else inner.model
@@ -36,7 +36,7 @@ class Backend(PhysicsBackend):
         return EXPERTS[self.spec.expert](self) if self.spec.expert else None
 
     def vector(self) -> np.ndarray:
-        if isinstance(self.observation, dict) and "Fetch" in self.id:
+        if isinstance(self.observation, dict) and "Fetch" in self.made:
             return self.observation["observation"][:10].astype(np.float32)  # what all its tasks have
         proprio = [self.info[key] for key in sorted(self.info) if key.startswith("proprio/")]
         return np.concatenate(proprio).astype(np.float32) if proprio else super().vector()

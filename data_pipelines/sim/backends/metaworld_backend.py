@@ -17,10 +17,11 @@ from data_pipelines.sim.behaviour import Expert
 class Backend(PhysicsBackend):
     low, high = -np.ones(4), np.ones(4)
 
-    def reset(self, env: str, seed: int) -> None:
-        np.random.seed(seed)
-        self.task = env
-        self.env = tasks.ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{env}-goal-observable"](seed=seed)
+    def make(self, env: str) -> None:
+        self.kind = tasks.ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{env}-goal-observable"]
+
+    def reset(self, seed: int) -> None:
+        self.env = self.kind(seed=seed)  # which is where it draws what is to be done
         self.env.max_path_length = np.inf
         self.observation, _ = self.env.reset()
         self.model, self.data = self.env.model, self.env.data
@@ -31,7 +32,7 @@ class Backend(PhysicsBackend):
         return float(reward), bool(info["success"])
 
     def expert(self, rng: np.random.Generator) -> Expert:
-        policy = ENV_POLICY_MAP[self.task]()
+        policy = ENV_POLICY_MAP[self.made]()
         return lambda: policy.get_action(self.observation.copy())  # some policies write into it
 
     def vector(self) -> np.ndarray:

@@ -29,14 +29,22 @@ class PhysicsBackend(ABC):
 
     def __init__(self, spec: SimSpec, size: int):
         self.spec, self.size = spec, size
+        self.made = ""  # the environment that is open
         self.picture: Picture | None = None
         self._drawn: mujoco.MjModel | None = None
 
     # --- of a package ----------------------------------------------------------------------------
 
     @abstractmethod
-    def reset(self, env: str, seed: int) -> None:
-        """Brings the environment `env` to the start that `seed` means."""
+    def make(self, env: str) -> None:
+        """Opens the environment `env`, always the same one; costs seconds with some packages."""
+
+    @abstractmethod
+    def reset(self, seed: int) -> None:
+        """Brings the open environment to the start that `seed` means, whatever ran before.
+
+        Sets `model`, `data`, `low` and `high`.
+        """
 
     @abstractmethod
     def advance(self, action: np.ndarray) -> tuple[float, bool]:
@@ -54,7 +62,12 @@ class PhysicsBackend(ABC):
     # --- shared ----------------------------------------------------------------------------------
 
     def start(self, env: str, seed: int) -> None:
-        self.reset(env, seed)
+        if env != self.made:
+            np.random.seed(0)  # several packages draw from it
+            self.make(env)
+            self.made = env
+        np.random.seed(seed)
+        self.reset(seed)
         if self.model is not self._drawn:
             self.close()
             self.picture = Picture(self.model, self.spec.view, self.size, self.hidden_geoms)

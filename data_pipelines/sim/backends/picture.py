@@ -33,6 +33,8 @@ class Picture:
 
     def draw(self, data: mujoco.MjData) -> np.ndarray:
         """uint8 [size, size, 3]."""
+        if self.view.follow:  # by hand: MuJoCo's own following depends on what was drawn before
+            self.camera.lookat[:] = data.body(self.view.follow).xpos
         self.renderer.update_scene(data, camera=self.camera, scene_option=self.option)
         large = self.renderer.render()
         parts = large.reshape(self.size, OVERSAMPLE, self.size, OVERSAMPLE, 3)
@@ -49,11 +51,7 @@ def _camera(model: mujoco.MjModel, view: View) -> mujoco.MjvCamera:
         camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         camera.fixedcamid = model.camera(view.name).id
         return camera
-    if view.follow:
-        camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-        camera.trackbodyid = model.body(view.follow).id
-    else:
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.lookat[:] = view.lookat
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat[:] = view.lookat
     camera.distance, camera.azimuth, camera.elevation = view.distance, view.azimuth, view.elevation
     return camera

@@ -1,6 +1,7 @@
 """robosuite and robosuite-models: arms, hands and humanoids at a table.
 
-`kwargs` of a spec: `robots`, and `part`, the controller of a single arm instead of its default.
+`kwargs` of a spec: `robots`, and instead of their defaults `controller`, that of the whole robot, or
+`part`, that of a single arm.
 """
 
 from __future__ import annotations
@@ -41,8 +42,7 @@ _hollow_sawyer()
 class Backend(PhysicsBackend):
     hidden_geoms = (0,)  # collision shapes
 
-    def reset(self, env: str, seed: int) -> None:
-        np.random.seed(seed)  # all that robosuite draws from
+    def make(self, env: str) -> None:
         self.env = robosuite.make(
             env,
             robots=self.spec.kwargs["robots"],
@@ -54,17 +54,21 @@ class Backend(PhysicsBackend):
             control_freq=round(self.spec.hz * self.spec.repeat),
             horizon=NEVER,
             ignore_done=True,
-            hard_reset=False,
+            hard_reset=False,  # the model stays, which saves seconds an episode
         )
+
+    def reset(self, seed: int) -> None:
         self.env.reset()
         self.model, self.data = self.env.sim.model._model, self.env.sim.data._data
         self.low, self.high = (np.array(bound, np.float64) for bound in self.env.action_spec)
 
     def _controllers(self) -> dict | None:
-        part = self.spec.kwargs.get("part")
-        if part is None:
+        whole, part = self.spec.kwargs.get("controller"), self.spec.kwargs.get("part")
+        if whole is None and part is None:
             return None
-        config = load_composite_controller_config(robot=self.spec.kwargs["robots"])
+        config = load_composite_controller_config(controller=whole, robot=self.spec.kwargs["robots"])
+        if part is None:
+            return config
         arm = load_part_controller_config(default_controller=part)
         config["body_parts"]["right"] = arm | {"gripper": {"type": "GRIP"}}
         return config

@@ -12,8 +12,10 @@ from data_pipelines.sim.behaviour import Expert
 
 
 class Backend(PhysicsBackend):
-    def reset(self, env: str, seed: int) -> None:
+    def make(self, env: str) -> None:
         self.env = SO101PickPlaceGymEnv(random_block_position=True, action_scale=DEFAULT_ACTION_SCALE)
+
+    def reset(self, seed: int) -> None:
         self.env.reset(seed=seed)
         self.model, self.data = self.env.model, self.env.data
         space = self.env.action_space

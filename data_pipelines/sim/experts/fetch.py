@@ -16,7 +16,7 @@ HELD = 0.025  # metres between hand and block when it is between the fingers
 
 def expert(backend) -> Expert:
     """The script for the environment that `backend` has just started."""
-    script = _reach if "Reach" in backend.id else _pick if "Pick" in backend.id else _push
+    script = _reach if "Reach" in backend.made else _pick if "Pick" in backend.made else _push
 
     def act() -> np.ndarray:
         seen = backend.observation

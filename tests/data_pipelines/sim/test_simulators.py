@@ -1,0 +1,117 @@
+"""The suite with real simulators, each in a process of its own: same bytes, and episodes run again."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_pipelines.registry import get_spec
+from data_pipelines.rlds import RldsDataset
+from data_pipelines.sim import EMBODIMENTS, generate_sim, select
+from data_pipelines.sim.packages import missing_packages
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        bool(missing_packages(EMBODIMENTS)), reason="simulators not installed: pip install -e '.[sim]'"
+    ),
+]
+
+NAMES = ("pusht", "dmc_reacher", "aloha")
+"""No OpenGL; torque control; two arms and two tasks."""
+
+EPISODES, SIZE = 2, 32
+
+REPLAY = """
+import json, sys
+import numpy as np
+from data_pipelines.rlds import RldsDataset
+from data_pipelines.sim import read_start, replay
+for name in sys.argv[2:]:
+    dataset = RldsDataset(f"{sys.argv[1]}/{name}")
+    for i in range(len(dataset)):
+        recorded = dataset.episode(i, "observation/image", ["action"])
+        start = read_start(dataset, i)
+        same = replay(name, start, recorded.actions, size=32)
+        errors = np.abs(same.frames[:-1].astype(int) - np.stack(recorded.images)).mean(axis=(1, 2, 3))
+        other = replay(name, start, recorded.actions[::-1], size=32)
+        change = np.abs(other.frames[-20:].astype(int) - same.frames[-20:]).mean()
+        print(json.dumps([float(errors.max()), float(change), same.success, recorded.success]))
+"""
+"""Prints per episode: worst frame against the recorded JPEG, effect of other actions, successes."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("sim")
+    generate_sim(root, names=NAMES, episodes=EPISODES, size=SIZE)
+    return root
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    files = (p for p in sorted(root.rglob("*")) if p.is_file() and p.name != "stats.json")
+    return {str(p.relative_to(root)): p.read_bytes() for p in files}
+
+
+def test_datasets_match_their_registry_entries(made):
+    for name in NAMES:
+        spec, dataset = get_spec(name), RldsDataset(made / name)
+        dataset.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+        assert len(dataset) == EPISODES
+        for i in range(EPISODES):
+            episode = dataset.episode(i, spec.image_key, spec.action_keys)
+            assert episode.steps >= 12 * spec.stride, "too short for a window"
+            assert (episode.success is None) == (not select([name])[0].success)
+            frames = np.stack(episode.images).astype(int)
+            assert frames.shape[1:] == (SIZE, SIZE, 3)
+            assert np.abs(np.diff(frames[:: spec.stride], axis=0)).mean() > 0.05, "nothing moves"
+
+
+def test_the_same_bytes_from_any_number_of_workers(made, tmp_path):
+    generate_sim(tmp_path, names=NAMES, episodes=EPISODES, size=SIZE, workers=3)
+    assert contents(tmp_path) == contents(made)
+
+
+def test_an_episode_does_not_depend_on_those_before_it(made, tmp_path):
+    """Episodes of a killed run are kept, so the rest is made by processes that never made them."""
+    staged = tmp_path / "dmc_reacher"
+    command = [sys.executable, "-m", "data_pipelines.sim"]
+    job = {"name": "dmc_reacher", "episodes": [1], "seed": 0, "size": SIZE, "directory": str(staged)}
+    staged.mkdir()
+    subprocess.run([*command, json.dumps(job)], check=True, capture_output=True)
+    from data_pipelines.tfrecord import index_shard, read_record
+
+    shard = index_shard(next((made / "dmc_reacher").rglob("*.tfrecord-*")))
+    whole = read_record(shard.path, shard.offsets[1], shard.lengths[1])
+    assert (staged / "000001.record").read_bytes() == whole
+
+
+def test_recorded_actions_give_the_recorded_episode_and_others_another(made):
+    done = subprocess.run(
+        [sys.executable, "-c", REPLAY, str(made), *NAMES],
+        check=True,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"MUJOCO_GL": "egl"},
+    )
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    assert len(lines) == len(NAMES) * EPISODES
+    for error, change, success, recorded in lines:
+        assert error < 3, "the frames are of another episode, beyond what JPEG loses"
+        assert change > 0.2, "other actions led to the same pictures"
+        assert success == recorded or recorded is None
+
+
+def test_actions_of_another_robot_are_refused(made):
+    code = (
+        "from data_pipelines.rlds import RldsDataset\nfrom data_pipelines.sim import read_start, replay\n"
+        f"start = read_start(RldsDataset({str(made / 'pusht')!r}), 0)\nreplay('pusht', start, [[0.0] * 7])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "actions of shape (1, 7) cannot be run: this robot takes [N, 2]" in done.stderr
