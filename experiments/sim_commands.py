@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.commands import short, wrote
-from experiments.progress import step
+from experiments.progress import console, step
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,9 @@ PRESETS = {
 SHEET = "overview.png"
 SHEET_EPISODES = 4
 
+REPORT = 10
+"""Episodes from one line of a log to the next."""
+
 
 def write_sim(
     out: Path,
@@ -51,6 +54,12 @@ def write_sim(
     chosen = PRESETS[preset]
     specs = select(tuple(names) or chosen.names)
     with step(f"simulate {len(specs)} robots") as update:
+
+        def report(name: str, done: int, total: int) -> None:
+            update(done, total, name)
+            if not console.is_terminal and (done == total or done % REPORT == 0):
+                console.print(f"{done} of {total} episodes, the last of {name}")
+
         paths = generate_sim(
             out,
             names=[spec.name for spec in specs],
@@ -58,7 +67,7 @@ def write_sim(
             size=chosen.size if size is None else size,
             seed=seed,
             workers=workers,
-            progress=lambda name, done, total: update(done, total, name),
+            progress=report,
         )
     with step("draw contact sheets"):
         for path in paths:

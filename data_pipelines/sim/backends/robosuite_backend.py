@@ -56,6 +56,8 @@ class Backend(PhysicsBackend):
             ignore_done=True,
             hard_reset=False,  # the model stays, which saves seconds an episode
         )
+        for name in self.env._observables:  # computed in every step of the physics; nobody looks
+            self.env.modify_observable(name, "enabled", False)
 
     def reset(self, seed: int) -> None:
         self.env.reset()

@@ -25,7 +25,7 @@ def make_episode(index: int, steps: int = 80) -> Episode:
     rng = np.random.default_rng(index)
     return Episode(
         start=StartState("PushT", index, tuple(rng.standard_normal(10).tolist())),
-        frames=np.full((steps, SIZE, SIZE, 3), 40 * index, np.uint8),
+        frames=np.full((steps, SIZE, SIZE, 3), 18 * index, np.uint8),
         states=rng.standard_normal((steps, 10)).astype(np.float32),
         actions=rng.uniform(0, 512, (steps, 2)).astype(np.float32),
         rewards=rng.random(steps).astype(np.float32),
