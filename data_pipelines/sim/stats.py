@@ -30,11 +30,10 @@ def stats_table(root: Path) -> str:
         frames, success = stats["frames"], stats["success"]
         lengths = f"{min(frames) / spec.hz:.1f} to {max(frames) / spec.hz:.1f}"
         rate = "" if success is None else f"{sum(success)}/{len(success)}"
-        rows.append(
-            f"| `{spec.name}` | {spec.package} | {spec.action_dim} | {spec.hz:g} | {spec.expert or 'wanders'} | "
-            f"{len(frames)} | {np.sum(frames)} | {lengths} | {np.sum(frames) / np.sum(stats['seconds']):.0f} | "
-            f"{rate} |"
-        )
+        speed = f"{np.sum(frames) / np.sum(stats['seconds']):.0f}"
+        what = [f"`{spec.name}`", spec.package, f"{spec.action_dim}", f"{spec.hz:.3g}", spec.expert or "wanders"]
+        cells = [*what, f"{len(frames)}", f"{np.sum(frames)}", lengths, speed, rate]
+        rows.append(f"| {' | '.join(cells)} |")
         machines.add(stats["machine"])
         sizes.add(f"{stats['size']} px")
         dates.add(stats["date"])

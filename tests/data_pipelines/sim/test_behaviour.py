@@ -13,7 +13,8 @@ EXPERT = np.full(7, 0.25)
 
 
 def actions(seed: int, expert: bool, steps: int = 400, reached: bool = False) -> tuple[np.ndarray, float]:
-    behaviour = Behaviour(SPEC, LOW, HIGH, REST, (lambda: EXPERT) if expert else None, np.random.default_rng(seed))
+    act = (lambda: EXPERT) if expert else None
+    behaviour = Behaviour(SPEC, LOW, HIGH, REST, act, np.random.default_rng(seed))
     return np.stack([behaviour.act(reached) for _ in range(steps)]), behaviour.level
 
 

@@ -47,6 +47,51 @@ for name in sys.argv[2:]:
 """Prints per episode: worst frame against the recorded JPEG, effect of other actions, successes."""
 
 
+AUDIT = """
+import json, sys
+import numpy as np
+from data_pipelines.sim import select
+from data_pipelines.sim.packages import prepare_process
+prepare_process()
+from data_pipelines.sim.backends import open_simulator
+from data_pipelines.sim.behaviour import Behaviour
+(spec,) = select([sys.argv[1]])
+simulator = open_simulator(spec, 32)
+def run(env, seed, steps):
+    simulator.start(env, seed)
+    began = simulator.data.time if hasattr(simulator, "data") else 0.0
+    bounds = simulator.low, simulator.high
+    behaviour = Behaviour(spec, *bounds, simulator.rest(), None, np.random.default_rng(seed))
+    seen = [(simulator.physics(), simulator.frame())]
+    for _ in range(steps):
+        simulator.step(behaviour.act(False).astype(np.float64))
+        seen.append((simulator.physics(), simulator.frame()))
+    clock = simulator.data.time - began if hasattr(simulator, "data") else steps / spec.hz
+    return seen, clock * spec.hz / steps
+first, rate = run(spec.envs[0], 11, 4)
+run(spec.envs[-1], 3, 10)
+again, _ = run(spec.envs[0], 11, 4)
+same = [bool(np.array_equal(x, y)) for a, b in zip(first, again) for x, y in zip(a, b)]
+finite = bool(np.isfinite([simulator.low, simulator.high]).all())
+print("\\n" + json.dumps([len(simulator.low), finite, rate, all(same)]), flush=True)
+import os
+os._exit(0)
+"""
+"""Prints the action size, whether its bounds are finite, the physics' clock over that of the row, and
+whether an episode is the same, to the last pixel, after others."""
+
+
+@pytest.mark.parametrize("name", [spec.name for spec in EMBODIMENTS])
+def test_every_robot_is_what_its_row_says_and_forgets_what_it_did(name):
+    command = [sys.executable, "-W", "ignore", "-c", AUDIT, name]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    dim, finite, rate, same = json.loads(done.stdout.splitlines()[-1])
+    assert (dim, finite) == (select([name])[0].action_dim, True)
+    assert abs(rate - 1) < 0.01, "frames do not come at the row's rate"
+    assert same, "an episode depends on those before it"
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("sim")

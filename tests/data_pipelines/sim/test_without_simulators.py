@@ -95,7 +95,8 @@ def test_the_table_of_figures_has_speed_lengths_and_success(home):
 
 def test_missing_packages_are_named_with_the_extra_and_what_draws(monkeypatch):
     monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"not installed \(gym-pusht, mujoco\): pip install -e '.\[sim\]'.*libegl1"):
+    message = r"not installed \(gym-pusht, mujoco\): pip install -e '.\[sim\]'.*libegl1"
+    with pytest.raises(ConfigError, match=message):
         packages.require_packages([SPEC])
 
 
@@ -176,7 +177,8 @@ def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
 
     fake.made.clear()
     fake.dies_at = 4
-    with pytest.raises(DataError, match="pusht: its simulator ended with code -11: cannot draw.*tries them again"):
+    message = "pusht: its simulator ended with code -11: cannot draw.*tries them again"
+    with pytest.raises(DataError, match=message):
         run(tmp_path / "cut")
     assert sorted(fake.made) == [0, 1, 2, 3, 10, 11], "the other job of the dataset was not run"
     assert not (tmp_path / "cut" / "pusht" / "1.0.0").exists()
