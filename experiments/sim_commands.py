@@ -57,7 +57,7 @@ def write_sim(
 
         def report(name: str, done: int, total: int) -> None:
             update(done, total, name)
-            if not console.is_terminal and (done == total or done % REPORT == 0):
+            if done and not console.is_terminal and (done == total or done % REPORT == 0):
                 console.print(f"{done} of {total} episodes, the last of {name}")
 
         paths = generate_sim(
