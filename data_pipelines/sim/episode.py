@@ -18,7 +18,10 @@ from data_pipelines.sim.spec import SimSpec
 
 
 class Simulator(Protocol):
-    """A running environment of one embodiment. Frame t is the state before action t."""
+    """A running environment of one embodiment. Frame t is the state before action t.
+
+    Everything but `start` and `close` waits for the first `start`.
+    """
 
     low: np.ndarray  # float64 [A], of actions
     high: np.ndarray  # float64 [A]
@@ -120,10 +123,10 @@ def record_episode(simulator: Simulator, spec: SimSpec, env: str, seed: int) -> 
 def replay_episode(simulator: Simulator, start: StartState, actions: Sequence[np.ndarray]) -> Replay:
     """Runs `actions` [N, A] (raw units) from `start`. Raises DataError for those of another robot."""
     actions = np.asarray(actions, np.float64)
+    simulator.start(start.env, start.seed)
     size = len(simulator.low)
     if actions.ndim != 2 or actions.shape[1] != size:
         raise DataError(f"actions of shape {actions.shape} cannot be run: this robot takes [N, {size}].")
-    simulator.start(start.env, start.seed)
     expected = len(simulator.physics())
     if len(start.physics) != expected:
         raise DataError(
