@@ -41,7 +41,8 @@ META_WORLD = (
 
 def _lift(name: str, robot: str, package: str = "robosuite", **more) -> SimSpec:
     """An arm that lifts a cube, commanded at its hand."""
-    given = {"expert": "lift script", "note": "Robomimic's task with another arm", "tau": 1.0, "gain": 0.35}
+    note = "Robomimic's task with another arm"
+    given = {"expert": "lift script", "note": note, "tau": 1.0, "gain": 0.35, "noise": 0.25}
     return S(
         f"robosuite_{name}_lift", package, "robosuite", ("Lift",), TABLE_ARM, hz=20, view=TABLE_TOP,
         kwargs={"robots": robot}, instruction=LIFT, success=True, **given | more,
@@ -79,11 +80,11 @@ EMBODIMENTS: tuple[SimSpec, ...] = (
       gain=0.2, noise=0.5),
     S("robosuite_panda_position", "robosuite", "robosuite", ("Lift",), (("position delta", 3), ("gripper",
       1)), hz=20, view=TABLE_TOP, kwargs={"robots": "Panda", "part": "OSC_POSITION"}, instruction=LIFT,
-      expert="lift script", success=True, tau=1.0, gain=0.35),
+      expert="lift script", success=True, tau=1.0, gain=0.35, noise=0.25),
     S("so101", "lerobot-env-so101", "so101", ("SO101PickPlace",), (("position delta", 3), ("gripper", 1)),
       hz=10, view=View(lookat=(0.18, 0, 0.08), distance=0.75, azimuth=145, elevation=-28),
       instruction="put the cube onto the mark", expert="shipped script", success=True, tau=0.8,
-      noise=0.5),
+      noise=0.25),
     S("dmc_hopper", "dm-control", "dm_control", ("hopper-hop",), (("torque", 4),), hz=25, repeat=2,
       view=View("cam0"), instruction="hop forward"),
     # --- 5 and 6 -------------------------------------------------------------------------

@@ -10,7 +10,7 @@ GAIN = 10.0  # action per metre
 FAST = 0.6  # at most, of full speed
 OPEN, CLOSED = -1.0, 1.0
 ABOVE = 0.12  # metres over the cube where the hand travels
-NEAR = 0.015  # metres across at which the hand may go down
+NEAR = 0.02  # metres across at which the hand may go down
 GRASP_STEPS = 8  # that the fingers take to close
 DROPPED = 0.06  # metres between hand and cube at which it is lost
 
