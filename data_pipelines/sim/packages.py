@@ -28,6 +28,12 @@ MODULES = {
 }
 """Package -> the module it installs."""
 
+TOGETHER = {
+    "gymnasium": ("gymnasium", "gymnasium-robotics", "ogbench"),
+    "robosuite": ("robosuite", "robosuite-models"),
+}
+"""Backend -> packages that its module imports, whichever of them a robot is from."""
+
 EXTRA = "pip install -e '.[sim]'"
 
 APT = (
@@ -41,8 +47,10 @@ GL = {"egl": "EGL", "osmesa": "OSMesa"}
 
 def missing_packages(specs: Iterable[SimSpec]) -> tuple[str, ...]:
     """Packages that these embodiments need and that are not installed."""
-    needed = sorted({spec.package for spec in specs} | {"mujoco"})
-    return tuple(p for p in needed if importlib.util.find_spec(MODULES.get(p, p)) is None)
+    needed = {"mujoco"}
+    for spec in specs:
+        needed.update({spec.package, *TOGETHER.get(spec.backend, ())})
+    return tuple(p for p in sorted(needed) if importlib.util.find_spec(MODULES.get(p, p)) is None)
 
 
 def require_packages(specs: Iterable[SimSpec]) -> None:
