@@ -2,42 +2,24 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.rlds import RldsDataset
 from data_pipelines.sim import generate, packages, read_start, select
-from data_pipelines.sim.episode import Episode, StartState
+from data_pipelines.sim.episode import StartState
 from data_pipelines.sim.record import encode_episode
 from data_pipelines.sim.stats import stats_table
-from data_pipelines.sim.worker import Job, episode_seed, facts_path, record_path
+from data_pipelines.sim.worker import Job, episode_seed
 from data_pipelines.sim.write import write_dataset
 from hma_jax.config import ConfigError
-
-(SPEC,) = select(["pusht"])
-SIZE, EPISODES = 16, 3
+from tests.data_pipelines.sim.fakes import EPISODES, SIZE, SPEC, fake_workers, make_episode, write_episode
 
 
-def make_episode(index: int, steps: int = 80) -> Episode:
-    rng = np.random.default_rng(index)
-    return Episode(
-        start=StartState("PushT", index, tuple(rng.standard_normal(10).tolist())),
-        frames=np.full((steps, SIZE, SIZE, 3), 18 * index, np.uint8),
-        states=rng.standard_normal((steps, 10)).astype(np.float32),
-        actions=rng.uniform(0, 512, (steps, 2)).astype(np.float32),
-        rewards=rng.random(steps).astype(np.float32),
-        success=index == 1,
-    )
-
-
-def write_episode(directory, index: int) -> None:
-    episode = make_episode(index)
-    facts = {"env": "PushT", "frames": 80, "success": episode.success, "seconds": 2.0, "states": 10}
-    facts_path(directory, index).write_text(json.dumps(facts))
-    record_path(directory, index).write_bytes(encode_episode(SPEC, episode, index))
+@pytest.fixture
+def fake(monkeypatch):
+    return fake_workers(monkeypatch)
 
 
 @pytest.fixture
@@ -127,39 +109,6 @@ def test_a_job_survives_its_command_line_and_seeds_are_its_episodes_own():
 def test_text_that_is_no_start_state_is_refused():
     with pytest.raises(DataError, match="is no start state"):
         StartState.from_json(b'{"env": "Lift"}')
-
-
-class FakeProcess:
-    """Stands for a worker process: makes its episodes, or dies on the way."""
-
-    made: list[int] = []
-    dies_at: int | None = None
-
-    def __init__(self, command, stdout, stderr, env, text):
-        job = Job.from_json(command[-1])
-        self.code, lines = 0, []
-        for i in job.episodes:
-            if i == self.dies_at:
-                stderr.write(b"cannot draw\n")
-                stderr.flush()
-                self.code = -11
-                break
-            write_episode(job.directory, i)
-            self.made.append(i)
-            lines.append(f"{i}\n")
-        self.stdout = iter(lines)
-
-    def wait(self) -> int:
-        return self.code
-
-
-@pytest.fixture
-def fake(monkeypatch):
-    FakeProcess.made, FakeProcess.dies_at = [], None
-    monkeypatch.setattr(generate.subprocess, "Popen", FakeProcess)
-    monkeypatch.setattr(generate, "require_packages", lambda specs: None)
-    monkeypatch.setattr(generate.importlib.metadata, "version", lambda name: "1.0")
-    return FakeProcess
 
 
 def contents(root) -> dict[str, bytes]:
