@@ -21,16 +21,18 @@ def instruction(spec: SimSpec, env: str) -> str:
     return spec.instruction or env.split("/")[-1].split("-v")[0].replace("-", " ").replace("_", " ")
 
 
+def encode_frame(frame: np.ndarray) -> bytes:
+    """The JPEG of uint8 [H, W, 3]."""
+    return simplejpeg.encode_jpeg(np.ascontiguousarray(frame), quality=JPEG_QUALITY, colorsubsampling="444")
+
+
 def encode_episode(spec: SimSpec, episode: Episode, index: int) -> bytes:
     """The record of episode `index`; equal episodes give equal bytes."""
     steps = len(episode.actions)
     flags = np.zeros((2, steps), np.int64)
     flags[0, 0] = flags[1, -1] = 1
     features: dict[str, np.ndarray | list[bytes]] = {
-        f"steps/observation/{IMAGE_KEY}": [
-            simplejpeg.encode_jpeg(frame, quality=JPEG_QUALITY, colorsubsampling="444")
-            for frame in np.ascontiguousarray(episode.frames)
-        ],
+        f"steps/observation/{IMAGE_KEY}": [encode_frame(frame) for frame in episode.frames],
         "steps/observation/state": episode.states.ravel(),
         "steps/action": episode.actions.ravel(),
         "steps/discount": np.ones(steps, np.float32),
