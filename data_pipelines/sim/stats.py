@@ -18,8 +18,8 @@ def stats_table(root: Path) -> str:
     """Markdown, one row per dataset of the suite under `root`, in the order of the table.
 
     Episode lengths are shortest to longest, in seconds of the robot's time; frames/s is what one
-    process simulated, drew and encoded, first episode and its start included. Raises DataError
-    when nothing is there.
+    process simulated and drew, the start of the first episode included. Raises DataError when
+    nothing is there.
     """
     rows, machines, sizes, dates = [], set(), set(), set()
     for spec in EMBODIMENTS:
@@ -31,9 +31,9 @@ def stats_table(root: Path) -> str:
         lengths = f"{min(frames) / spec.hz:.1f} to {max(frames) / spec.hz:.1f}"
         rate = "" if success is None else f"{sum(success)}/{len(success)}"
         speed = f"{np.sum(frames) / np.sum(stats['seconds']):.0f}"
-        what = [f"`{spec.name}`", spec.package, f"{spec.action_dim}", f"{spec.hz:.3g}", spec.expert or "wanders"]
-        cells = [*what, f"{len(frames)}", f"{np.sum(frames)}", lengths, speed, rate]
-        rows.append(f"| {' | '.join(cells)} |")
+        what = [f"`{spec.name}`", spec.package, f"{spec.action_dim}", f"{spec.hz:.3g}"]
+        how = [spec.expert or "wanders", f"{len(frames)}", f"{np.sum(frames)}", lengths, speed, rate]
+        rows.append(f"| {' | '.join(what + how)} |")
         machines.add(stats["machine"])
         sizes.add(f"{stats['size']} px")
         dates.add(stats["date"])
