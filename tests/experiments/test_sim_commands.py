@@ -8,6 +8,14 @@ from experiments.cli import main
 from tests.data_pipelines.sim.fakes import fake_workers
 
 
+@pytest.mark.parametrize("command", ["sim", "sim-table"])
+def test_help(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["data", command, "--help"])
+    assert end.value.code == 0
+    assert f"usage: hma data {command}" in capsys.readouterr().out
+
+
 def test_datasets_and_contact_sheets_are_written_and_named(tmp_path, monkeypatch, capsys):
     fake_workers(monkeypatch)
     command = ["data", "sim", "--names", "pusht", "--episodes", "2", "--size", "16", "--out", str(tmp_path)]
