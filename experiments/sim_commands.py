@@ -18,6 +18,7 @@ class SimPreset:
     names: tuple[str, ...] | None
     episodes: int
     size: int
+    study: str  # the preset of a study for which that is enough
 
 
 PRESETS = {
@@ -28,8 +29,9 @@ PRESETS = {
         ),
         episodes=4,
         size=64,
+        study="smoke",
     ),
-    "full": SimPreset(None, episodes=20, size=128),
+    "full": SimPreset(None, episodes=20, size=128, study="cpu"),
 }  # fmt: skip
 
 SHEET = "overview.png"
@@ -74,7 +76,7 @@ def write_sim(
             draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
         draw_sheet(paths, out / SHEET)
     where = shlex.quote(short(out))
-    wrote(*paths, out / SHEET, then=f"hma study --preset cpu --data {where}/*/1.0.0 --out runs/sim")
+    wrote(*paths, out / SHEET, then=f"hma study --preset {chosen.study} --data {where}/*/1.0.0 --out runs/sim")
 
 
 def print_table(directory: Path) -> None:
