@@ -28,6 +28,7 @@ from experiments import (
     tokenize_commands,
 )
 from experiments.cli_fit import fit
+from experiments.cli_sim import data_sim, data_sim_table
 from experiments.cli_tokenizer import tokenizer_app
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -163,6 +164,10 @@ def data_inspect(
 def data_suite(where: OmitArgPrefixes[Where]) -> None:
     """Write the study's simulated datasets as RLDS directories."""
     commands.write_suite(where.setting())
+
+
+data_app.command(name="sim")(data_sim)
+data_app.command(name="sim-table")(data_sim_table)
 
 
 @tokenizer_app.command(name="train")

@@ -32,6 +32,7 @@ def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
         "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE,
         "other datasets of the paper": OTHERS,
         "embedded suite (simulated)": _suite(),
+        "simulator suite (extra sim)": _simulators(),
     }
     return {title: specs for title, specs in groups.items() if specs}
 
@@ -68,7 +69,7 @@ def _table() -> dict[str, DatasetSpec]:
 
 @functools.cache
 def _built_in() -> dict[str, DatasetSpec]:
-    return {spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OTHERS, *_suite())}
+    return {spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OTHERS, *_suite(), *_simulators())}
 
 
 @functools.cache
@@ -90,3 +91,21 @@ def _suite() -> tuple[DatasetSpec, ...]:
             )
         )
     return tuple(specs)
+
+
+@functools.cache
+def _simulators() -> tuple[DatasetSpec, ...]:
+    from data_pipelines.sim.embodiments import EMBODIMENTS
+
+    return tuple(
+        DatasetSpec(
+            s.name,
+            image_key="observation/image",
+            action_keys=("action",),
+            action_dims=(s.action_dim,),
+            hz=s.hz,
+            camera=s.view.title,
+            note=f"{s.package}: {s.instruction or f'{len(s.envs)} tasks'}",
+        )
+        for s in EMBODIMENTS
+    )
