@@ -2,15 +2,15 @@
 
 `spec` is the record type. The entries are data: `own` (the real samples and one's own), `openx`
 and `openx_more` (Open X-Embodiment), `others` (what the paper adds to it) and the embedded
-suite's, which are derived from its own table; `toml_file` reads entries that live outside this
+suite's and the simulators', which are derived from their own tables; `toml_file` reads entries that live outside this
 project. `table` finds an entry by name, `mixtures` names lists of them. Reads no dataset.
 """
 
 from data_pipelines.registry.mixtures import MIXTURES, get_mixture
 from data_pipelines.registry.spec import FRAME_RATE, DatasetSpec
-from data_pipelines.registry.table import all_specs, get_spec, known_groups, register
+from data_pipelines.registry.table import all_specs, find_spec, get_spec, known_groups, register
 
 __all__ = [
-    "FRAME_RATE", "MIXTURES", "DatasetSpec", "all_specs", "get_mixture", "get_spec", "known_groups",
+    "FRAME_RATE", "MIXTURES", "DatasetSpec", "all_specs", "find_spec", "get_mixture", "get_spec", "known_groups",
     "register",
 ]  # fmt: skip
