@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 if TYPE_CHECKING:
-    from data_pipelines.inspect import Shown
+    from data_pipelines.inspection.inspect import Shown
 
 TILE = 112
 """Pixels of a frame's height."""

@@ -26,11 +26,11 @@ from experiments.workspace import Workspace
 from hma_jax.config import TokenizerConfig, require, stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from data_pipelines.location import Location
     from data_pipelines.registry import DatasetSpec
-    from data_pipelines.rlds import RldsDataset
-    from data_pipelines.share import Share
-    from data_pipelines.store import TokenStore
+    from data_pipelines.rlds.dataset import RldsDataset
+    from data_pipelines.rlds.location import Location
+    from data_pipelines.tokens.share import Share
+    from data_pipelines.tokens.store import TokenStore
     from hma_jax.tokenizers.base import Tokenizer
 
 STAMP = "made_from.txt"
@@ -71,15 +71,15 @@ def prepare(
 
 def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
     """The names that RLDS directories give themselves. Raises DataError for one that is none."""
-    from data_pipelines.schema import dataset_name
+    from data_pipelines.rlds.schema import dataset_name
 
     return tuple(map(dataset_name, data))
 
 
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     """User directories with their registry entries. Raises ConfigError for unknown names."""
-    from data_pipelines.location import locate
     from data_pipelines.registry import get_spec
+    from data_pipelines.rlds.location import locate
 
     named = dict(zip(name_datasets(data), map(locate, data), strict=True))
     missing = [n for n in study.dataset_names() if n not in named]
@@ -122,7 +122,7 @@ def make_suite(study: Study, workspace: Workspace) -> list[Source]:
 
 def open_source(source: Source, settings: StoreConfig) -> RldsDataset:
     """Indexes a dataset's shards. Raises DataError for damage that `settings` do not allow."""
-    from data_pipelines.rlds import RldsDataset
+    from data_pipelines.rlds.dataset import RldsDataset
 
     spec, path = source
     return RldsDataset(path, spec.split, corrupt=settings.corrupt, max_skipped=settings.max_skipped)
@@ -133,7 +133,7 @@ def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source]
 
     Beside it lies quality.json: its reconstruction PSNR on held-out frames.
     """
-    from data_pipelines.frames import make_frame_loader
+    from data_pipelines.loading.frames import make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
@@ -235,8 +235,8 @@ def make_store(
     datasets that still lack parts of other processes. `tokenizer`: a directory, if it is not
     the workspace's. `batch` and `threads` as in `tokenize_dataset`.
     """
-    from data_pipelines.share import Share
-    from data_pipelines.tokenize_job import tokenize_dataset
+    from data_pipelines.tokens.share import Share
+    from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
     made_with = load_tokenizer(tokenizer or workspace.tokenizer)
@@ -262,8 +262,8 @@ def make_store(
 
 def freeze_windows(study: Study, workspace: Workspace) -> Provenance:
     """The validation windows that all trials share, and a summary of the data."""
-    from data_pipelines.evalset import freeze_manifest
-    from data_pipelines.store import TokenStore
+    from data_pipelines.loading.evalset import freeze_manifest
+    from data_pipelines.tokens.store import TokenStore
 
     store = TokenStore(workspace.store)
     names, frames = study.dataset_names(), study.model.frames
@@ -285,7 +285,7 @@ def freeze_windows(study: Study, workspace: Workspace) -> Provenance:
 
 def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str, dict[str, int]]:
     """Per dataset: training episodes, those too short for a window, windows, episodes skipped."""
-    from data_pipelines.windows import train_windows
+    from data_pipelines.loading.windows import train_windows
 
     summary = {}
     for name in names:

@@ -37,7 +37,7 @@ class SuiteConfig:
 
 @dataclass(frozen=True)
 class StoreConfig:
-    """What the token store keeps (`data_pipelines.tokenize_job`)."""
+    """What the token store keeps (`data_pipelines.tokens.tokenize_job`)."""
 
     val_fraction: float = 0.05
     min_val: int = 2  # held-out episodes per dataset, at least

@@ -23,8 +23,8 @@ from experiments.workspace import Workspace
 from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, Setting, TrainConfig, stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from data_pipelines.evalset import EvalManifest
-    from data_pipelines.store import TokenStore
+    from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.tokens.store import TokenStore
     from hma_jax.embodiments import EmbodimentTable
     from hma_jax.evaluation.protocol import Evaluation
     from hma_jax.params import Params
@@ -79,8 +79,8 @@ class Materials:
 
 def open_materials(workspace: Workspace) -> Materials:
     """Raises ConfigError or DataError for what is missing or damaged."""
-    from data_pipelines.evalset import EvalManifest
-    from data_pipelines.store import TokenStore
+    from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.tokens.store import TokenStore
     from hma_jax.tokenizers.io import load_tokenizer
 
     return Materials(
@@ -108,7 +108,7 @@ def train_trial(
     """
     import jax
 
-    from data_pipelines.loader import LoaderConfig, make_loader
+    from data_pipelines.loading.loader import LoaderConfig, make_loader
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
 
@@ -158,7 +158,7 @@ def evaluate_on(
     progress: Progress = lambda *_: None,
 ) -> Evaluation:
     """The protocol over the frozen windows of `names`; only the first batch of each on request."""
-    from data_pipelines.evalset import eval_batches
+    from data_pipelines.loading.evalset import eval_batches
     from hma_jax.evaluation.protocol import evaluate
 
     manifest = materials.manifest

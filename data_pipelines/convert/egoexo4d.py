@@ -24,7 +24,7 @@ from data_pipelines.convert.hands import LAYOUT, cut_episodes, destination
 from data_pipelines.convert.settings import EgoExo4dSettings
 from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
-from data_pipelines.rlds_writer import encode_jpeg
+from data_pipelines.rlds.writer import encode_jpeg
 from hma_jax.config import to_dict
 
 HZ = 30.0

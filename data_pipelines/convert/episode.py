@@ -16,9 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.example import encode_example
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.rlds_writer import STEP_FIELDS, TEXT, Field, step_features, vector_field
+from data_pipelines.rlds.example import encode_example
+from data_pipelines.rlds.writer import STEP_FIELDS, TEXT, Field, step_features, vector_field
 from hma_jax.config import ConfigError
 
 

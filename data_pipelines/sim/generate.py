@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds_writer import VERSION
+from data_pipelines.rlds.writer import VERSION
 from data_pipelines.sim.embodiments import select
 from data_pipelines.sim.packages import require_packages
 from data_pipelines.sim.spec import SimSpec

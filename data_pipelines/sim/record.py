@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines import rlds_writer
-from data_pipelines.example import encode_example
-from data_pipelines.rlds_writer import (
+from data_pipelines.rlds import writer as rlds_writer
+from data_pipelines.rlds.example import encode_example
+from data_pipelines.rlds.writer import (
     STEP_FIELDS,
     TEXT,
     Field,

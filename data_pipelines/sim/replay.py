@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.rlds import RldsDataset
+from data_pipelines.rlds.dataset import RldsDataset
 from data_pipelines.sim.embodiments import get_embodiment
 from data_pipelines.sim.episode import Replay, StartState, replay_episode
 from data_pipelines.sim.packages import prepare_process, require_packages

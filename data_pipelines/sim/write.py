@@ -15,12 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.rlds_writer import VERSION, shard_name, write_info
+from data_pipelines.rlds.tfrecord import write_shard
+from data_pipelines.rlds.writer import VERSION, shard_name, write_info
 from data_pipelines.sim.record import build_features
 from data_pipelines.sim.spec import SimSpec
 from data_pipelines.sim.worker import facts_path, record_path
 from data_pipelines.suite.write import SHARD_FRAMES
-from data_pipelines.tfrecord import write_shard
 
 STATS = "stats.json"
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines import rlds_writer
-from data_pipelines.example import encode_example
-from data_pipelines.rlds_writer import (
+from data_pipelines.rlds import writer as rlds_writer
+from data_pipelines.rlds.example import encode_example
+from data_pipelines.rlds.tfrecord import write_shard
+from data_pipelines.rlds.writer import (
     STEP_FIELDS,
     TEXT,
     Field,
@@ -29,7 +30,6 @@ from data_pipelines.suite.appearance import Appearance, draw_appearance
 from data_pipelines.suite.render import frame_index, render_frames
 from data_pipelines.suite.rollout import Rollout, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
-from data_pipelines.tfrecord import write_shard
 
 SHARD_FRAMES = 4000
 """About this many native frames go into one shard."""

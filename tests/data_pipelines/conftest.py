@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from data_pipelines.store import TokenStore
-from data_pipelines.tokenize_job import tokenize_dataset
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
 
 SPECS = {

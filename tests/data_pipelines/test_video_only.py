@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.loader import LoaderConfig, make_loader
-from data_pipelines.store import TokenStore
-from data_pipelines.tokenize_job import tokenize_dataset
+from data_pipelines.loading.loader import LoaderConfig, make_loader
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.commands import AXES, SCALING
+from experiments.commands.study import AXES, SCALING
 from experiments.ledger import Ledger
 from experiments.presets import SMOKE
 from experiments.provenance import Provenance

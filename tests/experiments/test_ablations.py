@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from experiments import ablate_conditioning, ablate_settings, scale_width
-from experiments.commands import draw
+from experiments.commands.study import draw
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.rows import curve, difference, read_csv
 from experiments.sweep import CONTROL, POINT, reference_trial, titles, unique_trials

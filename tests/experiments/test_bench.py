@@ -11,7 +11,7 @@ from experiments.bench.report import markdown
 from experiments.bench.rollout import agreement, time_rollouts
 from experiments.bench.timing import Timing, summarise, time_by_turns
 from experiments.bench.train import time_training
-from experiments.cli import main
+from experiments.cli.main import main
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig
 
 

@@ -8,8 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from experiments import commands, pipeline
-from experiments.cli import main
+import data_pipelines
+import experiments
+import hma_jax
+from experiments import pipeline
+from experiments.cli.main import main
+from experiments.commands import study as commands
 from experiments.ledger import Ledger
 from experiments.runner import read_states
 from experiments.workspace import Workspace, load_record, save_record
@@ -104,25 +108,31 @@ def test_sweep_modules_run_as_programs(module, shown):
     assert done.returncode == 0 and shown in done.stdout, done.stderr
 
 
-def test_experiments_do_not_import_in_a_circle():
+@pytest.mark.parametrize("package", [hma_jax, data_pipelines, experiments], ids=lambda p: p.__name__)
+def test_no_package_imports_in_a_circle(package):
     """Imports inside functions count too; those for type checking only do not."""
-    folder = Path(commands.__file__).parent
-    graph = {path.stem: imports_of(path) for path in folder.glob("*.py")}
-    assert "commands" in graph["cli"] and "scale_width" in graph["commands"]
+    root = Path(package.__file__).parent
+    files = {module_name(path, root.parent): path for path in root.rglob("*.py")}
+    graph = {name: imports_of(path, files) - {name} for name, path in files.items()}
+    assert sum(map(len, graph.values())) > len(graph)
     list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
 
 
-def imports_of(path):
-    """Modules of `experiments` that a file imports."""
+def module_name(path, root):
+    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
+
+
+def imports_of(path, known):
+    """Modules of `known` that a file imports."""
     tree = ast.parse(path.read_text())
     unseen = [n for n in tree.body if isinstance(n, ast.If) and getattr(n.test, "id", "") == "TYPE_CHECKING"]
     tree.body = [n for n in tree.body if n not in unseen]
-    names = []
+    found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
-            own = node.module == "experiments"
-            names += [f"experiments.{alias.name}" for alias in node.names] if own else [node.module]
-    return {name.split(".")[1] for name in names if name.startswith("experiments.")}
+            inner = {f"{node.module}.{alias.name}" for alias in node.names} & set(known)
+            found |= inner or ({node.module} & set(known))
+    return found
 
 
 def test_a_study_is_the_scaling_axes_only(capsys):

@@ -19,8 +19,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
-from experiments import pipeline, registry_commands
-from experiments.cli import main
+from experiments import pipeline
+from experiments.cli.main import main
+from experiments.commands import registry as registry_commands
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
 from tests.data_pipelines.fakes import make_spec, write_rlds

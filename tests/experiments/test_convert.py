@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from experiments.cli import main
+from experiments.cli.main import main
 
 CHECKPOINT = Path(__file__).parent.parent / "golden" / "04_discrete_mlp"
 

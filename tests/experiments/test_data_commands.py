@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from data_pipelines.store import TokenStore
-from experiments.cli import main
+from data_pipelines.tokens.store import TokenStore
+from experiments.cli.main import main
 from tests.data_pipelines.convert.sources import hand, write_epic, write_lerobot, write_robomimic
-from tests.data_pipelines.test_import_tokens import write_folder
+from tests.data_pipelines.tokens.test_import_tokens import write_folder
 
 FORMATS = ("robomimic", "lerobot", "epic-kitchens", "ego4d", "egoexo4d")
 
@@ -49,7 +49,7 @@ def test_a_conversion_says_what_it_wrote_the_entry_and_what_is_next(tmp_path, ca
 
 def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):
     from data_pipelines.registry import DatasetSpec
-    from data_pipelines.rlds import RldsDataset
+    from data_pipelines.rlds.dataset import RldsDataset
 
     root = write_lerobot(tmp_path / "My Robot", "v3.0")
     assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_pipelines.inspect import Shown
+from data_pipelines.inspection.inspect import Shown
 from data_pipelines.registry import table as registry_table
-from experiments.cli import main
-from experiments.commands import find_directories, make_setting
+from experiments.cli.main import main
+from experiments.commands.study import find_directories, make_setting
 from experiments.contact_sheet import TILE, draw_sheet
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds

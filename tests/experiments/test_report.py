@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from experiments.commands import draw
+from experiments.commands.study import draw
 from experiments.rows import OVERALL, Row, curve, read_csv, tally, write_csv
 from experiments.scale_datasets import plan as plan_datasets
 from experiments.scale_width import plan as plan_width

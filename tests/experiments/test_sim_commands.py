@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from experiments.cli import main
+from experiments.cli.main import main
 from tests.data_pipelines.sim.fakes import fake_workers
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from experiments import pipeline
-from experiments.cli import main
-from experiments.commands import make_setting
+from experiments.cli.main import main
+from experiments.commands.study import make_setting
 from experiments.progress import Pace
 from tests.data_pipelines.fakes import write_rlds
-from tests.data_pipelines.job_process import contents
+from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from experiments import transfer_lr
-from experiments.commands import draw
+from experiments.commands.study import draw
 from experiments.optima import find_optima
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.rows import LOSS, TRAINING, curve, read_csv

@@ -10,9 +10,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipelines.images import fit_image
-from data_pipelines.mixture import mixture_weights
+from data_pipelines.loading.mixture import mixture_weights
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.rlds.images import fit_image
 from hma_jax.config import DiffusionConfig, ModelConfig, OptimizerConfig
 from hma_jax.convert.table import official_parts
 from hma_jax.decoding import masked_counts

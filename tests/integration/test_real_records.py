@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import table as registry_table
-from experiments.cli import main
+from experiments.cli.main import main
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
 
 

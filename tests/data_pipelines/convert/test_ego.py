@@ -14,7 +14,6 @@ from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, number, read_back, write_video
 
-
 # --- Ego4D: a video of 10 frames per second, whose frame n is number n ---------------------------
 
 UID = "0a1b"

@@ -11,7 +11,7 @@ import pytest
 from data_pipelines.registry import all_specs, get_spec
 from data_pipelines.sim import EMBODIMENTS, select
 from data_pipelines.sim.packages import MODULES
-from experiments.sim_commands import PRESETS
+from experiments.commands.sim import PRESETS
 from hma_jax.config import ConfigError
 
 SIX_SECONDS = 6.0

@@ -1,0 +1,148 @@
+"""The registry entry that the facts of a dataset suggest, and what an entry gives for it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.inspection.inspect import CameraFacts, Facts
+from data_pipelines.loading.windows import count_windows
+from data_pipelines.registry import DatasetSpec
+
+ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
+OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)
+NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
+
+NO_RATE = 0.0
+"""Stands in an entry for a rate that nobody gave; a `DatasetSpec` refuses it."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """The fields of an entry, and why."""
+
+    name: str
+    image_key: str
+    action_keys: tuple[str, ...]
+    action_dims: tuple[int, ...]
+    hz: float
+    split: str
+    version: str
+    video_targets: bool
+    reasons: tuple[str, ...]
+
+    def spec(self) -> DatasetSpec:
+        """As an entry. Raises ConfigError while the rate is missing."""
+        return DatasetSpec(
+            self.name, self.image_key, self.action_keys, self.action_dims, self.hz,
+            split=self.split, video_targets=self.video_targets, version=self.version,
+        )  # fmt: skip
+
+    def python(self) -> str:
+        """Text that pastes into the table `OWN` of data_pipelines/registry/own.py."""
+        rate = f"{self.hz:g}," if self.hz else "0,  # FILL IN: frames per second of the recording"
+        lines = [
+            "    DatasetSpec(",
+            f"        {_text(self.name)},",
+            f"        image_key={_text(self.image_key)},",
+            f"        action_keys={_tuple(map(_text, self.action_keys))},",
+            f"        action_dims={_tuple(map(str, self.action_dims))},",
+            f"        hz={rate}",
+        ]
+        if self.split != "train":
+            lines.append(f"        split={_text(self.split)},")
+        if not self.video_targets:
+            lines.append("        video_targets=False,  # its camera shows nothing")
+        if self.version:
+            lines.append(f"        version={_text(self.version)},")
+        return "\n".join([*lines, "    ),"])
+
+
+@dataclass(frozen=True)
+class WindowFacts:
+    """What an entry gives at a number of frames."""
+
+    frames: int
+    stride: int
+    needed: int  # native frames of a window
+    long_enough: int  # sampled episodes with a window
+    per_episode: float  # windows, over the sampled episodes
+    total: float  # windows of the split, estimated
+
+
+def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
+    """An entry for a dataset that the registry does not know; None when it has no camera at all."""
+    camera, why = choose_camera(facts.cameras)
+    if camera is None:
+        return None
+    keys, dims, about = _choose_actions(facts)
+    reasons = [f"camera: {why}", f"action: {about}"]
+    if not hz:
+        reasons.append("hz: not in the files; say it with --hz, or fill it in")
+    return Suggestion(
+        facts.name, camera.key, keys, dims, hz or NO_RATE, facts.split, facts.version,
+        not camera.is_blank, tuple(reasons),
+    )  # fmt: skip
+
+
+def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, str]:
+    """The camera to use, and why: one that shows something and does not ride on the arm."""
+    if not cameras:
+        return None, "there is none"
+    seeing = [c for c in cameras if not c.is_blank]
+    if not seeing:
+        return cameras[0], "every camera is blank; nothing to predict"
+
+    def rank(camera: CameraFacts) -> tuple:
+        name = camera.key.rsplit("/", 1)[-1]
+        plain = name in ("image", "rgb", "image_0", "image_1")
+        return bool(ON_THE_ARM.search(name)), not plain, not OUTSIDE.search(name), camera.key
+
+    best = min(seeing, key=rank)
+    blank = [c.key for c in cameras if c.is_blank]
+    why = f"of {len(cameras)}" + (f", {len(blank)} of them blank" if blank else "")
+    where = "rides on the arm, as all do" if ON_THE_ARM.search(best.key) else "by its name not on the arm"
+    return best, f"{best.key.removeprefix('observation/')} {why}; {where}"
+
+
+def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str]:
+    by_key = {a.key: a for a in facts.actions}
+    if "action" in by_key:
+        keys = ["action"]
+    else:
+        keys = [k for k in by_key if k.startswith("action/") and not NO_ACTION.search(k)]
+    if not keys:
+        return (), (), "no numeric field `action`: video alone"
+    names, dims, dropped = [], [], []
+    for key in keys:
+        hints = [d.hint for d in by_key[key].dimensions]
+        size = len(hints)
+        while size > 1 and hints[size - 1] == "end flag":
+            size -= 1
+        names.append(key if size == len(hints) else f"{key}[:{size}]")
+        dims.append(size)
+        dropped += [f"{key}[{i}]" for i in range(size, len(hints))]
+    about = f"{sum(dims)} values" + (f"; left out as end flags: {', '.join(dropped)}" if dropped else "")
+    others = [k for k in by_key if k not in keys and not NO_ACTION.search(k)]
+    if others:
+        about += f"; there are also {', '.join(others)}"
+    return tuple(names), tuple(dims), about
+
+
+def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:
+    """Windows of `frames` at `stride`, counted over the sampled episodes."""
+    counts = count_windows(np.array(facts.steps), frames, stride, stride)
+    mean = float(counts.mean())
+    return WindowFacts(frames, stride, frames * stride, int((counts > 0).sum()), mean, mean * facts.episodes)
+
+
+def _text(value: str) -> str:
+    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _tuple(values) -> str:
+    items = list(values)
+    return f"({', '.join(items)}{',' if len(items) == 1 else ''})"

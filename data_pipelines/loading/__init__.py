@@ -1,0 +1,1 @@
+"""From episodes to batches: splits, windows, mixture, order, and the frozen evaluation windows."""

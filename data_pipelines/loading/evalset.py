@@ -1,0 +1,190 @@
+"""The frozen evaluation set: which held-out windows every trial of a study is measured on.
+
+Owns the choice of windows, its file, and their batches. Measures nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from data_pipelines.loading.order import hash64, stream_seed
+from data_pipelines.loading.windows import cut_actions, cut_frames, cut_tokens, require_windows, val_windows
+from data_pipelines.tokens.store import TokenStore
+from hma_jax.config import ConfigError, from_dict, require, stable_hash, to_dict
+from hma_jax.embodiments import EmbodimentTable
+
+
+@dataclass(frozen=True)
+class DatasetWindows:
+    """The windows of one dataset: (episode position in the val split, start) pairs."""
+
+    dataset: str
+    windows: tuple[tuple[int, int], ...]
+    reason: str = ""  # why there are none
+
+
+@dataclass(frozen=True)
+class EvalManifest:
+    """A frozen choice of held-out windows. Datasets are sorted by name."""
+
+    frames: int  # T
+    seed: int
+    spacing: int  # model frames between starts of windows in one episode
+    store: str  # hash of the datasets' manifests
+    datasets: tuple[DatasetWindows, ...] = field(default_factory=tuple)
+
+    def hash(self) -> str:
+        return stable_hash(self)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Datasets that have windows."""
+        return tuple(d.dataset for d in self.datasets if d.windows)
+
+    @property
+    def empty(self) -> dict[str, str]:
+        """Datasets without a window, and why."""
+        return {d.dataset: d.reason for d in self.datasets if not d.windows}
+
+    def save(self, path: str | Path) -> None:
+        """Writes JSON with its own hash; whole or not at all. ConfigError if it cannot be written."""
+        path = Path(path)
+        aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            aside.write_text(json.dumps({"hash": self.hash(), **to_dict(self)}, indent=1) + "\n")
+            os.replace(aside, path)
+        except OSError as error:
+            reason = error.strerror or error
+            raise ConfigError(f"{path}: cannot be written ({reason}). Choose another path.") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> EvalManifest:
+        """Reads what `save` wrote. Raises DataError if it is missing, damaged or was edited."""
+        advice = "Freeze the evaluation set again; results on the old one are not comparable."
+        try:
+            values = json.loads(Path(path).read_text())
+            stated = values.pop("hash", None)
+            manifest = from_dict(cls, values)
+        except OSError as error:
+            reason = error.strerror or error
+            raise DataError(f"{path}: the evaluation set cannot be read ({reason}). {advice}") from error
+        except (ValueError, AttributeError, TypeError) as error:
+            raise DataError(f"{path}: not an evaluation set ({error}). {advice}") from error
+        if manifest.hash() != stated:
+            raise DataError(f"{path}: its contents do not match its hash {stated}: it was changed. {advice}")
+        return manifest
+
+
+def freeze_manifest(
+    store: TokenStore,
+    datasets: Sequence[str],
+    frames: int,
+    windows_per_dataset: int,
+    seed: int,
+    *,
+    spacing: int | None = None,
+) -> EvalManifest:
+    """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.
+
+    Starts within an episode lie `spacing` model frames apart; the default, `frames`, makes
+    windows disjoint, so that standard errors do not count the same pixels twice.
+    DIFFERS: the release evaluates the first windows of each dataset (reference section 5.6).
+
+    Raises DataError if no dataset has a window.
+    """
+    spacing = frames if spacing is None else spacing
+    require(windows_per_dataset >= 1, f"windows_per_dataset must be at least 1, got {windows_per_dataset}")
+    require(spacing >= 1, f"spacing must be at least 1, got {spacing}")
+    require(len(datasets) >= 1, "no dataset was given to evaluate on")
+    sets = {name: val_windows(store, name, frames) for name in sorted(set(datasets))}
+    require_windows(sets)
+    chosen = []
+    for name, windows in sets.items():
+        manifest = store.manifest(name)
+        step = spacing * manifest.stride // manifest.frame_step
+        apart = np.flatnonzero(windows.start % step == 0)
+        order = np.argsort(hash64(apart, stream_seed(seed, "evaluation", name)), kind="stable")
+        picked = np.sort(apart[order[:windows_per_dataset]])
+        pairs = tuple(windows.locate(int(i)) for i in picked)
+        chosen.append(DatasetWindows(name, pairs, "" if pairs else windows.shortage()))
+    return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen))
+
+
+def eval_batches(
+    store: TokenStore,
+    table: EmbodimentTable,
+    manifest: EvalManifest,
+    batch: int,
+    datasets: Sequence[str] | None = None,
+) -> Iterator[dict]:
+    """Batches of the frozen windows, one dataset at a time, each padded to `batch` rows.
+
+    `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C], `actions` float32 [B, T, U] (raw
+    units), `embodiment` int32 [B], `frames` uint8 [B, T, H, W, 3], `window` int32 [B] (number of
+    the window in the manifest, the same whatever the batch size and choice of datasets), `valid`
+    bool [B] (False for padding, which repeats the last window) and `dataset`, its name.
+
+    Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
+    dataset is not in the manifest or in `table`.
+    """
+    require(batch >= 1, f"batch must be at least 1, got {batch}")
+    frozen = {d.dataset: d for d in manifest.datasets}
+    wanted = manifest.names if datasets is None else tuple(datasets)
+    unknown = [name for name in wanted if name not in frozen]
+    require(not unknown, f"not in the evaluation set: {', '.join(unknown)}; it has {', '.join(frozen)}")
+    require(
+        store.hash(tuple(frozen)) == manifest.store,
+        f"{store.root}: the token store is not the one the evaluation set was frozen on. "
+        "Freeze it again, or restore the store.",
+    )
+    for name in wanted:
+        require(
+            store.manifest(name).settings.keep_frames != "none",
+            f"{store.root / name}: no raw frames to compare with. Tokenise it with keep_frames='val'.",
+        )
+    store.check_table(table, wanted)
+    return _batches(store, table, manifest, batch, wanted)
+
+
+def _batches(
+    store: TokenStore, table: EmbodimentTable, manifest: EvalManifest, batch: int, wanted: Sequence[str]
+) -> Iterator[dict]:
+    first = dict(zip((d.dataset for d in manifest.datasets), _offsets(manifest), strict=True))
+    windows = {d.dataset: d.windows for d in manifest.datasets}
+    for name in wanted:
+        for at in range(0, len(windows[name]), batch):
+            count = min(batch, len(windows[name]) - at)
+            rows = [min(at + k, at + count - 1) for k in range(batch)]
+            items = [_window(store, table, manifest.frames, name, *windows[name][row]) for row in rows]
+            yield {
+                **{key: np.stack([item[key] for item in items]) for key in items[0]},
+                "embodiment": np.full(batch, table.index(name), np.int32),
+                "window": np.asarray([first[name] + row for row in rows], np.int32),
+                "valid": np.arange(batch) < count,
+                "dataset": name,
+            }
+
+
+def _offsets(manifest: EvalManifest) -> list[int]:
+    counts = [len(d.windows) for d in manifest.datasets]
+    return [sum(counts[:k]) for k in range(len(counts))]
+
+
+def _window(
+    store: TokenStore, table: EmbodimentTable, frames: int, name: str, episode: int, start: int
+) -> dict[str, np.ndarray]:
+    facts = store.manifest(name)
+    item = store.episode(name, "val", episode)
+    return {
+        "tokens": cut_tokens(item, start, frames, facts),
+        "actions": cut_actions(item, start, frames, facts, table.action_width),
+        "frames": cut_frames(item.frames, start, frames, facts),
+    }

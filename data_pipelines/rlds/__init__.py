@@ -1,0 +1,1 @@
+"""RLDS, read and written without TensorFlow: shards, records, features, images, wherever they lie."""

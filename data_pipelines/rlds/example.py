@@ -1,0 +1,245 @@
+"""tf.train.Example without TensorFlow: bytes to arrays and back.
+
+Owns the wire format of that one message, nothing of RLDS. Only the wanted features are
+decoded and long lists go through numpy, which is faster than a general protobuf message
+when an episode's record holds cameras and embeddings that nobody asked for; of a record that
+is a view into a file, the others are not even read.
+
+Message (protobuf field numbers): Example{1: Features}, Features{1: map entries {1: key,
+2: Feature}}, Feature{1: BytesList | 2: FloatList | 3: Int64List}, each list {1: values}.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+
+if TYPE_CHECKING:
+    from data_pipelines.rlds.tfrecord import FileView
+
+Feature = np.ndarray | Sequence[bytes]
+
+_BYTES, _FLOAT, _INT = 1, 2, 3  # field numbers inside Feature
+_VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5  # wire types
+
+
+class LazyBytes(Sequence[bytes]):
+    """The n values of a bytes feature, each cut from the record when it is asked for."""
+
+    def __init__(self, data: bytes | FileView, spans: Sequence[tuple[int, int]]):
+        self._data, self._spans = data, spans
+
+    def __len__(self) -> int:
+        return len(self._spans)
+
+    def __getitem__(self, i: int) -> bytes:
+        start, end = self._spans[i]
+        return self._data[start:end]
+
+
+def parse_example(
+    data: bytes | FileView, keys: Collection[str] | None = None, lazy: bool = False
+) -> dict[str, Feature]:
+    """The features of a serialized tf.train.Example, by flat key.
+
+    A float feature is float32 [n], an integer feature int64 [n], a bytes feature a list of
+    n `bytes`. A feature without a value is an empty list. With `keys`, other features are
+    skipped unread; a wanted key that the record lacks is absent from the result. With `lazy`,
+    bytes features are `LazyBytes`, which need `data` as long as they live.
+
+    Raises DataError if `data` is not such a message.
+    """
+    wanted = None if keys is None else {k.encode() for k in keys}
+    found: dict[str, Feature] = {}
+    try:
+        for number, start, end in _messages(data, 0, len(data)):
+            if number != 1:
+                continue
+            for entry, entry_start, entry_end in _messages(data, start, end):
+                if entry != 1:
+                    continue
+                key, value = b"", (entry_end, entry_end)
+                for field, a, b in _messages(data, entry_start, entry_end):
+                    if field == 1:
+                        key = data[a:b]
+                    elif field == 2:
+                        value = (a, b)
+                if wanted is None or key in wanted:
+                    found[key.decode()] = _parse_feature(data, *value, lazy)
+    except (IndexError, ValueError, struct.error) as error:
+        raise DataError(f"the record is not a tf.train.Example ({error})") from error
+    return found
+
+
+def encode_example(features: Mapping[str, np.ndarray | list[bytes]]) -> bytes:
+    """A serialized tf.train.Example; the same features always give the same bytes.
+
+    Float arrays become float32 lists, integer and bool arrays int64 lists (both flattened),
+    lists of `bytes` bytes lists. Keys are written in sorted order.
+    """
+    entries = []
+    for key in sorted(features):
+        feature = _encode_feature(key, features[key])
+        entry = _field(1, key.encode()) + _field(2, feature)
+        entries.append(_field(1, entry))
+    return _field(1, b"".join(entries))
+
+
+# --- reading ---------------------------------------------------------------------------------
+
+
+def _varint(data: bytes | FileView, at: int) -> tuple[int, int]:
+    """(value, next position) of the varint at `at`."""
+    byte = data[at]
+    at += 1
+    if byte < 0x80:
+        return byte, at
+    value, shift = byte & 0x7F, 7
+    while True:
+        byte = data[at]
+        at += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, at
+        shift += 7
+        if shift > 63:
+            raise ValueError(f"a varint longer than 10 bytes at byte {at}")
+
+
+def _messages(data: bytes | FileView, at: int, end: int):
+    """(field number, start, end) of each length-delimited field in data[at:end]."""
+    while at < end:
+        tag, at = _varint(data, at)
+        wire = tag & 7
+        if wire == _LENGTH:
+            length, at = _varint(data, at)
+            stop = at + length
+            if stop > end:
+                raise ValueError(f"a field at byte {at} runs past the end of its message")
+            yield tag >> 3, at, stop
+            at = stop
+        else:  # unknown to this message; skip it as protobuf does
+            at = _skip(data, at, wire)
+
+
+def _skip(data: bytes | FileView, at: int, wire: int) -> int:
+    if wire == _VARINT:
+        return _varint(data, at)[1]
+    if wire == _FIXED64:
+        return at + 8
+    if wire == _FIXED32:
+        return at + 4
+    raise ValueError(f"unknown wire type {wire} at byte {at}")
+
+
+def _parse_feature(data: bytes | FileView, start: int, end: int, lazy: bool) -> Feature:
+    kind, parts = 0, []
+    for number, a, b in _messages(data, start, end):
+        if number != kind:  # a oneof: the last kind wins, pieces of one kind are joined
+            kind, parts = number, []
+        parts.append((a, b))
+    if kind == _FLOAT:
+        return _join([piece for a, b in parts for piece in _floats(data, a, b)], np.float32)
+    if kind == _INT:
+        return _join([piece for a, b in parts for piece in _ints(data, a, b)], np.int64)
+    spans = [(x, y) for a, b in parts for number, x, y in _messages(data, a, b) if number == 1]
+    return LazyBytes(data, spans) if lazy else [data[x:y] for x, y in spans]
+
+
+def _join(pieces: list[np.ndarray], dtype: type) -> np.ndarray:
+    if len(pieces) == 1:
+        return pieces[0]
+    return np.concatenate(pieces) if pieces else np.zeros(0, dtype)
+
+
+def _floats(data: bytes | FileView, at: int, end: int):
+    while at < end:
+        tag, at = _varint(data, at)
+        if tag == (1 << 3 | _LENGTH):  # packed, what every writer does
+            length, at = _varint(data, at)
+            _check_inside(at + length, end)
+            if length % 4:
+                raise ValueError(f"a list of floats at byte {at} is {length} bytes long")
+            yield np.frombuffer(data[at : at + length], "<f4")
+            at += length
+        elif tag == (1 << 3 | _FIXED32):
+            _check_inside(at + 4, end)
+            yield np.frombuffer(data[at : at + 4], "<f4")
+            at += 4
+        else:
+            at = _skip(data, at, tag & 7)
+
+
+def _ints(data: bytes | FileView, at: int, end: int):
+    while at < end:
+        tag, at = _varint(data, at)
+        if tag == (1 << 3 | _LENGTH):
+            length, at = _varint(data, at)
+            _check_inside(at + length, end)
+            yield _varints(np.frombuffer(data[at : at + length], np.uint8))
+            at += length
+        elif tag == (1 << 3 | _VARINT):
+            start = at
+            _, at = _varint(data, at)
+            yield _varints(np.frombuffer(data[start:at], np.uint8))
+        else:
+            at = _skip(data, at, tag & 7)
+
+
+def _check_inside(stop: int, end: int) -> None:
+    if stop > end:
+        raise ValueError(f"a list of numbers runs past the end of its message at byte {end}")
+
+
+def _varints(raw: np.ndarray) -> np.ndarray:
+    """int64 values of packed varints (uint8 bytes), all at once."""
+    last = raw < 0x80
+    if last.all():  # flags and small numbers
+        return raw.astype(np.int64)
+    if not last[-1]:
+        raise ValueError("a varint is cut off")
+    ends = np.flatnonzero(last)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    if (ends - starts).max() > 9:
+        raise ValueError("a varint is longer than 10 bytes")
+    position = np.arange(raw.size) - np.repeat(starts, ends - starts + 1)
+    bits = (raw & 0x7F).astype(np.uint64) << (7 * position).astype(np.uint64)
+    return np.bitwise_or.reduceat(bits, starts).view(np.int64)
+
+
+# --- writing ---------------------------------------------------------------------------------
+
+
+def _encode_feature(key: str, value: np.ndarray | list[bytes]) -> bytes:
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        return _field(_FLOAT, _field(1, np.ascontiguousarray(value, "<f4").tobytes()))
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iub":
+        flat = value.reshape(-1)
+        small = flat.size == 0 or (flat.min() >= 0 and flat.max() < 0x80)
+        packed = flat.astype(np.uint8).tobytes() if small else b"".join(map(_encode_varint, flat.tolist()))
+        return _field(_INT, _field(1, packed))
+    if isinstance(value, list) and all(isinstance(v, bytes) for v in value):
+        return _field(_BYTES, b"".join(_field(1, v) for v in value))
+    raise DataError(
+        f"feature {key!r} cannot be stored in a tf.train.Example: give a float, integer or bool array "
+        f"or a list of bytes, not {type(value).__name__}"
+    )
+
+
+def _encode_varint(value: int) -> bytes:
+    value &= (1 << 64) - 1  # negative numbers as two's complement
+    out = bytearray()
+    while value >= 0x80:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _field(number: int, payload: bytes) -> bytes:
+    return _encode_varint(number << 3 | _LENGTH) + _encode_varint(len(payload)) + payload

@@ -1,0 +1,246 @@
+"""TFRecord files as random-access storage: index, read one record, write.
+
+Owns the framing and its checksums. Does not know what is inside a record (see `example`).
+
+A record is: length (uint64), checksum of the length (uint32), payload, checksum of the
+payload (uint32), all little-endian. As lengths are known from the headers, a scan that skips
+payloads gives the place of every record, and any record is then one read away. Records of
+hundreds of megabytes are never held: their checksum is taken in pieces, and their bytes are
+read where they are looked at. Nothing here keeps a file open beyond a call or a `with`, so
+readers pickle and are safe in threads.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import google_crc32c
+import numpy as np
+
+from data_pipelines.errors import CorruptRecordError
+from data_pipelines.rlds.location import DiskFile, Ranges, is_remote, locate, open_ranges
+
+if TYPE_CHECKING:
+    from data_pipelines.rlds.location import Location
+
+HEADER = 12  # bytes: length and its checksum
+FOOTER = 4  # bytes: checksum of the payload
+
+WHOLE = 16 * 2**20
+"""Records up to this many bytes are read at once, larger ones where they are looked at."""
+
+CHUNK = 4 * 2**20
+"""Bytes of a large record that are in memory while its checksum is taken."""
+
+BLOCK = 4096
+"""Bytes read at least: the few bytes asked for next are mostly among them."""
+
+SCAN_BLOCK = 65536
+"""The same for the scan of a remote shard, where a request costs more than its bytes."""
+
+
+@dataclass(frozen=True)
+class ShardIndex:
+    """Where the records of one file are, and the checksums that stand behind them."""
+
+    path: Location
+    offsets: np.ndarray  # int64 [records]: first byte of the header
+    lengths: np.ndarray  # int64 [records]: bytes of the payload
+    checksums: np.ndarray  # uint32 [records]: of the payload, as stored, not verified
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+
+def masked_crc32c(data: bytes) -> int:
+    """CRC-32C, rotated and offset as the TFRecord format asks."""
+    return _mask(google_crc32c.value(data))
+
+
+def _mask(crc: int) -> int:
+    return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def index_shard(path: str | Location) -> ShardIndex:
+    """The place of every record, from a scan that skips the payloads.
+
+    Raises CorruptRecordError where a header's checksum is wrong or the file ends inside a
+    record; payload checksums are verified by `read_record`. A file of 0 bytes has 0 records.
+    """
+    index, damage = scan_shard(path)
+    if damage is not None:
+        raise damage
+    return index
+
+
+def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | None]:
+    """`index_shard` that returns what it could index, and what stopped it.
+
+    After a damaged header the place of the next record is unknown, so the rest of the file
+    is lost: records before it are indexed, nothing behind it. The scan holds one block.
+    """
+    path = locate(path)
+    offsets: list[int] = []
+    lengths: list[int] = []
+    checksums: list[int] = []
+    damage = None
+    with open_ranges(path) as file:
+        size = file.size
+        view = FileView(file, 0, size, SCAN_BLOCK if is_remote(path) else FOOTER + HEADER)
+        offset = 0
+        header = view[:HEADER]
+        while offset < size:
+            if len(header) < HEADER:
+                reason = f"the file ends inside a record header, at byte {size}"
+                damage = CorruptRecordError(path, offset, reason)
+                break
+            length, crc = struct.unpack("<QI", header)
+            if masked_crc32c(header[:8]) != crc:
+                reason = "the checksum of the record's length does not match"
+                damage = CorruptRecordError(path, offset, reason)
+                break
+            end = offset + HEADER + length + FOOTER
+            if end > size:
+                reason = f"the file is truncated: the record needs bytes up to {end}, the file has {size}"
+                damage = CorruptRecordError(path, offset, reason)
+                break
+            between = view[end - FOOTER : end + HEADER]  # this footer, the next header
+            offsets.append(offset)
+            lengths.append(length)
+            checksums.append(struct.unpack("<I", between[:FOOTER])[0])
+            offset, header = end, between[FOOTER:]
+    index = ShardIndex(
+        path,
+        np.asarray(offsets, np.int64),
+        np.asarray(lengths, np.int64),
+        np.asarray(checksums, np.uint32),
+    )
+    return index, damage
+
+
+def read_record(path: str | Location, offset: int, length: int, verify: bool = True) -> bytes:
+    """The payload of `length` bytes of the record that starts at byte `offset` of `path`.
+
+    Raises CorruptRecordError if the file is shorter than its index says or, with `verify`,
+    if the payload does not match its checksum.
+    """
+    path = locate(path)
+    with open_ranges(path) as file:
+        body = _read(file, path, offset, offset + HEADER, length + FOOTER)
+    payload = body[:length]
+    if verify:
+        _verify(masked_crc32c(payload), body[length:], path, offset)
+    return payload
+
+
+@contextmanager
+def open_record(path: str | Location, offset: int, length: int) -> Iterator[bytes | FileView]:
+    """The verified payload of a record, for the time of a `with`, in bounded memory.
+
+    Up to WHOLE bytes it is read at once. A larger one is verified in pieces and then a view
+    that reads what is looked at; from a remote store it passes through an unnamed temporary
+    file, so that every byte is fetched once. Raises CorruptRecordError as `read_record` does.
+    """
+    path = locate(path)
+    if length <= WHOLE:
+        yield read_record(path, offset, length)
+        return
+    with open_ranges(path) as file:
+        footer = _read(file, path, offset, offset + HEADER + length, FOOTER)
+        if not is_remote(path):
+            _verify(_stream(file, path, offset, length, None), footer, path, offset)
+            yield FileView(file, offset + HEADER, length)
+            return
+        with tempfile.TemporaryFile() as copy:
+            _verify(_stream(file, path, offset, length, copy), footer, path, offset)
+            copy.flush()
+            yield FileView(DiskFile(copy.fileno()), 0, length)
+
+
+class FileView:
+    """A part of an open file that is indexed and sliced like `bytes`, and read on demand.
+
+    Not safe in threads: it remembers the block it read last.
+    """
+
+    def __init__(self, file: Ranges, start: int, length: int, block: int = BLOCK):
+        self._file, self._start, self._length, self._size = file, start, length, block
+        self._at, self._block = 0, b""
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, key: int | slice):
+        """An int for a position, `bytes` for a slice without a step; no negative positions."""
+        if isinstance(key, slice):
+            begin, end, _ = key.indices(self._length)
+            return self._bytes(begin, max(end - begin, 0))
+        if not 0 <= key < self._length:
+            raise IndexError(f"byte {key} of {self._length}")
+        return self._bytes(key, 1)[0]
+
+    def _bytes(self, at: int, count: int) -> bytes:
+        first = at - self._at
+        if first < 0 or first + count > len(self._block):
+            if count >= self._size:
+                return self._file.read(self._start + at, count)
+            self._block = self._file.read(self._start + at, min(self._size, self._length - at))
+            self._at, first = at, 0
+        return self._block[first : first + count]
+
+
+def _read(file: Ranges, path: Location, record: int, at: int, length: int) -> bytes:
+    """Exactly `length` bytes of the record that starts at byte `record`."""
+    try:
+        data = file.read(at, length)
+    except OSError as error:
+        raise CorruptRecordError(path, record, f"it cannot be read ({error.strerror})") from error
+    if len(data) < length:
+        raise CorruptRecordError(path, record, "the file has become shorter since it was indexed")
+    return data
+
+
+def _stream(file: Ranges, path: Location, offset: int, length: int, copy) -> int:
+    """The masked checksum of a payload, read in pieces that are also written to `copy`."""
+    crc, at = 0, offset + HEADER
+    for begin in range(at, at + length, CHUNK):
+        piece = _read(file, path, offset, begin, min(CHUNK, at + length - begin))
+        crc = google_crc32c.extend(crc, piece)
+        if copy is not None:
+            copy.write(piece)
+    return _mask(crc)
+
+
+def _verify(crc: int, footer: bytes, path: Location, offset: int) -> None:
+    if crc != struct.unpack("<I", footer)[0]:
+        raise CorruptRecordError(path, offset, "the checksum of the record's data does not match")
+
+
+def write_shard(path: str | Path, records: Iterable[bytes]) -> int:
+    """Writes `records` as one TFRecord file and returns their number.
+
+    The file appears under its name only when it is complete.
+    """
+    path = Path(path)
+    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    count = 0
+    try:
+        with open(aside, "wb") as out:
+            for record in records:
+                length = struct.pack("<Q", len(record))
+                out.write(length + struct.pack("<I", masked_crc32c(length)))
+                out.write(record)
+                out.write(struct.pack("<I", masked_crc32c(record)))
+                count += 1
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+    return count
+

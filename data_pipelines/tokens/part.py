@@ -1,0 +1,176 @@
+"""One part of a dataset in the token store: its files, and the facts that say it is complete.
+
+Owns how a part is written, recognised and described. A part holds the episodes of a range of
+the source; which ranges there are depends on the source alone, so that any number of
+processes, killed and started again, make the same files.
+
+    <dataset>/train-00003-of-00120.array_record   its training episodes, if any
+    <dataset>/val-00003-of-00120.array_record     its held-out episodes, if any
+    <dataset>/parts/00003.json                    its facts, in place only after the others
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from array_record.python import array_record_module
+
+from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
+from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
+from data_pipelines.tokens.moments import Moments, merge_all
+from hma_jax.config import ConfigError, from_dict, to_dict
+
+FACTS = "parts"
+"""Directory of the facts of all parts."""
+
+Made = tuple[str, StoredEpisode] | Loss
+"""What a part is made of: episodes with their split, and what could not be used."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Part `number` of `count`: the episodes [first, end) of the source."""
+
+    number: int
+    count: int
+    first: int
+    end: int
+
+    @property
+    def episodes(self) -> range:
+        return range(self.first, self.end)
+
+
+@dataclass(frozen=True)
+class PartSplit:
+    """The episodes of one split in one part, in store order."""
+
+    episodes: tuple[int, ...]  # index in the source
+    steps: tuple[int, ...]  # native frames N
+    content: str  # hash over the records
+    size: int  # bytes of the file; 0: there is none
+
+
+@dataclass(frozen=True)
+class PartFacts:
+    part: Part
+    train: PartSplit
+    val: PartSplit
+    moments: Moments  # of the native actions of the train split
+    lost: tuple[Loss, ...]
+
+
+def write_part(
+    directory: Path, part: Part, made: Iterable[Made], aside: Path, action_dim: int, keep_frames: set[str]
+) -> PartFacts:
+    """Writes `made` as the part of the dataset in `directory`, by way of the directory `aside`.
+
+    A part is there as a whole or not at all; one that is there is replaced. `keep_frames`:
+    splits whose records hold frames. Raises OSError.
+    """
+    writers = {
+        split: _SplitWriter(aside / part_name(split, part.number, part.count), split in keep_frames)
+        for split in SPLITS
+    }
+    lost: list[Loss] = []
+    moments = []
+    for item in made:
+        if isinstance(item, Loss):
+            lost.append(item)
+            continue
+        split, episode = item
+        if split == "train" and len(episode.actions):
+            moments.append(Moments.of(episode.actions))
+        writers[split].add(episode)
+    splits = [writers[split].close() for split in SPLITS]
+    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost))
+    facts_aside = aside / "facts.json"
+    facts_aside.write_text(json.dumps(to_dict(facts)))
+    sync(facts_aside)
+    for split, values in zip(SPLITS, splits, strict=True):
+        place = directory / part_name(split, part.number, part.count)
+        if values.size:
+            os.replace(aside / place.name, place)
+        else:
+            place.unlink(missing_ok=True)
+    os.replace(facts_aside, _facts_path(directory, part))
+    sync(directory)
+    return facts
+
+
+def read_part(directory: Path, part: Part) -> PartFacts | None:
+    """The facts of a finished part; None if it is not there, or not as it was written.
+
+    Files are judged by their size: that finds what a crash or a full disk leaves behind.
+    """
+    try:
+        facts = from_dict(PartFacts, json.loads(_facts_path(directory, part).read_text()))
+    except (OSError, ValueError, AttributeError, TypeError, ConfigError):
+        return None
+    for split in SPLITS:
+        place = directory / part_name(split, part.number, part.count)
+        size = place.stat().st_size if place.is_file() else 0
+        if size != getattr(facts, split).size:
+            return None
+    return facts if facts.part == part else None
+
+
+def sync(path: Path) -> None:
+    """What was written to `path` survives a loss of power."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _facts_path(directory: Path, part: Part) -> Path:
+    return directory / FACTS / f"{part.number:05d}.json"
+
+
+class _SplitWriter:
+    """Appends episodes to one ArrayRecord file, made with the first, and keeps its facts."""
+
+    def __init__(self, path: Path, keep_frames: bool):
+        # Tokens do not compress; frames do. One record per group gives true random access.
+        self._options = "group_size:1" if keep_frames else "group_size:1,uncompressed"
+        self._path = path
+        self._writer = None
+        self._episodes: list[int] = []
+        self._steps: list[int] = []
+        self._content = hashlib.sha256()
+
+    def add(self, episode: StoredEpisode) -> None:
+        record = encode_episode(episode)
+        with self._errors():
+            if self._writer is None:
+                self._writer = array_record_module.ArrayRecordWriter(str(self._path), self._options)
+            self._writer.write(record)
+        self._content.update(record)
+        self._episodes.append(episode.episode)
+        self._steps.append(len(episode.actions))
+
+    @contextmanager
+    def _errors(self) -> Iterator[None]:
+        """ArrayRecord reports a full disk, or a directory that is gone, as RuntimeError."""
+        try:
+            yield
+        except RuntimeError as error:
+            kind = OSError if self._path.parent.is_dir() else FileNotFoundError
+            raise kind(str(error)) from error
+
+    def close(self) -> PartSplit:
+        size = 0
+        if self._writer is not None:
+            with self._errors():
+                self._writer.close()
+            sync(self._path)
+            size = self._path.stat().st_size
+        digest = self._content.hexdigest()[:32]
+        return PartSplit(tuple(self._episodes), tuple(self._steps), digest, size)

@@ -1,0 +1,267 @@
+"""RLDS episodes in, one dataset of the token store out.
+
+Owns what is made of an episode: which are held out, which frames are kept, how frames of many
+episodes are put through the tokenizer in equal pieces. Reading ahead is in `read_ahead`; parts,
+restarts, several processes and publishing are in `dataset_writer`.
+DIFFERS: in the release a bad step ends an episode whose frames and segment ids are half written,
+and everything behind it is misaligned (reference section 5.1). Here an episode is stored whole,
+or recorded as lost with its file and offset.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from data_pipelines.errors import EpisodeError
+from data_pipelines.loading.splits import held_out
+from data_pipelines.registry import DatasetSpec
+from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
+from data_pipelines.rlds.images import fit_image
+from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
+from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
+from data_pipelines.tokens.part import Made, Part
+from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
+from data_pipelines.tokens.share import Share
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.rlds.location import Location
+    from hma_jax.tokenizers.base import Tokenizer
+
+def tokenize_dataset(
+    spec: DatasetSpec,
+    directory: str | Location,
+    tokenizer: Tokenizer,
+    store_root: str | Path,
+    *,
+    val_fraction: float = 0.05,
+    min_val: int = 2,
+    max_val: int = 200,
+    keep_frames: Literal["none", "val", "all"] = "val",
+    frame_step: int | None = None,
+    batch: int = 256,
+    threads: int | None = None,
+    part_size: int = PART_SIZE,
+    corrupt: Literal["raise", "skip"] = "raise",
+    max_skipped: int = MAX_SKIPPED,
+    share: Share = Share(),
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Manifest | None:
+    """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
+
+    `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz
+    frames), 1 stores all phases; it must divide the stride. `batch` images are encoded at a
+    time, `threads` (default: as many as cores, up to 8) decode. `progress(done, total)` counts
+    episodes of this process's `share`. If the store already has this dataset made from the
+    same shards in the same way, nothing is done; what a killed job had finished is kept. The
+    bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of
+    JobSettings; on nothing else. None: parts of other processes are still missing.
+
+    Raises ConfigError for keys, settings or a store directory that cannot work, and for a
+    dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
+    (see `RldsDataset`).
+    """
+    frame_step = spec.stride if frame_step is None else frame_step
+    require(
+        frame_step >= 1 and spec.stride % frame_step == 0,
+        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {spec.stride}",
+    )
+    require(batch >= 1, f"batch must be at least 1, got {batch}")
+    source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
+    source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+    plan = Manifest(
+        spec=spec.facts(),
+        tokenizer=tokenizer_facts(tokenizer),
+        settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
+        source=source.fingerprint(),
+        source_version=source.version,
+        action_mean=(),
+        action_std=(),
+        train=SplitFacts(),
+        val=SplitFacts(),
+    )
+    work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
+    lost = [
+        Loss(reason.replace(f"{source.directory}/", ""), episodes=count)
+        for reason, count in sorted(source.skipped.items())
+    ]
+    return write_dataset(
+        store_root,
+        plan,
+        cut_parts(source.sizes(), part_size, MOST_PARTS),
+        work.make,
+        share=share,
+        lost=lost,
+        max_lost=max_skipped if corrupt == "skip" else 0,
+        overwrite=overwrite,
+        progress=progress,
+    )
+
+
+def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
+    """What a manifest says of a tokenizer."""
+    return TokenizerFacts(
+        identity=tokenizer.identity,
+        image_size=tokenizer.image_size,
+        grid=tokenizer.grid,
+        tokens=tokenizer.tokens,
+        vocab_size=tokenizer.vocab_size,
+        factors=tokenizer.factors,
+        factor_vocab=tokenizer.factor_vocab,
+        channels=tokenizer.channels,
+    )
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@dataclass
+class _Pending:
+    """An episode whose frames are on their way through the tokenizer."""
+
+    begin: Begin
+    keep: bool
+    came: int = 0  # frames put into the tokenizer's input
+    frames: list[np.ndarray] = field(default_factory=list)
+    end: End | None = None  # None: more frames are to come
+
+
+class _Work:
+    """How the parts of one dataset are made."""
+
+    def __init__(
+        self, source: RldsDataset, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int
+    ):
+        s = plan.settings
+        self._source, self._plan, self._threads = source, plan, threads
+        self._tokenizer, self._batch = tokenizer, batch
+        self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
+        self._is_val = held_out(plan.spec.name, len(source), s.val_fraction, s.min_val, s.max_val)
+
+    def make(self, part: Part) -> Iterator[Made]:
+        """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""
+        spec, size = self._plan.spec, self._plan.tokenizer.image_size
+        items = frames_ahead(
+            part.episodes,
+            lambda i: self._source.open_episode(i, spec.image_key, spec.action_keys),
+            lambda image: fit_image(image, size),
+            3 * size * size,
+            self._plan.frame_step,
+            self._threads,
+        )
+        pending: deque[_Pending] = deque()
+        with closing(items), _Encoder(self._tokenizer, self._batch) as encoder:
+            for item in items:
+                if isinstance(item, Begin):
+                    pending.append(_Pending(item, self._keeps(item.index)))
+                elif isinstance(item, End):
+                    if not pending or pending[-1].begin.index != item.index:  # it could not be opened
+                        pending.append(_Pending(Begin(item.index, np.zeros((0, 0)), None), False))
+                    pending[-1].end = item
+                else:
+                    pending[-1].came += 1
+                    if pending[-1].keep:
+                        pending[-1].frames.append(item)
+                    encoder.put(item)
+                yield from self._finished(pending, encoder)
+            encoder.flush()
+            yield from self._finished(pending, encoder)
+
+    def _split(self, index: int) -> str:
+        return "val" if self._is_val[index] else "train"
+
+    def _keeps(self, index: int) -> bool:
+        return self._plan.settings.keep_frames in ("all", self._split(index))
+
+    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[Made]:
+        """Takes the episodes from `pending` that have all their tokens."""
+        while pending and pending[0].end is not None and encoder.ready >= pending[0].came:
+            episode = pending.popleft()
+            tokens = encoder.take(episode.came)
+            if episode.end.error is not None:
+                yield self._lose(episode.end.error)
+                continue
+            begin = episode.begin
+            frames = np.stack(episode.frames) if episode.keep else None
+            episode.frames.clear()
+            yield self._split(begin.index), StoredEpisode(
+                begin.index, begin.success, tokens.astype(self._dtype), begin.actions, frames
+            )
+
+    def _lose(self, error: EpisodeError) -> Loss:
+        self._source.skip(error)
+        reason = str(error).replace(f"{self._source.directory}/", "")
+        place = (error.path.name, error.offset) if error.path is not None else ("", -1)
+        return Loss(reason, *place)
+
+
+class _Encoder:
+    """Frames in, their tokens out in the same order. The device works while the next piece gathers."""
+
+    def __init__(self, tokenizer: Tokenizer, batch: int):
+        self._tokenizer, self._batch = tokenizer, batch
+        self._frames: list[np.ndarray] = []
+        self._tokens: deque[np.ndarray] = deque()
+        self._under_way: Future | None = None
+        self._pool = ThreadPoolExecutor(1, "encode")
+        self.ready = 0
+        """Frames whose tokens can be taken."""
+
+    def __enter__(self) -> _Encoder:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def put(self, frame: np.ndarray) -> None:
+        self._frames.append(frame)
+        if len(self._frames) == self._batch:
+            self._start()
+
+    def flush(self) -> None:
+        """Encodes what has gathered; afterwards everything is ready."""
+        if self._frames:
+            self._start()
+        self._collect()
+
+    def take(self, count: int) -> np.ndarray:
+        """The tokens of the next `count` frames, which are ready."""
+        taken = [np.zeros((0, *self._shape()), np.int32)]
+        missing = count
+        while missing:
+            piece = self._tokens.popleft()
+            taken.append(piece[:missing])
+            if len(piece) > missing:
+                self._tokens.appendleft(piece[missing:])
+            missing -= len(taken[-1])
+        self.ready -= count
+        return np.concatenate(taken[1:] or taken)
+
+    def _shape(self) -> tuple[int, ...]:
+        t = self._tokenizer
+        return (t.tokens, t.channels) if t.channels else (t.tokens,)
+
+    def _start(self) -> None:
+        images = np.stack(self._frames)
+        self._frames.clear()
+        self._collect()
+        self._under_way = self._pool.submit(self._tokenizer.encode, images)
+
+    def _collect(self) -> None:
+        if self._under_way is not None:
+            tokens = np.asarray(self._under_way.result())
+            self._tokens.append(tokens)
+            self.ready += len(tokens)
+            self._under_way = None

@@ -1,0 +1,113 @@
+"""`hma bench`: arguments and help. What the commands do is in `commands.bench`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.extras import SubcommandApp
+
+from experiments.commands import bench as commands
+
+bench_app = SubcommandApp()
+
+HELP = (
+    "How fast it is, here. Every command times the fast path and the naive one by turns in one process, "
+    "prints both, and writes a JSON record with commit, hardware and versions."
+)
+
+Model = Literal["base", "xl", "base-continuous", "xl-continuous", "cpu", "cpu-continuous"]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is timed and how often."""
+
+    model: Model = "base"
+    """base: the released size, width 256, 32 layers, 12 frames of 256 + 64 tokens; xl: width 1024; cpu:
+    the model of the cpu preset."""
+    batch: tuple[int, ...] = (1,)
+    """Examples at a time; several numbers give several measurements."""
+    repeats: int = 30
+    """Timed calls of every stage, after two untimed ones."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """What is computed in."""
+    robots: int = 1
+    """Embodiments of the model; a batch mixes them."""
+    layers: Annotated[int | None, arg(metavar="N")] = None
+    """Another number of layers, for a quick look."""
+    seed: int = 0
+    out: Path = Path("runs/bench")
+    """Directory for the record."""
+
+
+@dataclass(frozen=True)
+class Decode:
+    """How frames are filled."""
+
+    unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2
+    """Looks at each frame, M."""
+    sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100
+    """Continuous models: steps of the diffusion sampler."""
+
+
+@bench_app.command(name="generate")
+def generate(bench: OmitArgPrefixes[Bench], decode: OmitArgPrefixes[Decode]) -> None:
+    """Time the making of one frame: while the window fills, when it slides, and by recomputation."""
+    commands.generate(bench, decode)
+
+
+@bench_app.command(name="rollout")
+def rollout(
+    bench: OmitArgPrefixes[Bench],
+    decode: OmitArgPrefixes[Decode],
+    frames: int = 12,
+    prompt: int = 4,
+    slide: Literal["exact", "streaming"] = "exact",
+    naive: bool = True,
+) -> None:
+    """Time whole rollouts in one compiled call, and check them against recomputation.
+
+    Args:
+        bench: What is timed and how often.
+        decode: How frames are filled.
+        frames: Length of a rollout, prompt included; past the model's window it slides.
+        prompt: Frames it starts from.
+        slide: What happens past the window.
+        naive: Time recomputation too, and compare the frames.
+    """
+    commands.rollouts(bench, decode, frames, prompt, slide, naive)
+
+
+@bench_app.command(name="train")
+def train(bench: OmitArgPrefixes[Bench], remat: bool = False) -> None:
+    """Time optimiser steps against forward passes of the same batch.
+
+    Args:
+        bench: What is timed and how often.
+        remat: Compute activations again in the backward pass, to save memory.
+    """
+    commands.train(bench, remat)
+
+
+@bench_app.command(name="eval")
+def evaluate(bench: OmitArgPrefixes[Bench], draws: int = 5) -> None:
+    """Time the evaluation protocol against the same protocol taken literally, and compare the numbers.
+
+    Args:
+        bench: What is timed and how often.
+        draws: Random action sequences for delta PSNR.
+    """
+    commands.evaluate(bench, draws)
+
+
+@bench_app.command(name="report")
+def report(records: Positional[tuple[Path, ...]]) -> None:
+    """Print records as Markdown tables.
+
+    Args:
+        records: Record files, or directories of them.
+    """
+    commands.report(records)

@@ -1,0 +1,108 @@
+"""The program `hma`: its commands, and what an error becomes.
+
+Exit codes: 0 done; 1 the work failed (data, a trial, a full disk); 2 wrong arguments or
+configuration; 130 interrupted. `--debug` or HMA_DEBUG=1 shows the traceback of an error.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from tyro.extras import SubcommandApp
+
+from experiments.cli import bench, convert, data, study, tokenizer
+from experiments.cli.fit import fit
+from experiments.commands.study import TrialsFailed
+from experiments.program import PROGRAM
+from experiments.progress import errors
+from hma_jax.config import ConfigError
+
+app = SubcommandApp()
+app.command(name="study")(study.study)
+app.command(name="sweep")(study.sweep)
+app.command(name="tokenize")(study.tokenize)
+app.command(name="train")(study.train)
+app.command(name="adapt")(study.adapt)
+app.command(name="evaluate")(study.evaluate)
+app.command(name="report")(study.report)
+app.command(data.data_app, name="data", help=data.HELP)
+app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)
+app.command(convert.convert_app, name="convert", help=convert.HELP)
+app.command(bench.bench_app, name="bench", help=bench.HELP)
+app.command(name="fit")(fit)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit code; errors become one message on stderr.
+
+    Without `arguments`, those of the process, which is then taken to be this program's own.
+    """
+    own_process = arguments is None
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = os.environ.get("HMA_DEBUG", "0") not in ("", "0")
+    if "--debug" in arguments:
+        arguments.remove("--debug")
+        debug = True
+    if own_process and not debug:
+        _silence_background()
+    try:
+        app.cli(
+            prog=PROGRAM,
+            description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
+            args=arguments or ["--help"],
+        )
+        return 0
+    except KeyboardInterrupt:
+        _say("interrupted; the same command goes on from here")
+        return 130
+    except Exception as error:  # the boundary of the program
+        code = _exit_code(error)
+        if debug or code is None:
+            raise
+        _say(f"error: {_words(error)}")
+        return code
+
+
+def _silence_background() -> None:
+    """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
+    pages of their own, from threads and destructors where nothing can catch it, until the very
+    end. The error message says it once.
+    """
+    sys.unraisablehook = lambda _: None
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+
+
+def _exit_code(error: Exception) -> int | None:
+    """None for what is not the user's business: a bug, shown with its traceback."""
+    from data_pipelines.errors import DataError
+
+    if isinstance(error, ConfigError):
+        return 2
+    if isinstance(error, (DataError, TrialsFailed, OSError)):
+        return 1
+    if "jax" in sys.modules:  # otherwise none of these can have been raised
+        from hma_jax.training.loop import DivergedError, Interrupted
+
+        if isinstance(error, (DivergedError, Interrupted)):
+            return 130 if isinstance(error, Interrupted) else 1
+    return None
+
+
+def _words(error: Exception) -> str:
+    """The message of an error, and what it cannot know: how its advice is followed from here."""
+    from data_pipelines.errors import EpisodeError
+
+    if isinstance(error, EpisodeError):
+        return f"{error} (Here: --set store.corrupt=skip.)"
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
+    return str(error)
+
+
+def _say(message: str) -> None:
+    errors.print(message, markup=False, soft_wrap=True)
+

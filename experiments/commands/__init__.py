@@ -1,0 +1,1 @@
+"""What the commands of `hma` do. Each says what it wrote and what to run next; heavy imports happen here."""

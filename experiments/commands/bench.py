@@ -1,0 +1,161 @@
+"""What `hma bench` does: runs a benchmark, shows it, writes its record. Heavy imports happen here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.program import command_line
+from experiments.progress import console, step, tidy_table
+from hma_jax.config import ConfigError, require
+
+if TYPE_CHECKING:
+    from experiments.bench.models import Subject
+    from experiments.bench.record import BenchRecord, Stage
+    from experiments.cli.bench import Bench, Decode
+    from hma_jax.config import DecodeConfig
+
+
+def generate(bench: Bench, decode: Decode) -> None:
+    from experiments.bench.generate import ratios, time_frames
+
+    subject, how = _subject(bench), _decode(decode)
+    stages: list[Stage] = []
+    found: dict[str, float] = {}
+    for rows in bench.batch:
+        with step(f"time frames at batch {rows}"):
+            here = time_frames(subject, rows, how, bench.repeats)
+        stages += here
+        found |= ratios(here, rows)
+    _finish("generate", bench, subject, stages, found, {"decode": how})
+
+
+def rollouts(bench: Bench, decode: Decode, frames: int, prompt: int, slide: str, naive: bool) -> None:
+    from dataclasses import replace
+
+    from experiments.bench.rollout import agreement, time_rollouts
+
+    subject, how = _subject(bench), replace(_decode(decode), slide=slide)
+    stages: list[Stage] = []
+    found: dict[str, float] = {}
+    for rows in bench.batch:
+        with step(f"time rollouts at batch {rows}"):
+            here = time_rollouts(subject, rows, frames, prompt, how, bench.repeats, naive)
+        stages += here
+        if naive:
+            seconds = {s.name: s.timing.median for s in here}
+            found[f"recompute / rollout, batch {rows}"] = seconds["recompute"] / seconds["rollout"]
+    notes = ()
+    if naive:
+        with step("compare with recomputation"):
+            value = agreement(subject, bench.batch[0], frames, prompt, how)
+        what = "largest difference" if subject.config.diffusion else "share of equal tokens"
+        notes = (f"against recomputation, {what}: {value:g}",)
+    settings = {"decode": how, "frames": frames, "prompt": prompt}
+    _finish("rollout", bench, subject, stages, found, settings, notes)
+
+
+def train(bench: Bench, remat: bool) -> None:
+    from dataclasses import replace
+
+    from experiments.bench.train import time_training
+
+    subject = _subject(bench, remat=remat)
+    stages: list[Stage] = []
+    found: dict[str, float] = {}
+    for rows in bench.batch:
+        with step(f"time training steps at batch {rows}"):
+            here = time_training(subject, rows, bench.repeats)
+        stages += here
+        seconds = {s.name: s.timing.median for s in here}
+        found[f"step / forward, batch {rows}"] = seconds["step"] / seconds["forward"]
+    _finish("train", bench, replace(subject), stages, found, {"remat": remat})
+
+
+def evaluate(bench: Bench, draws: int) -> None:
+    from experiments.bench.evaluate import time_evaluation
+    from hma_jax.config import EvalConfig
+
+    subject, config = _subject(bench), EvalConfig(random_actions=draws)
+    stages: list[Stage] = []
+    found: dict[str, float] = {}
+    for rows in bench.batch:
+        with step(f"time evaluation of {rows} windows"):
+            here = time_evaluation(subject, rows, config, bench.repeats)
+        stages += here
+        seconds = {s.name: s.timing.median for s in here}
+        found[f"literal / protocol, batch {rows}"] = seconds["literal"] / seconds["protocol"]
+    _finish("eval", bench, subject, stages, found, {"eval": config})
+
+
+def report(records: Sequence[Path]) -> None:
+    from experiments.bench.record import read_record
+    from experiments.bench.report import markdown
+
+    files = [f for path in records for f in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
+    require(len(files) > 0, "no records there; make one with `hma bench generate`")
+    print(markdown([read_record(file) for file in files]))
+
+
+def _subject(bench: Bench, **changes: Any) -> Subject:
+    from experiments.bench.models import make_subject
+
+    if bench.repeats < 1 or min(bench.batch, default=0) < 1:
+        raise ConfigError("--repeats and --batch must be at least 1")
+    with step(f"draw the weights of {bench.model}"):
+        return make_subject(bench.model, bench.dtype, bench.robots, bench.seed, bench.layers, **changes)
+
+
+def _decode(decode: Decode) -> DecodeConfig:
+    from hma_jax.config import DecodeConfig, SamplerConfig
+
+    return DecodeConfig(decode.unmask_steps, sampler=SamplerConfig(steps=decode.sampler_steps))
+
+
+def _finish(
+    kind: str,
+    bench: Bench,
+    subject: Subject,
+    stages: Sequence[Stage],
+    ratios: dict[str, float],
+    settings: dict[str, Any],
+    notes: tuple[str, ...] = (),
+) -> None:
+    from experiments.bench.record import make_record, write_record
+    from experiments.bench.timing import matmul_rate
+    from hma_jax.config import to_dict
+
+    record = make_record(
+        kind,
+        bench.model,
+        command_line(),
+        dtype=bench.dtype,
+        seed=bench.seed,
+        settings=to_dict(settings | {"model": subject.config, "robots": bench.robots}),
+        stages=tuple(stages),
+        ratios={name: round(value, 3) for name, value in ratios.items()},
+        notes=notes,
+        matmul_flops_per_second=matmul_rate(bench.dtype),
+    )
+    show(record)
+    path = write_record(record, bench.out)
+    console.print(f"wrote {path}; tables: hma bench report {bench.out}", soft_wrap=True)
+
+
+def show(record: BenchRecord) -> None:
+    table = tidy_table(
+        f"{record.kind} {record.subject}, {record.dtype}, {', '.join(record.machine['devices'])}",
+        "stage", "batch", "median", "p90", "frames/s", "GFLOP/s", "compile",
+    )  # fmt: skip
+    for s in record.stages:
+        rate = f"{s.flops / s.timing.median / 1e9:,.1f}" if s.flops else ""
+        frames = f"{s.frames_per_second:,.2f}" if s.frames else ""
+        seconds = [f"{x * 1e3:,.1f} ms" for x in (s.timing.median, s.timing.p90)]
+        table.add_row(s.name, f"{s.batch}", *seconds, frames, rate, f"{s.compile_seconds:.1f} s")
+    console.print(table)
+    for name, value in record.ratios.items():
+        console.print(f"{name}: [bold]{value:.2f}[/]")
+    for note in record.notes:
+        console.print(note)
+    console.print(f"[dim]a plain matrix product here: {record.matmul_flops_per_second / 1e9:,.1f} GFLOP/s[/]")

@@ -1,0 +1,162 @@
+"""What `hma train`, `hma adapt` and `hma evaluate` do: single models of a study's data."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.atomic import write_atomically
+from experiments.commands.study import Setting, next_command, short, wrote
+from experiments.progress import console, step, tidy_table
+from experiments.sweep import reference_trial
+from hma_jax.config import ConfigError, MeshConfig, require
+
+if TYPE_CHECKING:
+    from experiments.trial import Materials, Trial
+    from hma_jax.tokenizers.base import Tokenizer
+    from hma_jax.training.train import Run
+
+
+SHOWN = (
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain"
+)  # fmt: skip
+"""Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all."""
+
+
+def train(setting: Setting, run: Path | None, mesh: MeshConfig) -> None:
+    """Trains the study's reference trial by itself."""
+    _prepare(setting)
+    trial = reference_trial(setting.study, setting.study.seeds[0])
+    _train(setting, trial, run or setting.workspace.root / "model", mesh)
+
+
+def adapt(setting: Setting, source: Path, run: Path | None, everything: bool, mesh: MeshConfig) -> None:
+    """Trains a model further that has first been given slices for the study's new datasets."""
+    from experiments.trial import open_materials
+    from hma_jax.adapt import add_embodiments
+    from hma_jax.training.train import load_run
+
+    _prepare(setting)
+    study, materials = setting.study, open_materials(setting.workspace)
+    trained = load_run(source)
+    _check_tokenizer(trained, materials, f"; add --tokenizer with the one that {short(source)} was trained with")
+    seed = study.seeds[0]
+    new = [name for name in study.dataset_names() if name not in trained.table.names]
+    require(bool(new), f"{source} already knows {', '.join(study.dataset_names())}: there is nothing to add")
+    robots = [materials.store.manifest(name).embodiment() for name in new]
+    params, table = add_embodiments(trained.params, trained.model, trained.table, robots, seed)
+    only = () if everything else tuple(new)
+    trial = replace(
+        reference_trial(study, seed),
+        model=trained.model,
+        train=replace(study.train, seed=seed, only=only),
+    )
+    console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
+    origin = {"step": trained.step, "provenance": trained.provenance}
+    _train(setting, trial, run or setting.workspace.root / "model", mesh, table=table, initial=params, origin=origin)
+
+
+def _prepare(setting: Setting) -> None:
+    from experiments.pipeline import prepare
+
+    with setting.workspace.claimed():
+        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer)
+
+
+def _train(setting: Setting, trial: Trial, run: Path, mesh: MeshConfig, **start: Any) -> None:
+    from experiments.trial import open_materials, train_trial
+
+    with step(f"train: {trial.title}") as update:
+        result = train_trial(
+            trial,
+            open_materials(setting.workspace),
+            run,
+            mesh=mesh,
+            progress=lambda phase, done, total: update(done, total, phase),
+            **start,
+        )
+    console.print(f"loss {result.losses[-1]:.4f} after {len(result.losses):,} steps")
+    wrote(run, then=next_command(f"evaluate {shlex.quote(short(run))}", setting))
+
+
+def evaluate(setting: Setting, run: Path) -> None:
+    from experiments.trial import evaluate_on, open_materials, write_samples
+    from hma_jax.training.train import load_run
+
+    trained = load_run(run)
+    materials = open_materials(setting.workspace)
+    check_fits(trained, materials)
+    frozen = {d.dataset for d in materials.manifest.datasets}
+    left_out = [name for name in trained.table.names if name not in frozen]
+    if left_out:
+        console.print(f"note: not evaluated, for want of windows here: {', '.join(left_out)}", soft_wrap=True)
+    with step(f"evaluate {short(run)}") as update:
+        evaluation = evaluate_on(
+            tuple(name for name in trained.table.names if name in frozen),
+            trained.params,
+            trained.model,
+            trained.table,
+            materials,
+            setting.study.eval,
+            trained.train.masking.setting,
+            progress=lambda phase, done, total: update(done, total, phase),
+        )
+    metrics = [m for m in SHOWN if m in evaluation.overall]
+    table = tidy_table(f"{short(run)}, step {trained.step:,}", "dataset", *metrics)
+    for name, stats in [*evaluation.datasets.items(), ("overall", evaluation.overall)]:
+        table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
+    console.print(table)
+    write_atomically(run / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1))
+    write_samples(run / "samples.npz", evaluation.samples)
+    wrote(run / "evaluation.json", run / "samples.npz")
+
+
+def check_fits(trained: Run, materials: Materials) -> None:
+    """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
+    advice = "; evaluate it with the --out it was trained in"
+    _check_tokenizer(trained, materials, advice)
+    frames, manifest = trained.model.frames, materials.manifest
+    if frames != manifest.frames:
+        raise ConfigError(
+            f"the model sees windows of {frames} frames, those frozen for evaluation here have "
+            f"{manifest.frames}{advice}"
+        )
+    if not set(trained.table.names) & {d.dataset for d in manifest.datasets}:
+        raise ConfigError(
+            f"the model was trained on {', '.join(trained.table.names)}, of which the study here has no "
+            f"windows{advice}"
+        )
+
+
+def _check_tokenizer(trained: Run, materials: Materials, advice: str) -> None:
+    """A model that was converted does not know its tokenizer: then the form of its tokens decides."""
+    if "official" in trained.provenance and "tokenizer" not in trained.provenance:
+        _check_form(trained, materials.tokenizer, advice)
+        return
+    tokenizer, here = trained.provenance.get("tokenizer"), materials.tokenizer.identity
+    if tokenizer != here:
+        raise ConfigError(
+            f"the model was trained on tokens of tokenizer {tokenizer}, the study here uses {here}{advice}"
+        )
+
+
+def _check_form(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
+    model = trained.model
+    if model.diffusion:
+        takes = (model.tokens, 0, 0, model.diffusion.token_channels)
+    else:
+        takes = (model.tokens, model.factors, model.factor_vocab, 0)
+    makes = (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels)
+    if takes != makes:
+        words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
+        raise ConfigError(
+            f"the model takes {words.format(*takes)}, the tokenizer here makes {words.format(*makes)}{advice}"
+        )
+    console.print(
+        f"note: the model comes from the official release and does not say on which tokens it was trained; "
+        f"taken for those of the tokenizer here, {tokenizer.identity}",
+        soft_wrap=True,
+    )

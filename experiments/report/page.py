@@ -1,0 +1,251 @@
+"""The report: one HTML page with the curves, frames, tables and everything needed to repeat it.
+
+Self-contained: pictures are embedded, nothing is fetched. Numbers come from the rows of the
+CSV; only frames and run records are read from the trials' directories.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.ledger import FINISHED
+from experiments.optima import Optimum
+from experiments.provenance import Provenance
+from experiments.report.pieces import card, frames, picture, pm, section, table
+from experiments.report.plot_style import drawn_metrics
+from experiments.report.style import CSS
+from experiments.report.sweeps import GAINS, TITLES, describe
+from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve, load_result
+from experiments.runner import State
+from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
+from experiments.trial import Trial, trial_id
+from experiments.workspace import Record, Workspace
+from hma_jax.config import to_json
+
+SHOWN_STRIPS = 6
+"""Datasets whose frames are visible at once; the others unfold."""
+
+
+def write_report(
+    workspace: Workspace,
+    record: Record,
+    sweeps: Sequence[Sweep],
+    rows: Sequence[Row],
+    optima: Sequence[Optimum],
+    states: dict[str, State],
+    provenance: Provenance,
+) -> None:
+    """Writes workspace.report from `rows` and the figures already drawn."""
+    home = _home(sweeps)
+    reference = trial_id(_reference(home), provenance) if home else ""
+    finished = [id for id, state in states.items() if state.event == FINISHED]
+    shown = reference in finished
+    witness = reference if shown else next(iter(finished), None)
+    result = load_result(workspace.trials, witness) if witness else None
+    body = [
+        _headline(workspace, record, sweeps, rows, states, home, result),
+        *_curves(workspace, sweeps, rows, optima),
+        section("True and predicted frames", _strips(
+            workspace.trials / reference / "samples.npz", record.study.eval.prompt_frames
+        )) if shown else "",
+        section("Reference trial by dataset", _dataset_table(rows, home, workspace)) if shown else "",
+        section("Trials", _trial_table(workspace, sweeps, states, provenance)),
+        section("How to repeat it", _origin(workspace, record, provenance, result)),
+    ]  # fmt: skip
+    page = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>HMA-JAX study: {html.escape(record.study.name)}</title><style>{CSS}</style></head>\n"
+        f"<body><main>{''.join(body)}</main></body></html>\n"
+    )
+    aside = workspace.report.with_suffix(".tmp")
+    aside.write_text(page, encoding="utf-8")
+    aside.replace(workspace.report)
+
+
+# --- Parts -----------------------------------------------------------------------------------
+
+
+def _home(sweeps: Sequence[Sweep]) -> Sweep | None:
+    """The sweep by which the reference trial is shown: the widest scope on which it stands."""
+    standing = [s for s in sweeps if s.reference_x is not None]
+    return max(standing, key=lambda s: len(s.scope), default=None)
+
+
+def _reference(home: Sweep) -> Trial:
+    return next(p.trial for p in home.points if p.x == home.reference_x)
+
+
+def _headline(
+    workspace: Workspace,
+    record: Record,
+    sweeps: Sequence[Sweep],
+    rows: Sequence[Row],
+    states: dict[str, State],
+    home: Sweep | None,
+    result: dict[str, Any] | None,
+) -> str:
+    study = record.study
+    metrics = drawn_metrics(rows, [s.name for s in sweeps])
+    cards = []
+    if home and "perplexity" in metrics:
+        cards += [
+            card("perplexity, reference", _at_reference(rows, home, "perplexity"),
+                 "s.e. over windows and seeds"),
+            card("perplexity, untrained", _at_reference(rows, home, "perplexity", UNTRAINED),
+                 f"vocabulary size is {study.model.vocab_size:,}"),
+        ]  # fmt: skip
+    if home and "delta_psnr" in metrics:
+        cards += [
+            card("ΔPSNR, reference", _at_reference(rows, home, "delta_psnr"),
+                 "dB, last frame: true minus random actions"),
+            card("ΔPSNR, shuffled actions", _at_reference(rows, home, "delta_psnr", CONTROL),
+                 "dB, must vanish within its error"),
+        ]  # fmt: skip
+    cards.append(
+        card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames")
+    )
+    when = result["run"]["finished"] if result else "no trial finished"
+    unfinished = sum(state.event != FINISHED for state in states.values())
+    warning = f'<p class="warning">{unfinished} trial(s) have no result; see the table of trials.</p>'
+    *others, final = [GAINS[s.name] for s in sweeps]
+    gains = f"{', '.join(others)} and {final}" if others else final
+    return (
+        f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
+        f"<p class=lead>What an action-conditioned video model over many robots gains from {gains}: "
+        f"{max(len(p.trial.datasets) for s in sweeps for p in s.points)} dataset(s), "
+        f"{all_steps(sweeps)} steps of {study.train.batch} windows per trial.</p>"
+        f"<p class=meta>{html.escape(when)}</p></header>"
+        f"<div class=cards>{''.join(cards)}</div>{warning if unfinished else ''}"
+    )
+
+
+def _at_reference(rows: Sequence[Row], home: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
+    """The curve's point where the reference trial stands."""
+    return next((p for p in curve(rows, home.name, metric, role) if p.x == home.reference_x), None)
+
+
+def _curves(
+    workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row], optima: Sequence[Optimum]
+) -> list[str]:
+    """A section for the scaling curves, which share a figure, and one for each other sweep."""
+    sections = []
+    scaling = [s for s in sweeps if s.scaling]
+    if scaling:
+        overview = picture(workspace.figures / "scaling.png", "Scaling curves")
+        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima) for s in scaling)))
+    for sweep in sweeps:
+        if not sweep.scaling:
+            figure = picture(workspace.figures / f"{sweep.name}.png", TITLES[sweep.name])
+            sections.append(section(TITLES[sweep.name], figure, describe(sweep, rows, optima)))
+    return sections
+
+
+def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
+    path = workspace.tokenizer / "quality.json"
+    if not path.exists():
+        return None
+    quality = json.loads(path.read_text())
+    return CurvePoint(0, quality["mean"], quality["sem"], math.nan, {}, 0)
+
+
+def _strips(path: Path, prompt: int) -> str:
+    """Rows of frames per dataset: recorded, predicted, and predicted under random actions."""
+    with np.load(path) as samples:
+        names = list(dict.fromkeys(key.split("/")[0] for key in samples.files))
+        strips = [
+            f"<figure class=strip><figcaption>{html.escape(name)}</figcaption>"
+            + "".join(
+                f"<div><span>{label}</span>{frames(samples[f'{name}/{kind}'][0], prompt)}</div>"
+                for kind, label in (
+                    ("true", "true"),
+                    ("predicted", "predicted"),
+                    ("random", "random actions"),
+                )
+            )
+            + "</figure>"
+            for name in names
+        ]
+    rest = "".join(strips[SHOWN_STRIPS:])
+    more = f"<details><summary>{len(names) - SHOWN_STRIPS} more datasets</summary>{rest}</details>"
+    return (
+        f"<p>The first validation window of each dataset. The first {prompt} frames are given; the rest is "
+        "predicted from actions alone, once under the recorded actions and once under random ones.</p>"
+        f"{''.join(strips[:SHOWN_STRIPS])}{more if rest else ''}"
+    )
+
+
+def _dataset_table(rows: Sequence[Row], sweep: Sweep, workspace: Workspace) -> str:
+    """One line per dataset; data.json says how much of it there was."""
+    data = json.loads(workspace.data_summary.read_text()) if workspace.data_summary.exists() else {}
+    head = {"perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)",
+            "psnr_copy": "copying (dB)", "ssim": "SSIM", "delta_psnr": "ΔPSNR (dB)"}  # fmt: skip
+    measured = {r.metric for r in rows if r.sweep == sweep.name}
+    metrics = [m for m in head if m in measured]
+
+    def cell(name: str, metric: str) -> str:
+        at = [p for p in curve(rows, sweep.name, metric, scope=name) if p.x == sweep.reference_x]
+        return pm(at[0].mean, at[0].sem) if at else "–"
+
+    lines = []
+    for name in (*sweep.scope, OVERALL):
+        facts = data.get(name, {})
+        counts = [str(facts.get(k, "–")) for k in ("episodes", "too_short", "skipped", "windows")]
+        lines.append([html.escape(name), *counts, *(cell(name, metric) for metric in metrics)])
+    return (
+        "<p>PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR "
+        "of repeating the last given frame. Errors are standard errors.</p>"
+        + table(["dataset", "episodes", "too short", "skipped", "windows", *map(head.get, metrics)], lines)
+    )
+
+
+def _trial_table(
+    workspace: Workspace, sweeps: Sequence[Sweep], states: dict[str, State], provenance: Provenance
+) -> str:
+    lines, names = [], titles(sweeps, provenance)
+    for id, name in names.items():
+        state = states[id]
+        cells = ["–", "–", "–", "–"]
+        if state.event == FINISHED:
+            result = load_result(workspace.trials, id)
+            run, losses = result["run"], result["losses"]
+            cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
+                     f"{losses[-1]:.3f}"]  # fmt: skip
+        message = html.escape(state.message)
+        status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
+        lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
+    done = sum(states[id].event == FINISHED for id in names)
+    head = ["id", "trial", "status", "parameters", "train FLOPs", "time", "last loss"]
+    return f"<p>{done} of {len(lines)} finished.</p>" + table(head, lines, text=3)
+
+
+def _origin(
+    workspace: Workspace, record: Record, provenance: Provenance, result: dict[str, Any] | None
+) -> str:
+    machine = result["run"]["machine"] if result else {}
+    facts = {
+        "command": record.command,
+        "data": ", ".join(record.data)
+        or f"embedded suite, scale {record.study.suite.scale:g}, seed {record.study.suite.seed}",
+        "token store": provenance.store,
+        "evaluation manifest": provenance.manifest,
+        "tokenizer": provenance.tokenizer,
+        "sources": provenance.code,
+        "commit": machine.get("commit") or "unknown",
+        "processor": f"{machine.get('processor', 'unknown')}, {machine.get('cores', '?')} cores",
+        "devices": ", ".join(machine.get("devices", [])) or "unknown",
+        "software": ", ".join(f"{k} {v}" for k, v in machine.get("packages", {}).items()),
+        "numbers": workspace.results.name,
+    }
+    items = "".join(
+        f"<dt>{html.escape(k)}</dt><dd><code>{html.escape(v)}</code></dd>" for k, v in facts.items()
+    )
+    config = html.escape(to_json(record.study))
+    return f"<dl>{items}</dl><details><summary>Configuration</summary><pre>{config}</pre></details>"

@@ -1,0 +1,87 @@
+"""Figure of several curves over one number: learning rates at several widths, with muP and without."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.ticker import NullLocator
+
+from experiments.optima import diverged, ends, lowest
+from experiments.report.plot_style import MUTED, plain_log, show_nothing, show_tally
+from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
+from experiments.sweep import POINT, STANDARD, Sweep
+
+ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}
+DRAWN = {
+    LOSS: (TRAINING, "training loss, last tenth of steps"),
+    "perplexity": (OVERALL, "perplexity, held out"),
+}
+"""Metrics with their scope and label."""
+CAPTION = (
+    "bars: s.e. over seeds; star: lowest, hollow at an end of what was tried\n"
+    "cross: diverged; dotted: lowest of the base width"
+)
+
+
+def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
+    """A row of panels per role, a column per metric, a colour per series."""
+    series = all_series(rows, sweep.name)
+    measured = {r.metric for r in rows if r.sweep == sweep.name}
+    metrics = [m for m in DRAWN if m in measured] or list(DRAWN)
+    figure, panels = plt.subplots(
+        len(series), len(metrics), figsize=(4.3 * len(metrics), 0.4 + 2.9 * len(series)),
+        layout="constrained", sharex=True, sharey="col", squeeze=False,
+    )  # fmt: skip
+    for line, role in zip(panels, series, strict=True):
+        for panel, metric in zip(line, metrics, strict=True):
+            _draw(panel, rows, sweep, metric, role, series[role])
+            panel.set_title(ROLES[role], loc="left", fontsize=10)
+    for panel, metric in zip(panels[-1], metrics, strict=True):
+        panel.set_xlabel(sweep.axis)
+        if metric == "perplexity":
+            plain_log(panel, panel.yaxis)
+    show_tally(panels[0, -1], rows, sweep.name)
+    handles = panels[0, 0].get_legend_handles_labels()[0]
+    if handles:
+        panels[0, 0].legend(loc="best")
+    figure.supxlabel(CAPTION, fontsize=8.5, color=MUTED)
+    return figure
+
+
+def _draw(
+    panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]
+) -> None:
+    scope, label = DRAWN[metric]
+    xs = sorted({r.x for r in rows if r.sweep == sweep.name})
+    for i, name in enumerate(series):
+        colour = plt.cm.viridis(0.85 * i / max(len(series) - 1, 1))
+        lost = diverged(rows, sweep.name, role, name)
+        for x in lost:  # on the upper edge: beyond any loss
+            panel.plot(x, 0.97 - 0.05 * i, "x", color=colour, transform=panel.get_xaxis_transform())
+        points = [p for p in curve(rows, sweep.name, metric, role, scope, name) if p.x not in lost]
+        best = lowest(points, lost)
+        if best is None:
+            continue
+        bars = [0.0 if math.isnan(p.seed_sem) else p.seed_sem for p in points]
+        panel.errorbar(
+            [p.x for p in points], [p.mean for p in points], bars, color=colour, marker="o",
+            markersize=4, linewidth=1.6, capsize=2.5, elinewidth=1.1,
+            label=name + (" (base)" if name == sweep.base else ""),
+        )  # fmt: skip
+        open_ended = best.x in ends(rows, sweep.name, role, name)
+        panel.plot(
+            best.x, best.mean, "*", markersize=13, color=colour, zorder=4,
+            markerfacecolor="white" if open_ended else colour,
+        )  # fmt: skip
+        if name == sweep.base:
+            panel.axvline(best.x, color=MUTED, linewidth=1, linestyle=":", zorder=1)
+    if not panel.lines:
+        show_nothing(panel)
+    panel.set_xscale("log")
+    panel.set_xlim(xs[0] / 1.25, xs[-1] * 1.25)
+    panel.set_xticks(xs, [f"{x:.2g}" for x in xs])
+    panel.xaxis.set_minor_locator(NullLocator())
+    panel.set_ylabel(label)

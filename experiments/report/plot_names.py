@@ -1,0 +1,67 @@
+"""Figure of a sweep over names: a line per variant, its mean, error over seeds and every seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+from experiments.report.plot_style import (
+    CONTROL_LINE,
+    DEFAULT,
+    LABELS,
+    MUTED,
+    drawn_metrics,
+    plain_log,
+    show_nothing,
+    show_tally,
+)
+from experiments.rows import Row, curve
+from experiments.sweep import CONTROL, Sweep
+
+CAPTION = (
+    "dots: seeds; bars: mean ± s.e. over seeds, all judged on the same windows\n"
+    "dashed: the default trained on shuffled actions, one seed"
+)
+
+
+def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
+    """A panel per metric, names down the side in the order of the sweep, the default in its own colour."""
+    metrics = drawn_metrics(rows, [sweep.name])
+    figure, panels = plt.subplots(
+        1, len(metrics), figsize=(2.4 + 3.4 * len(metrics), 1.8 + 0.36 * len(sweep.labels)),
+        layout="constrained", sharey=True, squeeze=False,
+    )  # fmt: skip
+    for panel, metric in zip(panels[0], metrics, strict=True):
+        _draw(panel, rows, sweep, metric)
+    panels[0, 0].set_yticks(range(len(sweep.labels)), sweep.labels)
+    panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
+    panels[0, 0].get_yticklabels()[sweep.reference_x].set(color=DEFAULT, fontweight="bold")
+    figure.supxlabel(CAPTION, fontsize=8.5, color=MUTED)
+    return figure
+
+
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
+    points = curve(rows, sweep.name, metric)
+    for p in points:
+        colour = DEFAULT if p.x == sweep.reference_x else MUTED
+        panel.plot(
+            list(p.seeds.values()), [p.x] * len(p.seeds), "o",
+            color=colour, alpha=0.45, markersize=4, markeredgewidth=0,
+        )  # fmt: skip
+        panel.errorbar(
+            p.mean, p.x, xerr=p.seed_sem if p.seed_sem > 0 else None, color=colour, marker="|", markersize=13,
+            markeredgewidth=2.2, capsize=3.5, elinewidth=1.5,
+        )  # fmt: skip
+    if not points:
+        show_nothing(panel)
+    for control in curve(rows, sweep.name, metric, CONTROL):
+        panel.axvline(control.mean, **CONTROL_LINE)
+    if metric == "perplexity":
+        plain_log(panel, panel.xaxis)
+    else:
+        panel.axvline(0, color=MUTED, linewidth=0.9, zorder=1)
+    show_tally(panel, rows, sweep.name)
+    panel.grid(axis="y", visible=False)
+    panel.set_xlabel(LABELS[metric])

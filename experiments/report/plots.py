@@ -1,0 +1,124 @@
+"""Figures of sweeps as PNG: numbers from rows of the tidy CSV and nothing else.
+
+Curves over one number are drawn here, axes of names in `plot_names`, families of curves in
+`plot_families`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.ticker import NullLocator
+
+from experiments.report.plot_families import plot_family
+from experiments.report.plot_names import plot_names
+from experiments.report.plot_style import (
+    COLOURS,
+    LABELS,
+    MUTED,
+    STYLE,
+    drawn_metrics,
+    plain_log,
+    save,
+    show_control,
+    show_nothing,
+    show_tally,
+)
+from experiments.rows import UNTRAINED, CurvePoint, Row, curve
+from experiments.sweep import CONTROL, Sweep
+
+
+def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
+    """One axis: a panel per metric."""
+    with plt.rc_context(STYLE):
+        if sweep.labels:
+            figure = plot_names(rows, sweep)
+        elif sweep.base:
+            figure = plot_family(rows, sweep)
+        else:
+            metrics = drawn_metrics(rows, [sweep.name])
+            figure, panels = plt.subplots(
+                1, len(metrics), figsize=(4.3 * len(metrics), 3.5), layout="constrained", squeeze=False
+            )
+            for panel, metric in zip(panels[0], metrics, strict=True):
+                _draw(panel, rows, sweep, metric)
+        save(figure, path)
+
+
+def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> None:
+    """All scaling curves in one figure: a column per sweep, laid out as figure 6 of the paper.
+
+    Without any, there is no file.
+    """
+    path.unlink(missing_ok=True)
+    if not sweeps:
+        return
+    metrics = drawn_metrics(rows, [s.name for s in sweeps])
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(
+            len(metrics), len(sweeps), figsize=(3.9 * len(sweeps), 3.1 * len(metrics)),
+            layout="constrained", squeeze=False,
+        )  # fmt: skip
+        for column, sweep in enumerate(sweeps):
+            for panel, metric in zip(panels[:, column], metrics, strict=True):
+                _draw(panel, rows, sweep, metric)
+                if column:
+                    panel.set_ylabel("")
+        save(figure, path)
+
+
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
+    """One curve with standard errors, every seed's point, and the reference lines."""
+    points = curve(rows, sweep.name, metric)
+    colour = COLOURS[metric]
+    if points:
+        xs = [p.x for p in points]
+        bars = [0.0 if math.isnan(p.sem) else p.sem for p in points]
+        panel.errorbar(
+            xs, [p.mean for p in points], bars, color=colour, marker="o", markersize=5.5,
+            linewidth=1.8, capsize=3, elinewidth=1.2, zorder=3, label="mean ± s.e.",
+        )  # fmt: skip
+        if any(len(p.seeds) > 1 for p in points):
+            panel.plot(
+                [p.x for p in points for _ in p.seeds], [v for p in points for v in p.seeds.values()],
+                "o", color=colour, alpha=0.45, markersize=3.5, markeredgewidth=0, zorder=4, label="seeds",
+            )  # fmt: skip
+        _x_axis(panel, points, sweep)
+    else:
+        show_nothing(panel)
+    show_control(panel, curve(rows, sweep.name, metric, CONTROL))
+    if metric == "perplexity":
+        plain_log(panel, panel.yaxis)
+        for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve
+            panel.set_title(f"untrained: {p.mean:.0f}", loc="left", fontsize=8.5, color=MUTED)
+    else:
+        panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
+    show_tally(panel, rows, sweep.name)
+    panel.set_xlabel(sweep.axis + (" · parameters" if sweep.name == "width" else ""))
+    panel.set_ylabel(LABELS[metric])
+    if panel.get_legend_handles_labels()[0]:
+        panel.legend(loc="best")
+
+
+def _x_axis(panel: Axes, points: list[CurvePoint], sweep: Sweep) -> None:
+    """A log axis whose ticks are the points themselves."""
+    panel.set_xscale("log")
+    names = [_count(p.x) for p in points]
+    if sweep.name == "width":
+        names = [f"{p.x}\n{_count(p.parameters)}" for p in points]
+    panel.set_xticks([p.x for p in points], names)
+    panel.xaxis.set_minor_locator(NullLocator())
+    if len(points) == 1:
+        panel.set_xlim(points[0].x / 2, points[0].x * 2)
+
+
+def _count(n: float) -> str:
+    """1234567 -> '1.2M'."""
+    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if n >= size:
+            return f"{n / size:.3g}{unit}" if n / size >= 100 or n % size == 0 else f"{n / size:.1f}{unit}"
+    return f"{n:g}"

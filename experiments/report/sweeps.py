@@ -1,0 +1,160 @@
+"""What the report says of one sweep: its question, its numbers and what follows from them."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+
+from experiments.optima import Optimum
+from experiments.report.pieces import number, pm, table
+from experiments.report.plot_families import ROLES
+from experiments.report.plot_style import drawn_metrics
+from experiments.rows import CurvePoint, Row, curve, difference
+from experiments.sweep import CONTROL, Sweep
+
+QUESTIONS = {
+    "datasets": "Does training on more robots help or hurt those already there? All points are judged "
+    "on the smallest set of datasets and see the same number of windows in training.",
+    "trajectories": "What does more data per robot buy? Subsets are nested; the number of optimiser "
+    "steps is the same everywhere.",
+    "width": "What does a wider model buy? The learning rate is set once, at the base width, and "
+    "carried over by muP.",
+    "settings": "Does it help a video model to be told the actions, or to predict them too? Passive "
+    "prediction sees no actions, so that its ΔPSNR is zero by construction.",
+    "conditioning": "By which way should actions enter the trunk?",
+    "lr": "Does the best learning rate stay where it is as the model widens? Both parametrisations are "
+    "the same function at the base width.",
+}
+TITLES = {
+    "settings": "Ablation: dynamics setting",
+    "conditioning": "Ablation: action conditioning",
+    "lr": "Transfer of the learning rate",
+}
+"""Sections of the page, for sweeps that have one of their own."""
+GAINS = {
+    "datasets": "more robots",
+    "trajectories": "more data",
+    "width": "more width",
+    "settings": "knowing actions",
+    "conditioning": "the way actions enter",
+    "lr": "muP",
+}
+"""What a video model may gain from, by sweep; for the headline."""
+HEADINGS = {"perplexity": "perplexity", "delta_psnr": "ΔPSNR (dB)"}
+LOSSES = {"cross_entropy": "held out", "loss": "training"}
+
+
+def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum]) -> str:
+    """Heading, question and numbers of a sweep of any kind."""
+    if sweep.labels:
+        numbers = _names(sweep, rows)
+    elif sweep.base:
+        numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
+    else:
+        numbers = _curve(sweep, rows)
+    heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
+    return (
+        f"{heading}<p>{html.escape(QUESTIONS[sweep.name])} "
+        f"Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
+    )
+
+
+def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePoint]]:
+    """{metric: {x: point}} of the metrics that there are."""
+    metrics = drawn_metrics(rows, [sweep.name])
+    return {m: {p.x: p for p in curve(rows, sweep.name, m)} for m in metrics}
+
+
+def _curve(sweep: Sweep, rows: Sequence[Row]) -> str:
+    """A line per point, and the change from end to end in standard errors."""
+    columns = _columns(sweep, rows)
+    points = next(iter(columns.values()))
+    lines = []
+    for x, p in points.items():
+        values = [pm(column[x].mean, column[x].sem) for column in columns.values()]
+        lines.append([f"{x:,}", f"{p.parameters:,}", *values, str(len(p.seeds))])
+    numbers = table([sweep.axis, "parameters", *(HEADINGS[m] for m in columns), "seeds"], lines)
+    if len(points) < 2:
+        return numbers
+    ends = min(points), max(points)
+    changes = ", ".join(f"{HEADINGS[m]} {_change(c[ends[0]], c[ends[1]])}" for m, c in columns.items())
+    return f"{numbers}<p>From {ends[0]:,} to {ends[1]:,}: {changes}.</p>"
+
+
+def _change(first: CurvePoint, last: CurvePoint) -> str:
+    """From one point to another, and how many standard errors lie between them."""
+    error = math.hypot(first.sem, last.sem)
+    if not error > 0:  # also nan: a single window
+        return f"{first.mean:.3g} → {last.mean:.3g}"
+    size = abs(last.mean - first.mean) / error
+    return f"{number(first.mean, error)} → {number(last.mean, error)} ({size:.1f} standard errors)"
+
+
+def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
+    """A line per variant with its difference to the default; errors are over seeds."""
+    columns = _columns(sweep, rows)
+    controls = {m: curve(rows, sweep.name, m, CONTROL) for m in columns}
+    lines = []
+    for x, label in enumerate(sweep.labels):
+        here = {m: column.get(x) for m, column in columns.items()}
+        known = next((p for p in here.values() if p), None)
+        if known is None:
+            continue
+        cells = [_bold(label, x == sweep.reference_x), f"{known.parameters:,}"]
+        for metric, p in here.items():
+            default = columns[metric].get(sweep.reference_x)
+            cells += [pm(p.mean, p.seed_sem) if p else "–", _difference(p, default)]
+        lines.append([*cells, str(len(known.seeds))])
+    if any(controls.values()):
+        pairs = [[pm(p[0].mean, math.nan) if p else "–", ""] for p in controls.values()]
+        lines.append(["default, shuffled actions", "", *(cell for pair in pairs for cell in pair), "1"])
+    head = [sweep.axis, "parameters"]
+    for metric in columns:
+        head += [HEADINGS[metric], "to the default"]
+    return table([*head, "seeds"], lines) + (
+        "<p>Bold: the default. Errors are standard errors over seeds, as in the figure: all variants are "
+        "judged on the same windows, so that those do not add to a difference. Differences are taken seed "
+        "by seed.</p>"
+    )
+
+
+def _bold(text: str, wanted: bool) -> str:
+    return f"<b>{html.escape(text)}</b>" if wanted else html.escape(text)
+
+
+def _difference(point: CurvePoint | None, default: CurvePoint | None) -> str:
+    if point is None or default is None or point is default:
+        return ""
+    mean, error = difference(point, default)
+    return ("+" if mean > 0 else "") + pm(mean, error)
+
+
+def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
+    """A line per curve and loss: where it is lowest and what the base width's best rate costs."""
+    lines = [
+        [
+            ROLES[o.role],
+            _bold(o.series, o.series == sweep.base),
+            LOSSES[o.metric],
+            f"{o.x:.3g}" + (f" <span class=failed>{o.edge}</span>" if o.edge else ""),
+            pm(o.loss, o.seed_sem),
+            "–" if math.isnan(o.transferred_x) else f"{o.transferred_x:.3g}",
+            _penalty(o),
+        ]
+        for o in optima
+    ]
+    head = ["", "curve", "loss", "best rate", "lowest", "base width's best rate", "penalty"]
+    return table(head, lines, text=3) + (
+        "<p>The penalty is what the loss is higher by when a width takes the rate that is best at the base "
+        "width (bold); that of the held-out loss is in nats per token. Errors are over seeds, where there "
+        "are several; the grid is not interpolated. "
+        "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
+        "beyond.</p>"
+    )
+
+
+def _penalty(optimum: Optimum) -> str:
+    if math.isnan(optimum.penalty):
+        return "–"
+    return "diverged" if math.isinf(optimum.penalty) else pm(optimum.penalty, optimum.penalty_seed_sem)

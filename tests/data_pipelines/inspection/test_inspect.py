@@ -1,0 +1,196 @@
+"""What inspection says of directories whose contents are known, and the entries it suggests."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.inspection.action_stats import dimension_facts
+from data_pipelines.inspection.inspect import CameraFacts, inspect_dataset
+from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
+from data_pipelines.registry import DatasetSpec, get_spec
+from data_pipelines.registry.own import OWN
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
+
+LENGTHS = [6, 7, 8, 9, 10, 11]
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory):
+    """Actions: episode, step, and a flag that rises at the end."""
+
+    def change(episode, features):
+        features["steps/action"][-1, 2] = 1
+
+    root = tmp_path_factory.mktemp("toy")
+    return write_rlds(root, make_spec("toy", (3,)), LENGTHS, shards=2, change=change)
+
+
+def camera(name: str, blank: bool = False) -> CameraFacts:
+    return CameraFacts(f"observation/{name}", ((8, 8),), 4, 4 if blank else 0, still=blank)
+
+
+def column(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)[:, None]
+
+
+def hint(*episodes: np.ndarray) -> str:
+    (facts,) = dimension_facts(episodes)
+    return facts.hint
+
+
+# --- facts ------------------------------------------------------------------------------------
+
+
+def test_counts_lengths_and_schema_of_a_known_directory(toy):
+    facts, _ = inspect_dataset(toy)
+    assert (facts.name, facts.version, facts.episodes, facts.sampled) == ("toy", "1.0.0", 6, 6)
+    assert [(s.name, s.episodes, s.shards) for s in facts.splits] == [("train", 6, 2)]
+    assert sorted(facts.steps) == LENGTHS
+    assert (facts.lengths.shortest, facts.lengths.longest, facts.lengths.mean) == (6, 11, 8.5)
+    kinds = {f.key: (f.kind, f.shape, f.dtype, f.per_step) for f in facts.fields}
+    assert kinds["observation/image"] == ("image", (8, 8, 3), "uint8", True)
+    assert kinds["action"] == ("number", (3,), "float32", True)
+    assert kinds["language_instruction"][0] == "text"
+    assert kinds["episode_metadata/success"][3] is False
+
+
+def test_action_statistics_are_those_of_all_sampled_steps(toy):
+    facts, _ = inspect_dataset(toy)
+    (action,) = facts.actions
+    steps = np.concatenate([np.arange(n) for n in LENGTHS])
+    index, step, flag = action.dimensions
+    assert (step.minimum, step.maximum) == (0, 10)
+    assert step.mean == pytest.approx(steps.mean()) and step.std == pytest.approx(steps.std())
+    assert flag.mean == pytest.approx(6 / len(steps)) and flag.hint == "end flag"
+    assert index.distinct == 6
+
+
+def test_sample_is_bounded_in_episodes_and_bytes(toy):
+    facts, shown = inspect_dataset(toy, episodes=3, shown=2)
+    assert (facts.sampled, facts.episodes, len(shown)) == (3, 6, 2)
+    assert inspect_dataset(toy, episodes=3)[0].steps == inspect_dataset(toy, episodes=3)[0].steps
+    assert inspect_dataset(toy, max_bytes=1)[0].sampled == 1
+
+
+def test_shown_frames_are_those_of_their_times(toy):
+    _, shown = inspect_dataset(toy, frames=3)
+    for example in shown:
+        assert example.times[0] == 0 and example.times[-1] == example.steps - 1
+        assert example.instruction == "push" and example.success is bool(example.index % 2)
+        (frames,) = example.frames.values()
+        assert [f[0, 0].tolist() for f in frames] == [[example.index, t, 0] for t in example.times]
+
+
+def test_blank_camera_is_recognised_and_not_offered_as_a_target(tmp_path):
+    def change(episode, features):
+        features["steps/observation/image"] = [png(np.full((8, 8, 3), 9, np.uint8))] * 5
+
+    directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
+    facts, _ = inspect_dataset(directory)
+    assert facts.cameras[0].is_blank and facts.cameras[0].still
+    assert "video_targets=False" in suggest_entry(facts, 4).python()
+
+
+def test_damaged_episode_is_counted_not_fatal(tmp_path):
+    def change(episode, features):
+        if episode == 1:
+            features["steps/action"] = features["steps/action"][:-1]
+        if episode == 2:
+            features["steps/observation/image"][0] = b"no image"
+
+    facts, _ = inspect_dataset(write_rlds(tmp_path, make_spec(), [5, 5, 5, 5], change=change))
+    assert facts.sampled == 2 and sum(facts.damaged.values()) == 2
+    assert any("differ in length" in reason for reason in facts.damaged)
+
+
+def test_directory_without_a_usable_episode(tmp_path):
+    def change(episode, features):
+        features["steps/action"] = features["steps/action"][:-1]
+
+    directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
+    with pytest.raises(DataError, match="no episode of split 'train' can be read: .*differ in length"):
+        inspect_dataset(directory)
+
+
+def test_unknown_split_lists_those_there(toy):
+    with pytest.raises(ConfigError, match="no split 'val'.*splits there: train"):
+        inspect_dataset(toy, "val")
+
+
+# --- hints ------------------------------------------------------------------------------------
+
+
+def test_hints_name_what_the_numbers_look_like():
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(rng.normal(size=(200, 1)), axis=0)
+    assert hint(column(3, 3, 3), column(3, 3)) == "constant"
+    assert hint(column(0, 0, 1), column(0, 1)) == "end flag"
+    assert hint(column(0, 1, 1, 0, 1), column(1, 0)) == "switch"
+    assert hint(rng.normal(size=(200, 1))) == "delta"
+    assert hint(walk) == "absolute"
+    assert hint(5 + 0.1 * rng.normal(size=(200, 1))) == "absolute"
+    assert hint((walk + np.pi) % (2 * np.pi) - np.pi) == "wrapping angle"
+
+
+def test_constant_with_rounding_noise_is_dead():
+    (facts,) = dimension_facts([np.float32(0.1) + np.float32([[0], [1e-8], [0]])])
+    assert facts.hint == "constant" and np.isnan(facts.smoothness)
+
+
+def test_values_that_are_not_finite_are_counted_and_left_out():
+    (facts,) = dimension_facts([column(1, np.nan, 3, np.inf)])
+    assert (facts.minimum, facts.maximum, facts.mean, facts.not_finite) == (1, 3, 2, 2)
+
+
+# --- suggestions ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cameras", "chosen"),
+    [
+        ([camera("wrist_image"), camera("image")], "image"),
+        ([camera("hand_color_image"), camera("frontleft_fisheye_image")], "frontleft_fisheye_image"),
+        ([camera("image_0", blank=True), camera("image_1")], "image_1"),
+        ([camera("wrist_left"), camera("zed"), camera("exterior_1_left")], "exterior_1_left"),
+        ([camera("hand_image")], "hand_image"),
+    ],
+)
+def test_camera_that_sees_from_outside_is_chosen(cameras, chosen):
+    assert choose_camera(cameras)[0].key == f"observation/{chosen}"
+
+
+def test_suggested_python_is_an_entry_that_reads_the_dataset(toy):
+    facts, _ = inspect_dataset(toy)
+    suggestion = suggest_entry(facts, 4)
+    (spec,) = eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})  # what pasting it does
+    assert spec == suggestion.spec()
+    assert (spec.action_keys, spec.action_dims, spec.hz) == (("action[:2]",), (2,), 4)
+
+
+def test_without_a_rate_the_entry_says_where_it_is_missing(toy):
+    suggestion = suggest_entry(inspect_dataset(toy)[0], None)
+    assert "FILL IN" in suggestion.python() and any("--hz" in reason for reason in suggestion.reasons)
+    with pytest.raises(ConfigError, match="hz, the native rate, must be positive"):
+        eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})
+
+
+def test_dict_actions_are_suggested_field_by_field(tmp_path):
+    spec = make_spec("parts", (2, 1))
+    suggestion = suggest_entry(inspect_dataset(write_rlds(tmp_path, spec, [5, 6]))[0], spec.hz)
+    assert (suggestion.action_keys, suggestion.action_dims) == (spec.action_keys, spec.action_dims)
+
+
+def test_real_dataset_gets_the_entry_it_has():
+    facts, _ = inspect_dataset(REAL_DATA)
+    known = get_spec("bridge_dataset")
+    assert known in OWN
+    assert suggest_entry(facts, 5).spec().facts() == known.facts()
+
+
+def test_windows_are_counted_over_the_sample(toy):
+    windows = window_facts(inspect_dataset(toy)[0], stride=2, frames=4)  # 8 steps each
+    assert (windows.needed, windows.long_enough) == (8, 4)
+    assert windows.total == pytest.approx(1 + 1 + 2 + 2)

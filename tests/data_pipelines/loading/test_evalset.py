@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.loading.evalset import EvalManifest, eval_batches, freeze_manifest
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+
+
+@pytest.fixture(scope="module")
+def manifest(store):
+    return freeze_manifest(store, store.names, frames=4, windows_per_dataset=5, seed=0)
+
+
+def test_windows_of_an_episode_do_not_overlap(store):
+    everything = freeze_manifest(store, store.names, 4, 500, seed=0)
+    for entry in everything.datasets:
+        facts = store.manifest(entry.dataset)
+        assert len(set(entry.windows)) == len(entry.windows) > 0
+        for episode, start in entry.windows:
+            assert start % 4 == 0
+            assert (start + 4) * facts.stride <= facts.val.steps[episode]
+
+
+def test_spacing_allows_overlap_when_asked(store):
+    counts = [
+        len(freeze_manifest(store, ("arm",), 4, 500, 0, spacing=s).datasets[0].windows) for s in (4, 2, 1)
+    ]
+    assert counts == [6, 12, 24]  # two episodes of 15 model frames
+
+
+def test_fewer_windows_are_a_subset_of_more(store):
+    few, more = (freeze_manifest(store, store.names, 4, n, seed=0) for n in (2, 4))
+    for a, b in zip(few.datasets, more.datasets, strict=True):
+        assert len(a.windows) == 2 and set(a.windows) < set(b.windows)
+
+
+def test_batches_give_each_window_once_with_its_frames_and_actions(store, table, manifest):
+    seen = []
+    for batch in eval_batches(store, table, manifest, batch=2):
+        assert batch["frames"].shape == (2, 4, 8, 8, 3) and batch["frames"].dtype == np.uint8
+        entry = table.entries[table.index(batch["dataset"])]
+        assert (batch["embodiment"] == table.index(batch["dataset"])).all()
+        assert np.array_equal(batch["frames"][..., 0, 0, 1], batch["tokens"][..., 0] % 256)
+        steps = batch["tokens"][..., 0] % 256
+        chunk = batch["actions"][..., : entry.chunk].reshape(2, 4, entry.stride, entry.action_dim)
+        assert (chunk[..., 1] == steps[..., None] + np.arange(entry.stride)).all()
+        episodes = set((batch["tokens"][:, 0, 0] // 256).tolist())
+        assert episodes <= set(store.manifest(entry.name).val.episodes)
+        seen += batch["window"][batch["valid"]].tolist()
+    assert seen == list(range(sum(len(d.windows) for d in manifest.datasets)))
+
+
+def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, manifest):
+    frozen = freeze_manifest(latent_store, store.names, frames=4, windows_per_dataset=5, seed=0)
+    assert frozen.datasets == manifest.datasets
+    pairs = zip(
+        eval_batches(store, table, manifest, 2), eval_batches(latent_store, table, frozen, 2), strict=True
+    )
+    for a, b in pairs:
+        assert b["tokens"].shape == (2, 4, 4, 3) and b["tokens"].dtype == np.float32
+        assert np.array_equal(b["tokens"][..., 0] * 256 + b["tokens"][..., 1], a["tokens"])
+        assert np.array_equal(a["frames"], b["frames"])
+
+
+def test_last_batch_is_padded_by_repeating(store, table, manifest):
+    batches = [b for b in eval_batches(store, table, manifest, 3) if b["dataset"] == "arm"]
+    assert batches[-1]["valid"].tolist() == [True, True, False]
+    assert batches[-1]["window"].tolist() == [3, 4, 4]
+    assert np.array_equal(batches[-1]["tokens"][1], batches[-1]["tokens"][2])
+
+
+def test_a_window_keeps_its_number_in_other_batches_and_selections(store, table, manifest):
+    def tokens(batch, datasets=None):
+        return {
+            int(w): t.tobytes()
+            for b in eval_batches(store, table, manifest, batch, datasets)
+            for w, t in zip(b["window"], b["tokens"], strict=True)
+        }
+
+    everything = tokens(4)
+    assert tokens(1) == everything
+    assert tokens(3, ("hand",)).items() < everything.items()
+
+
+def test_file_round_trip_and_hash(store, manifest, tmp_path):
+    manifest.save(tmp_path / "new" / "eval.json")
+    loaded = EvalManifest.load(tmp_path / "new" / "eval.json")
+    assert loaded == manifest and loaded.hash() == manifest.hash()
+    assert freeze_manifest(store, store.names, 4, 5, seed=1).hash() != manifest.hash()
+    assert freeze_manifest(store, store.names[::-1], 4, 5, seed=0) == manifest
+
+
+def test_edited_file_is_refused(manifest, tmp_path):
+    path = tmp_path / "eval.json"
+    manifest.save(path)
+    values = json.loads(path.read_text())
+    values["datasets"][0]["windows"].pop()
+    path.write_text(json.dumps(values))
+    with pytest.raises(DataError, match="do not match its hash"):
+        EvalManifest.load(path)
+    for content in ("", "[]", "{}", '{"frames": "x"}'):
+        path.write_text(content)
+        with pytest.raises(DataError, match="not an evaluation set"):
+            EvalManifest.load(path)
+    with pytest.raises(DataError, match="cannot be read"):
+        EvalManifest.load(tmp_path / "absent.json")
+
+
+def test_unwritable_file_is_one_clear_message(manifest, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="file/eval.json: cannot be written"):
+        manifest.save(tmp_path / "file" / "eval.json")
+
+
+def small_store(tmp_path, name="toy", lengths=(20,) * 4, **options):
+    spec = make_spec(name, hz=2)
+    rlds = write_rlds(tmp_path, spec, list(lengths))
+    tokenize_dataset(spec, rlds, FakeTokenizer(), tmp_path / "s", **options)
+    return TokenStore(tmp_path / "s")
+
+
+def test_other_data_is_refused(store, table, manifest, tmp_path):
+    other = small_store(tmp_path, "arm")
+    small_store(tmp_path, "base")
+    small_store(tmp_path, "hand")
+    with pytest.raises(ConfigError, match="not the one the evaluation set was frozen on"):
+        eval_batches(TokenStore(other.root), table, manifest, 2)
+
+
+def test_store_without_raw_frames_is_refused(tmp_path):
+    store = small_store(tmp_path, keep_frames="none")
+    frozen = freeze_manifest(store, ("toy",), 4, 5, 0)
+    with pytest.raises(ConfigError, match="keep_frames='val'"):
+        eval_batches(store, store.embodiment_table(("toy",)), frozen, 2)
+
+
+def test_dataset_too_short_to_evaluate_is_reported_and_all_of_them_an_error(tmp_path):
+    small_store(tmp_path, "long")
+    store = small_store(tmp_path, "short", [3] * 4)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0)
+    assert frozen.names == ("long",)
+    assert "4 frames need 4 native frames" in frozen.empty["short"]
+    with pytest.raises(DataError, match="short: 4 frames need 4.*at most 3"):
+        freeze_manifest(store, ("short",), 4, 5, 0)
+
+
+def test_unknown_dataset_is_named(store, table, manifest):
+    with pytest.raises(ConfigError, match="not in the evaluation set: leg"):
+        eval_batches(store, table, manifest, 2, ("leg",))

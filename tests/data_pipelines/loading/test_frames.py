@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import EpisodeError
+from data_pipelines.loading.frames import make_frame_loader
+from data_pipelines.loading.splits import held_out
+from data_pipelines.registry import get_spec
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
+
+SPEC = make_spec()
+
+
+@pytest.fixture(scope="module")
+def rlds(tmp_path_factory):
+    return write_rlds(tmp_path_factory.mktemp("frames"), SPEC, [5 + i for i in range(20)], shards=3)
+
+
+def take(datasets, count, batch=8, **options):
+    loader = make_frame_loader(datasets, image_size=8, batch=batch, seed=1, **options)
+    return list(itertools.islice(loader, count))
+
+
+@pytest.mark.parametrize("batch", [1, 6, 8])
+def test_frames_are_uint8_squares_of_the_asked_size(batch):
+    loader = make_frame_loader([(get_spec("bridge_dataset"), REAL_DATA)], image_size=16, batch=batch, seed=0)
+    frames = next(loader)
+    assert frames.shape == (batch, 16, 16, 3) and frames.dtype == np.uint8 and frames.std() > 10
+
+
+def test_splits_share_no_episode_and_cover_all_frames(rlds):
+    mask = held_out("toy", 20)
+    seen = {}
+    for split in ("train", "val"):
+        frames = np.concatenate(take([(SPEC, rlds)], 120, split=split))[:, 0, 0]
+        seen[split] = set(map(tuple, frames[:, :2].tolist()))
+    assert {e for e, _ in seen["val"]} == set(np.flatnonzero(mask).tolist())
+    assert {e for e, _ in seen["train"]} == set(np.flatnonzero(~mask).tolist())
+    assert seen["val"] == {(e, t) for e in np.flatnonzero(mask) for t in range(5 + e)}
+
+
+def test_resuming_continues_exactly(rlds):
+    straight = take([(SPEC, rlds)], 6)
+    for start in (1, 4):
+        rest = take([(SPEC, rlds)], 2, start_step=start, threads=0)
+        assert np.array_equal(rest, straight[start : start + 2])
+
+
+def test_small_datasets_are_not_drowned(tmp_path, rlds):
+    other = make_spec("small")
+    directory = write_rlds(tmp_path, other, [200] * 4)
+    frames = np.concatenate(take([(SPEC, rlds), (other, directory)], 60))[:, 0, 0]
+    share = (frames[:, 0] < 4).mean()  # 2 of 20 episodes: 1 / (1 + 9^(1/3)) = 0.32 of the draws
+    assert share > 0.3
+
+
+def test_damaged_episode_is_an_error_or_replaced(tmp_path):
+    def spoil(episode, features):
+        if episode == 3:
+            features["steps/observation/image"] = [b"broken"] * 9
+
+    rlds = write_rlds(tmp_path, SPEC, [9] * 6, change=spoil)
+    assert not held_out("toy", 6)[3]
+    with pytest.raises(EpisodeError, match="episode 3"):
+        take([(SPEC, rlds)], 20)
+    seen = np.concatenate(take([(SPEC, rlds)], 20, corrupt="skip"))[:, 0, 0, 0]
+    assert 3 not in seen and len(set(seen.tolist())) == 3
+
+
+def test_wrong_arguments_are_one_clear_message(rlds):
+    with pytest.raises(ConfigError, match="no dataset was given"):
+        make_frame_loader([], 8, 8, 0)
+    with pytest.raises(ConfigError, match="images there"):
+        make_frame_loader([(get_spec("bridge_dataset"), rlds)], 8, 8, 0)
+    with pytest.raises(ConfigError, match="but 4 were expected"):
+        make_frame_loader([(make_spec("toy", (4,)), rlds)], 8, 8, 0)
+    with pytest.raises(ConfigError, match="split must be"):
+        make_frame_loader([(SPEC, rlds)], 8, 8, 0, split="test")

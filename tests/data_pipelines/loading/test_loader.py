@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import itertools
+import resource
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.loading.loader import LoaderConfig, make_loader, select_windows
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from hma_jax.config import ConfigError
+from hma_jax.embodiments import EmbodimentTable
+from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+
+STATM = Path("/proc/self/statm")
+CONFIG = LoaderConfig(frames=6, batch=16, seed=3)
+
+
+def take(store, table, count, config=CONFIG, **options):
+    return list(itertools.islice(make_loader(store, table, config, **options), count))
+
+
+def same(a, b):
+    return set(a) == set(b) and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+# --- what a batch holds ------------------------------------------------------------------------
+
+
+def test_batch_has_the_agreed_shapes_and_types(store, table):
+    (batch,) = take(store, table, 1)
+    assert {k: (v.shape, v.dtype.name) for k, v in batch.items()} == {
+        "tokens": ((16, 6, 4), "int32"),
+        "actions": ((16, 6, 30), "float32"),
+        "embodiment": ((16,), "int32"),
+    }
+
+
+def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table):
+    ids, latents = take(store, table, 3), take(latent_store, table, 3)
+    for a, b in zip(ids, latents, strict=True):
+        assert b["tokens"].shape == (16, 6, 4, 3) and b["tokens"].dtype == np.float32
+        assert np.array_equal(b["tokens"][..., 0] * 256 + b["tokens"][..., 1], a["tokens"])
+        np.testing.assert_allclose(b["tokens"][..., 2], b["tokens"][..., 1] / 3, rtol=1e-3)
+        assert np.array_equal(a["actions"], b["actions"])
+
+
+def test_every_row_is_one_window_with_its_own_actions(store, table):
+    """The fixture's tokens and actions both say (episode, step)."""
+    for batch in take(store, table, 12):
+        rows = zip(batch["tokens"], batch["actions"], batch["embodiment"], strict=True)
+        for tokens, actions, embodiment in rows:
+            entry = table.entries[embodiment]
+            stride, dim = entry.stride, entry.action_dim
+            episode, step = tokens[:, 0] // 256, tokens[:, 0] % 256
+            assert (np.diff(step) == stride).all() and len(set(episode)) == 1
+            chunk = actions[:, : stride * dim].reshape(6, stride, dim)
+            assert (chunk[..., 0] == episode[0]).all()
+            assert (chunk[..., 1] == step[:, None] + np.arange(stride)).all()
+            assert (actions[:, stride * dim :] == 0).all()
+
+
+def test_held_out_episodes_are_never_seen(store, table):
+    held = {name: set(store.manifest(name).val.episodes) for name in store.names}
+    for batch in take(store, table, 40):
+        for tokens, embodiment in zip(batch["tokens"], batch["embodiment"], strict=True):
+            assert tokens[0, 0] // 256 not in held[table.names[embodiment]]
+
+
+def test_batches_mix_embodiments(store, table):
+    assert all(len(set(batch["embodiment"].tolist())) == 3 for batch in take(store, table, 20))
+
+
+def test_datasets_are_drawn_with_the_cube_root_of_their_windows(store, table):
+    mixture = select_windows(store, CONFIG).mixture
+    counts = {n: len(s) for n, s in select_windows(store, CONFIG).sets.items()}
+    assert max(counts.values()) > 5 * min(counts.values())
+    root = np.cbrt([counts[n] for n in mixture.names])
+    seen = np.concatenate([b["embodiment"] for b in take(store, table, 200)])
+    frequency = np.bincount(seen, minlength=3)[[table.index(n) for n in mixture.names]] / len(seen)
+    np.testing.assert_allclose(frequency, root / root.sum(), atol=0.005)
+
+
+def test_an_epoch_visits_every_window_once(store):
+    table = store.embodiment_table(("base",))
+    config = LoaderConfig(frames=6, batch=5, datasets=("base",))
+    n = len(select_windows(store, config).sets["base"])
+    assert n % 5 == 0
+    for epoch in range(2):
+        batches = take(store, table, n // 5, config, start_step=epoch * n // 5)
+        assert len({int(t) for b in batches for t in b["tokens"][:, 0, 0]}) == n
+
+
+# --- order ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("processes", [2, 4, 16])
+def test_global_batch_does_not_depend_on_the_number_of_processes(store, table, processes):
+    whole = take(store, table, 4)
+    parts = [take(store, table, 4, process_index=p, process_count=processes) for p in range(processes)]
+    for step, batch in enumerate(whole):
+        joined = {k: np.concatenate([part[step][k] for part in parts]) for k in batch}
+        assert same(batch, joined)
+
+
+def test_resuming_at_every_step_continues_exactly(store, table):
+    straight = take(store, table, 9)
+    for start in range(9):
+        for batch, expected in zip(take(store, table, 2, start_step=start), straight[start:], strict=False):
+            assert same(batch, expected)
+
+
+def test_resuming_with_other_processes_and_threads_continues_exactly(store, table):
+    straight = take(store, table, 4)
+    parts = [
+        take(store, table, 2, start_step=2, process_index=p, process_count=2, threads=4 * p, prefetch=1)
+        for p in (0, 1)
+    ]
+    for k in (0, 1):
+        assert same(straight[2 + k], {n: np.concatenate([p[k][n] for p in parts]) for n in straight[0]})
+
+
+def test_far_steps_cost_nothing(store, table):
+    assert take(store, table, 1, start_step=10**9)[0]["tokens"].shape == (16, 6, 4)
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="needs /proc")
+def test_memory_stays_flat(store, table):
+    """A loader that keeps what it has read grows by 20 kB a batch here."""
+
+    def resident() -> int:
+        return int(STATM.read_text().split()[1]) * resource.getpagesize()
+
+    loader = make_loader(store, table, CONFIG)
+    for _ in range(200):
+        next(loader)
+    before = resident()
+    for _ in range(600):
+        next(loader)
+    assert resident() - before < 6e6
+
+
+def test_seed_changes_the_order(store, table):
+    assert not same(take(store, table, 1)[0], take(store, table, 1, replace(CONFIG, seed=4))[0])
+
+
+def test_a_dataset_more_does_not_reorder_the_others(store):
+    few, more = ("arm", "base"), ("arm", "base", "hand")
+    orders = []
+    for names in (few, more):
+        table = store.embodiment_table(names)
+        batches = take(store, table, 12, replace(CONFIG, datasets=names))
+        rows = [(e, t[0, 0]) for b in batches for e, t in zip(b["embodiment"], b["tokens"], strict=True)]
+        orders.append([t for e, t in rows if e == 0][:40])
+    assert orders[0] == orders[1]
+
+
+# --- subsets, control ------------------------------------------------------------------------------
+
+
+def test_small_subset_is_inside_the_large_one(store):
+    table = store.embodiment_table(("arm",))
+    seen = []
+    for limit in (2, 10, None):
+        config = LoaderConfig(frames=6, batch=16, datasets=("arm",), max_trajectories=limit)
+        seen.append({int(t) // 256 for b in take(store, table, 40, config) for t in b["tokens"][:, 0, 0]})
+    assert [len(s) for s in seen] == [2, 10, 38]
+    assert seen[0] < seen[1] < seen[2]
+
+
+def test_shuffled_actions_change_the_actions_and_nothing_else(store, table):
+    true = take(store, table, 6)
+    shuffled = take(store, table, 6, replace(CONFIG, shuffle_actions=True))
+    other, rows = 0, 0
+    for a, b in zip(true, shuffled, strict=True):
+        assert np.array_equal(a["tokens"], b["tokens"]) and np.array_equal(a["embodiment"], b["embodiment"])
+        changed = a["actions"][:, 0, 0] != b["actions"][:, 0, 0]  # value 0 is the episode's number
+        other, rows = other + changed.sum(), rows + len(changed)
+        for row, embodiment in zip(b["actions"], b["embodiment"], strict=True):
+            entry = table.entries[embodiment]  # a whole window of the same dataset's train split
+            assert (row[:, entry.chunk :] == 0).all() and len(set(row[:, 0])) == 1
+            assert int(row[0, 0]) in store.manifest(entry.name).train.episodes
+            assert (np.diff(row[:, 1]) == entry.stride).all()
+    assert other == rows
+    again = take(store, table, 6, replace(CONFIG, shuffle_actions=True))
+    assert all(map(same, shuffled, again))
+
+
+def test_a_window_meets_other_actions_on_each_visit(store):
+    """Otherwise a wrong pair could be learnt by heart."""
+    table = store.embodiment_table(("base",))
+    config = LoaderConfig(frames=20, batch=10, datasets=("base",), shuffle_actions=True)  # one window each
+    pairs: dict[int, set[int]] = {}
+    for batch in take(store, table, 6, config):
+        for tokens, actions in zip(batch["tokens"], batch["actions"], strict=True):
+            pairs.setdefault(int(tokens[0, 0]), set()).add(int(actions[0, 0]))
+    assert np.mean([len(p) for p in pairs.values()]) > 2
+
+
+# --- errors ----------------------------------------------------------------------------------------
+
+
+def test_too_short_episodes_are_counted(tmp_path):
+    spec = make_spec("mixed", hz=4)
+    rlds = write_rlds(tmp_path, spec, [8, 30] * 5)
+    tokenize_dataset(spec, rlds, FakeTokenizer(), tmp_path / "store")
+    store = TokenStore(tmp_path / "store")
+    config = LoaderConfig(frames=6, batch=2)
+    short = sum(n < 12 for n in store.manifest("mixed").train.steps)
+    assert select_windows(store, config).too_short == {"mixed": short} and short >= 3
+    take(store, store.embodiment_table(("mixed",)), 3, config)
+
+
+def test_dataset_without_windows_is_dropped_and_reported(store, table):
+    config = replace(CONFIG, frames=15)  # base has 20 frames at stride 1, arm 15, hand 12
+    selected = select_windows(store, config)
+    assert set(selected.mixture.names) == {"arm", "base"}
+    assert "15 frames need 75 native frames" in selected.mixture.dropped["hand"]
+    assert set(take(store, table, 1, config)[0]["embodiment"].tolist()) == {0, 1}
+
+
+def test_no_window_at_all_says_what_would_fit(store, table):
+    with pytest.raises(DataError, match="base: 21 frames need 21 native frames.*has 20.*at most 20 frames"):
+        make_loader(store, table, replace(CONFIG, frames=21))
+
+
+def test_unknown_dataset(store, table):
+    with pytest.raises(ConfigError, match="'leg' is not in the token store"):
+        make_loader(store, table, replace(CONFIG, datasets=("leg",)))
+
+
+def test_batch_that_does_not_split(store, table):
+    with pytest.raises(ConfigError, match="batch 16 does not split over 3 processes"):
+        make_loader(store, table, CONFIG, process_count=3)
+
+
+def test_table_of_another_action_layout(store, table):
+    wrong = EmbodimentTable((replace(table.entries[0], stride=1), *table.entries[1:]))
+    with pytest.raises(ConfigError, match="arm: the token store has 3 action values at stride 2"):
+        make_loader(store, wrong, CONFIG)
+
+
+def test_datasets_of_different_tokenizers_do_not_mix(store_root, tmp_path):
+    for name, tokenizer in (("a", FakeTokenizer("one")), ("b", FakeTokenizer("two"))):
+        spec = make_spec(name, hz=2)
+        tokenize_dataset(spec, write_rlds(tmp_path, spec, [20] * 4), tokenizer, tmp_path / "store")
+    store = TokenStore(tmp_path / "store")
+    with pytest.raises(ConfigError, match="tokenised differently"):
+        make_loader(store, store.embodiment_table(store.names), CONFIG)
+
+
+@pytest.mark.parametrize("change", [{"frames": 0}, {"batch": 0}, {"tau": 0.0}, {"datasets": ("a", "a")}])
+def test_impossible_configs_are_refused(change):
+    with pytest.raises(ConfigError, match=f"loader.{next(iter(change))}"):
+        replace(CONFIG, **change)

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_pipelines.registry import (
+    MIXTURES,
+    DatasetSpec,
+    all_specs,
+    get_mixture,
+    get_spec,
+    known_groups,
+    register,
+)
+from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.toml_file import load_entries, to_toml
+from data_pipelines.rlds.dataset import RldsDataset
+from data_pipelines.suite.embodiments import EMBODIMENTS
+from hma_jax.config import ConfigError
+from hma_jax.embodiments import Embodiment, EmbodimentTable
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Entries registered in a test are gone after it."""
+    monkeypatch.setattr(registry_table, "_registered", {})
+
+
+def test_real_dataset_matches_its_entry():
+    spec = get_spec("bridge_dataset")
+    RldsDataset(REAL_DATA).check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+    assert (spec.stride, spec.action_dim) == (2, 7)
+
+
+def test_every_embodiment_of_the_suite_is_registered():
+    for e in EMBODIMENTS:
+        spec = get_spec(e.name)
+        assert (spec.hz, spec.action_dim) == (e.hz, e.action_dim)
+        assert spec.image_key == f"observation/{e.cameras[0].key}"
+        assert all(key.startswith("action/") for key in spec.action_keys) == e.dict_actions
+
+
+def test_every_name_is_registered_once():
+    names = [spec.name for specs in known_groups().values() for spec in specs]
+    assert len(names) == len(set(names)) == len(all_specs()) > 95
+
+
+# --- the paper's mixture ----------------------------------------------------------------------
+
+
+def test_mixtures_are_the_release_s_lists():
+    sizes = {name: len(set(names)) for name, names in MIXTURES.items()}
+    assert sizes == {f"dataset{n}": n for n in (5, 10, 20, 30, 40)} | {"dataset30_vae": 30}
+    for small, large in (("dataset5", "dataset10"), ("dataset10", "dataset20"), ("dataset20", "dataset30")):
+        assert set(MIXTURES[small]) < set(MIXTURES[large])
+    (extra,) = set(MIXTURES["dataset30"]) - set(MIXTURES["dataset40"])  # the release's own inconsistency
+    assert extra.startswith("cmu_franka_exploration")
+    assert [get_spec(name).name for names in MIXTURES.values() for name in names]
+
+
+def test_unknown_mixture_lists_the_known():
+    with pytest.raises(ConfigError, match="unknown mixture 'dataset15'; known: dataset5, dataset10"):
+        get_mixture("dataset15")
+
+
+def test_rates_that_the_release_gets_wrong_are_right():
+    """Native rates where the release has none or a changed one (reference section 5.4)."""
+    native = {
+        "bridge_data_v2": 5, "utokyo_xarm_bimanual_converted_externally_to_rlds": 10,
+        "berkeley_fanuc_manipulation": 10, "qut_dexterous_manpulation": 30,
+        "dlr_sara_grid_clamp_converted_externally_to_rlds": 10, "cmu_stretch": 10, "spoc": 10,
+        "io_ai_tech": 30, "dobbe": 3.75, "berkeley_gnm_cory_hall": 5, "plex_robosuite": 20,
+        "imperial_wrist_dataset": 10, "language_table": 10, "kuka": 10,
+    }  # fmt: skip
+    assert {name: get_spec(name).hz for name in native} == native
+
+
+def test_termination_flags_and_future_actions_are_no_part_of_the_action():
+    dims = {"fractal20220817_data": 10, "kuka": 7, "bc_z": 7, "cmu_stretch": 7, "toto": 7, "droid": 7}
+    assert {name: get_spec(name).action_dim for name in dims} == dims
+    assert not [s.name for s in all_specs() if any("terminate" in key for key in s.action_keys)]
+
+
+def test_constant_action_dimensions_are_safe_to_normalise():
+    """Planar robots, flags that never rise: std 0 and rounding noise give exactly 0, not infinity."""
+    table = EmbodimentTable((Embodiment("flat", 3, 2, mean=(1.0, 0.1, -2.0), std=(0.5, 0.0, 1e-8)),))
+    raw = np.tile(np.float32([2.0, 0.1 + 1e-7, -2.0 + 1e-6]), (1, 4, 2))
+    normal = np.asarray(table.normalise(raw, np.array([0])))
+    assert np.allclose(normal, np.tile([2.0, 0.0, 0.0], 2), atol=1e-6)
+    assert not normal[..., [1, 2]].any()
+    assert np.allclose(table.unnormalise(normal, np.array([0])), raw, atol=1e-5)
+
+
+# --- entries ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "hz, stride", [(0.5, 1), (1, 1), (2, 1), (3, 2), (4, 2), (5, 2), (10, 5), (15, 8), (20, 10), (30, 15)]
+)
+def test_stride_brings_the_rate_next_to_2_hz(hz, stride):
+    assert DatasetSpec("x", "observation/image", ("action",), (1,), hz).stride == stride
+
+
+def test_part_of_a_field_is_read_as_the_action(tmp_path):
+    directory = write_rlds(tmp_path, make_spec("toy", (5,)), [4, 4])
+    dataset = RldsDataset(directory)
+    whole = dataset.episode(1, "observation/image", ("action",)).actions
+    parts = dataset.episode(1, "observation/image", ("action[1:3]", "action[:1]", "action[4:]")).actions
+    assert np.array_equal(parts, whole[:, [1, 2, 0, 4]])
+    dataset.check_keys("observation/image", ("action[1:3]", "action[4:]"), (2, 1))
+    with pytest.raises(ConfigError, match=r"'action\[3:9\]' has 2 values"):
+        dataset.check_keys("observation/image", ("action[3:9]",), (6,))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"hz": 0}, "hz, the native rate, must be positive"),
+        ({"action_dims": (7, 1)}, "same length"),
+        ({"action_keys": ("action[:6]",)}, r"'action\[:6\]' takes 6 values, action_dims says 7"),
+        ({"action_dims": (0,)}, "at least 1"),
+    ],
+)
+def test_entry_that_cannot_be_right_is_refused(change, message):
+    good = DatasetSpec("x", "observation/image", ("action[:7]",), (7,), 10)
+    with pytest.raises(ConfigError, match=f"dataset 'x': .*{message}"):
+        replace(good, **change)
+
+
+def test_unknown_name_suggests_the_closest():
+    with pytest.raises(ConfigError, match="unknown dataset 'bridge_datset'; did you mean bridge_dataset"):
+        get_spec("bridge_datset")
+    with pytest.raises(ConfigError, match="known: bridge_dataset.*hma data list"):
+        get_spec("zzzzz")
+
+
+# --- entries outside the project --------------------------------------------------------------
+
+
+def test_entry_survives_its_toml_file(tmp_path):
+    for spec in all_specs():
+        (tmp_path / "one.toml").write_text(to_toml(spec))
+        assert load_entries(tmp_path / "one.toml") == (spec,)
+
+
+def test_registered_entry_is_found_and_takes_the_place_of_a_known_one(registered):
+    register([DatasetSpec("mine", "observation/image", ("action",), (7,), 10)])
+    assert get_spec("mine").hz == 10
+    register([replace(get_spec("droid"), hz=7.5)])
+    assert get_spec("droid").hz == 7.5
+    assert len({s.name for s in all_specs()}) == len(all_specs())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[robot", "not a TOML file"),
+        ("hz = 3", "hz = 3 stands outside"),
+        ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\n', "robot: missing field.* hz"),
+        ('[robot]\nimage = "i"\n', "unknown field.* image; known"),
+        ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\nhz = -1\n', "hz, the native rate"),
+    ],
+)
+def test_toml_file_with_a_mistake_is_named(text, message, tmp_path):
+    (tmp_path / "my.toml").write_text(text)
+    with pytest.raises(ConfigError, match=rf"my.toml: .*{message}"):
+        load_entries(tmp_path / "my.toml")
+
+
+def test_missing_toml_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="absent.toml: the registry file cannot be read"):
+        load_entries(tmp_path / "absent.toml")

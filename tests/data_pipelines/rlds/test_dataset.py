@@ -1,0 +1,267 @@
+from __future__ import annotations
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
+from data_pipelines.rlds.dataset import RldsDataset
+from data_pipelines.rlds.tfrecord import index_shard
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
+
+SPEC = make_spec()
+KEYS = (SPEC.image_key, SPEC.action_keys)
+
+
+@pytest.fixture
+def directory(tmp_path):
+    """Six episodes in two shards."""
+    return write_rlds(tmp_path, SPEC, [5, 6, 7, 8, 9, 10], shards=2)
+
+
+def shards(directory):
+    return sorted(directory.glob("*.tfrecord*"))
+
+
+def flip(path, byte):
+    data = bytearray(path.read_bytes())
+    data[byte] ^= 1
+    path.write_bytes(data)
+
+
+# --- what is read ----------------------------------------------------------------------------
+
+
+def test_episodes_are_random_access_over_all_shards(directory):
+    dataset = RldsDataset(directory)
+    assert len(dataset) == 6 and (dataset.name, dataset.version) == ("toy", "1.0.0")
+    for i in (4, 0, 3):
+        episode = dataset.episode(i, *KEYS)
+        assert episode.steps == len(episode.images) == 5 + i
+        assert [image[0, 0].tolist() for image in episode.images] == [[i, t, 0] for t in range(5 + i)]
+        assert episode.actions.dtype == np.float32
+        assert episode.actions[:, :2].tolist() == [[i, t] for t in range(5 + i)]
+        assert episode.success is bool(i % 2)
+
+
+def test_frame_step_thins_images_not_actions(directory):
+    episode = RldsDataset(directory).episode(3, *KEYS, frame_step=3)
+    assert [image[0, 0, 1] for image in episode.images] == [0, 3, 6]
+    assert len(episode.actions) == 8
+
+
+def test_dict_actions_are_joined_in_the_order_given(tmp_path):
+    spec = make_spec("dicts", (2, 1, 3))
+    dataset = RldsDataset(write_rlds(tmp_path, spec, [4, 4]))
+    forward = dataset.episode(1, spec.image_key, spec.action_keys).actions
+    assert forward.shape == (4, 6) and forward[:, 1].tolist() == [0, 1, 2, 3]
+    backward = dataset.episode(1, spec.image_key, spec.action_keys[::-1]).actions
+    assert backward[:, 5].tolist() == [0, 1, 2, 3]
+
+
+def test_parent_directory_means_the_newest_version(tmp_path, directory):
+    newer = directory.with_name("1.10.0")
+    newer.mkdir()
+    for path in directory.iterdir():
+        (newer / path.name).write_bytes(path.read_bytes())
+    info = json.loads((newer / "dataset_info.json").read_text()) | {"version": "1.10.0"}
+    (newer / "dataset_info.json").write_text(json.dumps(info))
+    directory.with_name("1.9.0").mkdir()  # incomplete: no dataset_info.json
+    assert RldsDataset(directory.parent).version == "1.10.0"
+
+
+def test_pickled_dataset_reads_the_same(directory):
+    dataset = pickle.loads(pickle.dumps(RldsDataset(directory)))
+    assert dataset.episode(5, *KEYS).steps == 10
+
+
+def test_real_episode_is_read():
+    episode = RldsDataset(REAL_DATA).episode(0, "observation/image_0", ("action",))
+    assert episode.images[0].shape == (64, 64, 3) and episode.images[0].dtype == np.uint8
+    assert episode.actions.shape == (10, 7) and episode.success is None
+
+
+def test_fingerprint_tells_contents_apart_not_places(tmp_path):
+    lengths = [5, 6]
+    a = RldsDataset(write_rlds(tmp_path / "a", SPEC, lengths)).fingerprint()
+    assert a == RldsDataset(write_rlds(tmp_path / "b", SPEC, lengths)).fingerprint()
+    assert a != RldsDataset(write_rlds(tmp_path / "c", SPEC, [5, 7])).fingerprint()
+
+    def change(episode, features):  # same number of bytes
+        features["steps/action"][0, 0] = 9
+
+    assert a != RldsDataset(write_rlds(tmp_path / "d", SPEC, lengths, change=change)).fingerprint()
+
+
+# --- damage: one clear message each -----------------------------------------------------------
+
+
+def test_empty_or_missing_directory(tmp_path):
+    with pytest.raises(DataError, match="no such directory"):
+        RldsDataset(tmp_path / "absent")
+    with pytest.raises(DataError, match="holds nothing"):
+        RldsDataset(tmp_path)
+
+
+def test_no_dataset_info(directory):
+    (directory / "dataset_info.json").unlink()
+    with pytest.raises(DataError, match="has a dataset_info.json"):
+        RldsDataset(directory)
+
+
+@pytest.mark.parametrize("file", ["dataset_info.json", "features.json"])
+@pytest.mark.parametrize("content", ["", "{", "[]", "{}"])
+def test_damaged_metadata(directory, file, content):
+    (directory / file).write_text(content)
+    with pytest.raises(DataError, match="missing or damaged"):
+        RldsDataset(directory)
+
+
+def test_missing_features(directory):
+    (directory / "features.json").unlink()
+    with pytest.raises(DataError, match="missing or damaged"):
+        RldsDataset(directory)
+
+
+def test_missing_shard(directory):
+    shards(directory)[1].unlink()
+    with pytest.raises(DataError, match=r"00001-of-00002: the shard is missing"):
+        RldsDataset(directory)
+
+
+def test_empty_shard(directory):
+    shards(directory)[1].write_bytes(b"")
+    with pytest.raises(DataError, match=r"00001-of-00002: 0 records.*says 3: the file is empty"):
+        RldsDataset(directory)
+
+
+@pytest.mark.parametrize("stated", ["2", "4"])
+def test_count_that_contradicts_dataset_info(directory, stated):
+    path = directory / "dataset_info.json"
+    info = json.loads(path.read_text())
+    info["splits"][0]["shardLengths"][0] = stated
+    path.write_text(json.dumps(info))
+    with pytest.raises(DataError, match=rf"00000-of-00002: 3 records, but dataset_info.json says {stated}"):
+        RldsDataset(directory)
+
+
+def test_truncated_shard(directory):
+    shard = shards(directory)[0]
+    shard.write_bytes(shard.read_bytes()[:-10])
+    with pytest.raises(CorruptRecordError, match="truncated"):
+        RldsDataset(directory)
+
+
+def test_flipped_bit_in_a_record(directory):
+    shard = shards(directory)[0]
+    offset = int(index_shard(shard).offsets[1])
+    flip(shard, offset + 100)
+    dataset = RldsDataset(directory)
+    dataset.episode(0, *KEYS)
+    with pytest.raises(CorruptRecordError, match=rf"{shard.name}: corrupt record at byte {offset}"):
+        dataset.episode(1, *KEYS)
+
+
+def test_unknown_split(directory):
+    with pytest.raises(ConfigError, match="no split 'test'.*splits there: train"):
+        RldsDataset(directory, "test")
+
+
+def test_wrong_image_key_lists_the_images(directory):
+    with pytest.raises(ConfigError, match="images there: observation/image "):
+        RldsDataset(directory).check_keys("observation/imgae", ("action",))
+    with pytest.raises(ConfigError, match="'action' is not an image"):
+        RldsDataset(directory).check_keys("action", ("action",))
+
+
+def test_wrong_action_key_or_size(directory):
+    dataset = RldsDataset(directory)
+    with pytest.raises(ConfigError, match="no numeric field 'actoin'.*closest: action"):
+        dataset.check_keys("observation/image", ("actoin",))
+    with pytest.raises(ConfigError, match="'action' has 3 values per step.*but 7 were expected"):
+        dataset.check_keys("observation/image", ("action",), (7,))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_actions_that_are_not_finite_name_the_step(tmp_path, value):
+    def spoil(episode, features):
+        if episode == 2:
+            features["steps/action"][4, 1] = value
+
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6, 6, 6], change=spoil))
+    dataset.episode(1, *KEYS)
+    with pytest.raises(EpisodeError, match="toy, episode 2 .*'steps/action' is not finite at step 4"):
+        dataset.episode(2, *KEYS)
+
+
+def test_actions_and_frames_of_different_number(tmp_path):
+    def spoil(episode, features):
+        features["steps/action"] = features["steps/action"][:-1]
+
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6], change=spoil))
+    with pytest.raises(EpisodeError, match="15 values, but 6 frames of 3 need 18"):
+        dataset.episode(0, *KEYS)
+
+
+def test_episode_without_frames_is_unusable(tmp_path):
+    def spoil(episode, features):
+        features |= {"steps/observation/image": [], "steps/action": np.zeros((0, 3), np.float32)}
+
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6], change=spoil))
+    for keys in (SPEC.action_keys, ()):
+        with pytest.raises(EpisodeError, match="episode 0 .*no frames"):
+            dataset.episode(0, SPEC.image_key, keys)
+
+
+def test_image_that_cannot_be_decoded_names_the_step(tmp_path):
+    def spoil(episode, features):
+        features["steps/observation/image"][3] = b"\xff\xd8\xff broken"
+        features["steps/observation/image"][4] = b""
+
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6], change=spoil))
+    with pytest.raises(EpisodeError, match="episode 0 .*step 3 of 'steps/observation/image'"):
+        dataset.episode(0, *KEYS)
+    with pytest.raises(EpisodeError, match="neither JPEG nor PNG"):
+        dataset.frames(0, SPEC.image_key, lambda n: [4])
+
+
+# --- the policy 'skip' ------------------------------------------------------------------------
+
+
+def test_skip_keeps_what_a_truncated_shard_still_holds(directory):
+    shard = shards(directory)[0]
+    shard.write_bytes(shard.read_bytes()[:-10])
+    dataset = RldsDataset(directory, corrupt="skip")
+    assert len(dataset) == 5 and sum(dataset.skipped.values()) == 1
+    assert "truncated" in next(iter(dataset.skipped))
+    assert dataset.episode(2, *KEYS).actions[0, 0] == 3  # the second shard's first
+
+
+def test_skip_counts_a_missing_shard_in_full(directory):
+    shards(directory)[1].unlink()
+    dataset = RldsDataset(directory, corrupt="skip")
+    assert len(dataset) == 3 and sum(dataset.skipped.values()) == 3
+
+
+def test_skip_is_bounded(directory):
+    shards(directory)[1].unlink()
+    with pytest.raises(DataError, match="3 episodes are unusable, more than max_skipped=2"):
+        RldsDataset(directory, corrupt="skip", max_skipped=2)
+
+
+def test_skip_counts_an_episode_once(directory):
+    dataset = RldsDataset(directory, corrupt="skip", max_skipped=1)
+    error = EpisodeError("episode 1 is broken")
+    dataset.skip(error)
+    dataset.skip(error)
+    assert dataset.skipped == {"episode 1 is broken": 1}
+    with pytest.raises(DataError, match="max_skipped=1"):
+        dataset.skip(EpisodeError("episode 2 is broken"))
+
+
+def test_raise_passes_the_error_on(directory):
+    with pytest.raises(EpisodeError, match="broken"):
+        RldsDataset(directory).skip(EpisodeError("broken"))

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode, encode_episode, token_dtype
+from data_pipelines.tokens.store import TokenStore
+from hma_jax.config import ConfigError
+
+
+def make_item(**changes) -> StoredEpisode:
+    rng = np.random.default_rng(0)
+    values = dict(
+        episode=17,
+        success=None,
+        tokens=rng.integers(0, 60000, (3, 5)).astype(np.uint16),
+        actions=rng.normal(size=(6, 7)).astype(np.float32),
+        frames=rng.integers(0, 255, (3, 8, 8, 3)).astype(np.uint8),
+    )
+    return StoredEpisode(**(values | changes))
+
+
+@pytest.mark.parametrize("success", [None, True, False])
+@pytest.mark.parametrize("dtype", [np.uint16, np.uint32])
+@pytest.mark.parametrize("frames", [True, False])
+def test_record_keeps_everything(success, dtype, frames):
+    item = make_item(success=success)
+    kept = item.frames if frames else None
+    item = make_item(success=success, tokens=item.tokens.astype(dtype), frames=kept)
+    back = decode_episode(encode_episode(item))
+    assert (back.episode, back.success) == (17, success)
+    assert back.tokens.dtype == dtype and np.array_equal(back.tokens, item.tokens)
+    assert np.array_equal(back.actions, item.actions)
+    assert np.array_equal(back.frames, item.frames) if frames else back.frames is None
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_record_keeps_latents(channels):
+    latents = np.random.default_rng(1).normal(size=(3, 5, channels)).astype(np.float16)
+    item = make_item(tokens=latents)
+    back = decode_episode(encode_episode(item))
+    assert back.tokens.dtype == np.float16 and np.array_equal(back.tokens, latents)
+    assert np.array_equal(back.actions, item.actions) and np.array_equal(back.frames, item.frames)
+
+
+def test_records_of_ids_have_kept_their_layout():
+    """Written out by hand: stores from before there were latents must still be read."""
+    header = np.asarray([1, 17, -1, 3, 5, 6, 7, 2, 8, 0], "<i4").tobytes()
+    item = make_item()
+    data = header + item.actions.tobytes() + item.tokens.tobytes() + item.frames.tobytes()
+    assert encode_episode(item) == data
+    assert np.array_equal(decode_episode(data).tokens, item.tokens)
+
+
+def test_record_of_another_length_or_version_is_refused():
+    data = encode_episode(make_item())
+    for bad in (data[:-1], data + b"\0", data[:10], b"\2" + data[1:]):
+        with pytest.raises(ValueError, match="episode record|no episode"):
+            decode_episode(bad)
+
+
+def test_small_vocabularies_and_latents_take_two_bytes():
+    assert token_dtype(65536) == np.uint16 and token_dtype(65537) == np.uint32
+    assert token_dtype(0, channels=16) == np.float16
+
+
+def test_manifest_from_before_there_were_latents_is_one_of_ids(store_root, copy):
+    path = copy / "arm/manifest.json"
+    values = json.loads(path.read_text())
+    assert values["tokenizer"].pop("channels") == 0
+    path.write_text(json.dumps(values))
+    assert TokenStore(copy).manifest("arm") == TokenStore(store_root).manifest("arm")
+
+
+def test_table_follows_the_order_asked_for(store):
+    table = store.embodiment_table(("hand", "arm"))
+    assert table.names == ("hand", "arm")
+    hand = table.entries[0]
+    assert (hand.action_dim, hand.stride, hand.chunk) == (6, 5, 30)
+    assert hand.mean == store.manifest("hand").action_mean
+
+
+def test_hash_covers_the_chosen_datasets_only(store):
+    assert store.hash(("arm", "base")) == store.hash(("base", "arm"))
+    assert len({store.hash(), store.hash(("arm",)), store.hash(("base",))}) == 3
+
+
+def test_pickled_store_and_many_threads_read_the_same(store):
+    expected = [store.episode("arm", "train", i).tokens[0, 0] for i in range(38)]
+    copy = pickle.loads(pickle.dumps(store))
+    with ThreadPoolExecutor(8) as pool:
+        read = pool.map(lambda i: copy.episode("arm", "train", i % 38).tokens[0, 0], range(380))
+        assert list(read) == expected * 10
+
+
+def test_unknown_dataset_lists_those_there(store):
+    with pytest.raises(ConfigError, match="'leg' is not in the token store .* it has arm, base, hand"):
+        store.manifest("leg")
+
+
+def test_missing_or_empty_store(tmp_path):
+    with pytest.raises(DataError, match="no such token store"):
+        TokenStore(tmp_path / "absent")
+    with pytest.raises(DataError, match="no dataset in this token store"):
+        TokenStore(tmp_path)
+
+
+@pytest.fixture
+def copy(store_root, tmp_path):
+    shutil.copytree(store_root / "arm", tmp_path / "arm")
+    return tmp_path
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "{}", '{"format": 1, "spec": 3}', '{"format": 1}'])
+def test_damaged_manifest(copy, content):
+    (copy / "arm/manifest.json").write_text(content)
+    with pytest.raises(DataError, match=r"arm/manifest.json: .*tokenise it again"):
+        TokenStore(copy)
+
+
+def test_flipped_bit_is_an_error_not_another_token(copy):
+    path = copy / "arm/train-00000-of-00001.array_record"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    store = TokenStore(copy)
+    episodes = store.manifest("arm").train.episodes
+    errors = 0
+    for i in range(38):
+        try:
+            assert (store.episode("arm", "train", i).tokens // 256 == episodes[i]).all()
+        except DataError as error:
+            errors += 1
+            assert str(path) in str(error) and "tokenise the dataset again" in str(error)
+    assert errors >= 1
+
+
+@pytest.mark.parametrize("spoil", ["truncate", "remove", "empty"])
+def test_damaged_or_missing_file(copy, spoil):
+    path = copy / "arm/train-00000-of-00001.array_record"
+    if spoil == "remove":
+        path.unlink()
+    else:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 if spoil == "truncate" else 0])
+    with pytest.raises(DataError, match=r"train-00000-of-00001.array_record: .*tokenise the dataset again"):
+        TokenStore(copy).episode("arm", "train", 0)
