@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.bench.models import Subject
-from experiments.bench.record import Stage
+from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import DecodeConfig, EvalConfig, require
 from hma_jax.evaluation.metrics import factored_cross_entropy
@@ -62,7 +62,5 @@ def time_evaluation(subject: Subject, rows: int, config: EvalConfig, repeats: in
     timings = time_by_turns(calls, repeats)
     passes = (model.frames - 1) + sequences.shape[1] * config.unmask_steps * (model.frames - config.prompt_frames)
     flops = rows * forward_flops_per_window(model, table) * passes
-    return [
-        Stage("protocol", rows, timings["protocol"], fast.compile_seconds, fast.temporary_bytes or 0, rows),
-        Stage("literal", rows, timings["literal"], slow.compile_seconds, slow.temporary_bytes or 0, rows, flops),
-    ]
+    compiled, windows = {"protocol": fast, "literal": slow}, {"protocol": rows, "literal": rows}
+    return make_stages(rows, compiled, timings, frames=windows, flops={"protocol": 0.0, "literal": flops})

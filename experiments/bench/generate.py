@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.bench.models import Subject
-from experiments.bench.record import Stage
+from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import Compiled, compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
 from hma_jax.flops import forward_flops_per_window
@@ -71,18 +71,8 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
         "fill": (looks + 1) * per_frame,
         "stream": (looks + 1) * per_frame,
     }
-    return [
-        Stage(
-            name,
-            rows,
-            timings[name],
-            compiled[name].compile_seconds,
-            compiled[name].temporary_bytes or 0,
-            frames=0.0 if name == "whole" else rows,
-            flops=flops[name],
-        )
-        for name in calls
-    ]
+    frames = dict.fromkeys(calls, rows) | {"whole": 0}
+    return make_stages(rows, compiled, timings, frames=frames, flops=flops)
 
 
 def _with_own_cache(call: Compiled, params: Any, cache: Any) -> Callable[[], Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import jax
 
 from experiments.atomic import write_atomically
-from experiments.bench.timing import Timing, peak_memory_bytes
+from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
 from experiments.machine import describe_machine
 from hma_jax.config import ConfigError, from_dict, to_dict
 
@@ -33,6 +34,21 @@ class Stage:
     @property
     def frames_per_second(self) -> float:
         return self.frames / self.timing.median
+
+
+def make_stages(
+    rows: int,
+    calls: Mapping[str, Compiled],
+    timings: Mapping[str, Timing],
+    *,
+    frames: Mapping[str, float],
+    flops: Mapping[str, float],
+) -> list[Stage]:
+    """A stage for every call."""
+    return [
+        Stage(name, rows, timings[name], c.compile_seconds, c.temporary_bytes or 0, frames[name], flops[name])
+        for name, c in calls.items()
+    ]
 
 
 @dataclass(frozen=True)

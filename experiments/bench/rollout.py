@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.bench.models import Subject
-from experiments.bench.record import Stage
+from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
 from hma_jax.flops import forward_flops_per_window
@@ -38,18 +38,8 @@ def time_rollouts(
         "rollout": _passes(frames, prompt, subject.config.frames, decode) * per_window,
         "recompute": (frames - prompt) * decode.unmask_steps * per_window,
     }
-    return [
-        Stage(
-            name,
-            rows,
-            timings[name],
-            call.compile_seconds,
-            call.temporary_bytes or 0,
-            frames=rows * (frames - prompt),
-            flops=flops[name],
-        )
-        for name, call in compiled.items()
-    ]
+    frames_made = dict.fromkeys(compiled, rows * (frames - prompt))
+    return make_stages(rows, compiled, timings, frames=frames_made, flops=flops)
 
 
 def _passes(frames: int, prompt: int, window: int, decode: DecodeConfig) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 
 from experiments.bench.models import Subject
-from experiments.bench.record import Stage
+from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import TrainConfig
 from hma_jax.flops import forward_flops_per_window, train_flops_per_window
@@ -41,16 +41,5 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
         "forward": rows * forward_flops_per_window(config, table),
         "step": rows * train_flops_per_window(config, table),
     }
-    calls = {"forward": ahead, "step": step}
-    return [
-        Stage(
-            name,
-            rows,
-            timings[name],
-            call.compile_seconds,
-            call.temporary_bytes or 0,
-            frames=rows * config.frames,
-            flops=flops[name],
-        )
-        for name, call in calls.items()
-    ]
+    frames = dict.fromkeys(flops, rows * config.frames)
+    return make_stages(rows, {"forward": ahead, "step": step}, timings, frames=frames, flops=flops)
