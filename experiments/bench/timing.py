@@ -38,24 +38,29 @@ class Compiled:
 
 def compile_call(function: Callable[..., Any], *args: Any, donate: tuple[int, ...] = ()) -> Compiled:
     """`function` for arguments like `args`."""
-    began = time.perf_counter()
-    call = jax.jit(function, donate_argnums=donate).lower(*args).compile()
-    seconds = time.perf_counter() - began
+    call, seconds = time_once(lambda: jax.jit(function, donate_argnums=donate).lower(*args).compile())
     memory = call.memory_analysis()
     return Compiled(call, seconds, None if memory is None else int(memory.temp_size_in_bytes))
 
 
-def time_by_turns(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, Timing]:
+def time_once(call: Callable[[], Any]) -> tuple[Any, float]:
+    """(result, seconds)."""
+    began = time.perf_counter()
+    result = jax.block_until_ready(call())
+    return result, time.perf_counter() - began
+
+
+def time_by_turns(
+    calls: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = WARM_UP
+) -> dict[str, Timing]:
     """Every call once per round, so that a slow spell of the machine hits all of them."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
-    for _ in range(WARM_UP):
+    for _ in range(warm_up):
         for call in calls.values():
             jax.block_until_ready(call())
     for _ in range(repeats):
         for name, call in calls.items():
-            began = time.perf_counter()
-            jax.block_until_ready(call())
-            seconds[name].append(time.perf_counter() - began)
+            seconds[name].append(time_once(call)[1])
     return {name: summarise(values) for name, values in seconds.items()}
 
 

@@ -103,6 +103,52 @@ def evaluate(bench: OmitArgPrefixes[Bench], draws: int = 5) -> None:
     commands.evaluate(bench, draws)
 
 
+@bench_app.command(name="tokenize")
+def tokenize(
+    tokenizer: str = "magvit2",
+    piece: int | None = None,
+    repeats: int = 30,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+    seed: int = 0,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time a tokenizer both ways.
+
+    Args:
+        tokenizer: magvit2 or svd-vae, with drawn weights at 256 pixels, or a tokenizer's directory.
+        piece: Images per device at a time; its own default if not given.
+        repeats: Timed calls of every stage.
+        dtype: What magvit2 and svd-vae compute in.
+        seed: Of weights and images.
+        out: Directory for the record.
+    """
+    commands.tokenize(tokenizer, piece, repeats, dtype, seed, out)
+
+
+@bench_app.command(name="load")
+def load(
+    store: Path | None = None,
+    data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = (),
+    windows: int = 20_000,
+    batch: int = 32,
+    frames: int = 12,
+    threads: int = 1,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time training windows from a token store, and frames from RLDS directories; watch the memory.
+
+    Args:
+        store: A token store; one of forty datasets with random tokens is made if not given.
+        data: RLDS directories, whose JPEG frames are read at 64 pixels.
+        windows: Windows to draw.
+        batch: Windows per batch; four times as many frames of RLDS directories.
+        frames: Frames per window.
+        threads: Threads that read ahead.
+        out: Directory for the record.
+    """
+    commands.load(store, data, windows, batch, frames, threads, out)
+
+
 @bench_app.command(name="report")
 def report(records: Positional[tuple[Path, ...]]) -> None:
     """Print records as Markdown tables.

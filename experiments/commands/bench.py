@@ -89,6 +89,46 @@ def evaluate(bench: Bench, draws: int) -> None:
     _finish("eval", bench, subject, stages, found, {"eval": config})
 
 
+def tokenize(name: str, piece: int | None, repeats: int, dtype: str, seed: int, out: Path) -> None:
+    from experiments.bench.tokenize import make_tokenizer, time_tokenizer
+
+    with step(f"make {name}"):
+        tokenizer = make_tokenizer(name, dtype, piece, seed)
+    with step(f"time {name} on {tokenizer.at_once} image(s) at a time"):
+        stages = time_tokenizer(tokenizer, repeats, seed)
+    settings = {"tokenizer": tokenizer.config, "piece": tokenizer.at_once}
+    _write("tokenize", Path(name).name, dtype, seed, settings, stages, {}, (), out)
+
+
+def load(
+    store: Path | None, data: Sequence[str], windows: int, batch: int, frames: int, threads: int, out: Path
+) -> None:
+    import tempfile
+
+    from data_pipelines.tokens.store import TokenStore
+    from experiments.bench.load import make_store, time_shards, time_windows
+
+    stages, notes = [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        with step("open the token store"):
+            opened = make_store(Path(scratch), 0) if store is None else TokenStore(store)
+        with step(f"draw windows of {len(opened.names)} datasets"):
+            stage, slope = time_windows(opened, windows, batch, frames, threads)
+        stages.append(stage)
+        notes.append(f"memory over {stage.timing.repeats * batch:,} windows: {slope / 1e3:+.1f} kB per thousand")
+    if data:
+        from data_pipelines.registry import get_spec
+        from experiments.pipeline import name_datasets
+
+        sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
+        with step(f"draw frames of {len(sources)} RLDS directories"):
+            stage, slope = time_shards(sources, windows * frames // 10, 4 * batch, 64, threads)
+        stages.append(stage)
+        notes.append(f"memory over {stage.timing.repeats * 4 * batch:,} frames: {slope / 1e3:+.1f} kB per thousand")
+    settings = {"frames": frames, "threads": threads, "datasets": len(opened.names)}
+    _write("load", "store" if store is None else store.name, "none", 0, settings, stages, {}, tuple(notes), out)
+
+
 def report(records: Sequence[Path]) -> None:
     from experiments.bench.record import read_record
     from experiments.bench.report import markdown
@@ -122,25 +162,40 @@ def _finish(
     settings: dict[str, Any],
     notes: tuple[str, ...] = (),
 ) -> None:
+    settings = settings | {"model": subject.config, "robots": bench.robots}
+    _write(kind, bench.model, bench.dtype, bench.seed, settings, stages, ratios, notes, bench.out)
+
+
+def _write(
+    kind: str,
+    subject: str,
+    dtype: str,
+    seed: int,
+    settings: dict[str, Any],
+    stages: Sequence[Stage],
+    ratios: dict[str, float],
+    notes: tuple[str, ...],
+    out: Path,
+) -> None:
     from experiments.bench.record import make_record, write_record
     from experiments.bench.timing import matmul_rate
     from hma_jax.config import to_dict
 
     record = make_record(
         kind,
-        bench.model,
+        subject,
         command_line(),
-        dtype=bench.dtype,
-        seed=bench.seed,
-        settings=to_dict(settings | {"model": subject.config, "robots": bench.robots}),
+        dtype=dtype,
+        seed=seed,
+        settings=to_dict(settings),
         stages=tuple(stages),
         ratios={name: round(value, 3) for name, value in ratios.items()},
         notes=notes,
-        matmul_flops_per_second=matmul_rate(bench.dtype),
+        matmul_flops_per_second=0.0 if dtype == "none" else matmul_rate(dtype),
     )
     show(record)
-    path = write_record(record, bench.out)
-    console.print(f"wrote {path}; tables: hma bench report {bench.out}", soft_wrap=True)
+    path = write_record(record, out)
+    console.print(f"wrote {path}; tables: hma bench report {out}", soft_wrap=True)
 
 
 def show(record: BenchRecord) -> None:
@@ -158,4 +213,5 @@ def show(record: BenchRecord) -> None:
         console.print(f"{name}: [bold]{value:.2f}[/]")
     for note in record.notes:
         console.print(note)
-    console.print(f"[dim]a plain matrix product here: {record.matmul_flops_per_second / 1e9:,.1f} GFLOP/s[/]")
+    if record.matmul_flops_per_second:
+        console.print(f"[dim]a plain matrix product here: {record.matmul_flops_per_second / 1e9:,.1f} GFLOP/s[/]")

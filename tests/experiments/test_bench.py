@@ -13,6 +13,7 @@ from experiments.bench.timing import Timing, summarise, time_by_turns
 from experiments.bench.train import time_training
 from experiments.cli.main import main
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig
+from tests.data_pipelines.fakes import REAL_DATA
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +104,24 @@ def test_the_command_times_frames_every_way_and_the_report_reads_its_record(tmp_
     }  # fmt: skip
     assert main(["bench", "report", str(tmp_path)]) == 0
     assert "**generate cpu**" in capsys.readouterr().out
+
+
+def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
+    assert main(["tokenizer", "pixels", "--out", str(tmp_path / "tok"), "--image-size", "16", "--patch", "4"]) == 0
+    options = ["--tokenizer", str(tmp_path / "tok"), "--repeats", "1", "--out", str(tmp_path)]
+    assert main(["bench", "tokenize", *options]) == 0
+    (file,) = tmp_path.glob("tokenize-*.json")
+    assert [s.name for s in read_record(file).stages] == ["encode", "decode", "both"]
+    assert main(["bench", "tokenize", "--tokenizer", "nothing"]) == 2
+    assert "give magvit2, svd-vae or a tokenizer's directory" in " ".join(capsys.readouterr().err.split())
+
+
+def test_loading_is_timed_with_its_memory(tmp_path: Path):
+    options = ["--data", str(REAL_DATA), "--windows", "640", "--frames", "4", "--out", str(tmp_path)]
+    assert main(["bench", "load", *options]) == 0
+    (file,) = tmp_path.glob("load-*.json")
+    record = read_record(file)
+    windows, frames = record.stages
+    assert (windows.frames, windows.timing.repeats) == (32 * 4, 20)
+    assert frames.name == "RLDS frames" and frames.frames == 128
+    assert all("kB per thousand" in note for note in record.notes)

@@ -15,7 +15,6 @@ from hma_jax.tokenizers.config import AnyTokenizerConfig, Magvit2Config, PixelsC
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
 from hma_jax.tokenizers.network import normalise
 from hma_jax.tokenizers.quantizer import ids_to_codes
-from hma_jax.tokenizers.speed import measure_speed
 from tests.hma_jax.pretrained import MAGVIT2_SMALL, PIXELS_SMALL, VAE_SMALL, make, noise
 
 CONFIGS = {c.kind: c for c in (MAGVIT2_SMALL, VAE_SMALL, PIXELS_SMALL)}
@@ -133,12 +132,6 @@ def test_a_configuration_of_any_kind_comes_back_from_json():
 def test_a_configuration_that_cannot_work_is_refused(make_config, message):
     with pytest.raises(ConfigError, match=message):
         make_config()
-
-
-def test_speed_counts_images_both_ways(magvit2):
-    speeds = measure_speed(magvit2, pieces=2)
-    assert {name: s.images for name, s in speeds.items()} == {"encode": 8, "decode": 8}
-    assert all(s.images_per_second > 0 and s.first_call_seconds > 0 for s in speeds.values())
 
 
 # --- Ids ---------------------------------------------------------------------------------------
