@@ -173,7 +173,9 @@ def perplexity(losses: Any, group: int) -> Stat:
 
 
 def corpus_perplexity(losses: Any) -> Stat:
-    """exp of the mean loss over all windows; standard error by the delta method."""
+    """exp of the mean loss over all windows (infinite beyond what a float holds); standard error by
+    the delta method."""
     stat = mean_and_sem(losses)
-    value = math.exp(stat.mean)
+    with np.errstate(over="ignore"):
+        value = float(np.exp(stat.mean))
     return Stat(value, value * stat.sem, stat.n)

@@ -142,3 +142,7 @@ def test_shapes_that_differ_and_empty_averages_are_refused():
         metrics.ssim(np.zeros((4, 4, 3)), np.zeros((4, 4, 3)))
     with pytest.raises(ConfigError, match="no values"):
         metrics.mean_and_sem([])
+
+
+def test_a_model_that_is_certain_and_wrong_has_an_infinite_perplexity():
+    assert metrics.corpus_perplexity(np.array([700.0, 800.0])).value == np.inf
