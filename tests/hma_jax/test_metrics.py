@@ -145,4 +145,4 @@ def test_shapes_that_differ_and_empty_averages_are_refused():
 
 
 def test_a_model_that_is_certain_and_wrong_has_an_infinite_perplexity():
-    assert metrics.corpus_perplexity(np.array([700.0, 800.0])).value == np.inf
+    assert metrics.corpus_perplexity(np.array([700.0, 800.0])).mean == np.inf

@@ -175,7 +175,7 @@ def test_a_second_run_does_nothing_and_other_folders_are_refused(tmp_path, pair)
     stamp = (tmp_path / "store/toy_arm/train-00000-of-00001.array_record").stat().st_mtime_ns
     assert import_tokens(*pair, tmp_path / "store", hz=4) == first
     assert (tmp_path / "store/toy_arm/train-00000-of-00001.array_record").stat().st_mtime_ns == stamp
-    with pytest.raises(ConfigError, match="made in another way .*hz: 4.0 -> 6.0"):
+    with pytest.raises(ConfigError, match="in another way .*hz: 4.0 -> 6.0"):
         import_tokens(*pair, tmp_path / "store", hz=6)
 
 
@@ -232,7 +232,7 @@ def test_damage_is_named_with_file_and_sizes(tmp_path, pair, damage, message):
     damage(pair[0])
     with pytest.raises(DataError, match=message):
         import_tokens(*pair, tmp_path / "store", hz=4)
-    assert not (tmp_path / "store").exists() or not any((tmp_path / "store").iterdir())
+    assert not (tmp_path / "store" / "toy_arm").exists()
 
 
 def test_raw_images_and_odd_vocabularies_are_refused(tmp_path, pair):
