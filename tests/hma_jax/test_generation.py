@@ -282,8 +282,13 @@ def whole_rollouts(config, decode: DecodeConfig, prompt: int, hidden=None) -> tu
     [
         ({}, DecodeConfig(2), 2),
         ({"action_alignment": "causal"}, DecodeConfig(3, 1.0), 5),
-        ({"conditioning": "cross_attention"}, DecodeConfig(1), 9),
-        ({"conditioning": "modulate", "action_alignment": "causal"}, DecodeConfig(2, order="confidence"), 6),
+        pytest.param({"conditioning": "cross_attention"}, DecodeConfig(1), 9, marks=pytest.mark.slow),
+        pytest.param(
+            {"conditioning": "modulate", "action_alignment": "causal"},
+            DecodeConfig(2, order="confidence"),
+            6,
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["released", "sampled-causal", "long-prompt", "full-window"],
 )
@@ -309,7 +314,11 @@ def test_streaming_is_exact_while_the_window_fills_and_an_approximation_after():
 
 @pytest.mark.parametrize(
     "slide, alignment, prompt",
-    [("exact", "causal", 3), ("streaming", "causal", 2), ("exact", "released", 8)],
+    [
+        ("exact", "causal", 3),
+        pytest.param("streaming", "causal", 2, marks=pytest.mark.slow),
+        pytest.param("exact", "released", 8, marks=pytest.mark.slow),
+    ],
 )
 def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignment: str, prompt: int):
     config, decode = model_config(action_alignment=alignment), DecodeConfig(2, slide=slide)
