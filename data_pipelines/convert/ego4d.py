@@ -31,10 +31,12 @@ from data_pipelines.convert.hands import LAYOUT, cut_episodes, destination
 from data_pipelines.convert.settings import Ego4dSettings
 from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
+from data_pipelines.registry import get_spec
 from data_pipelines.rlds.writer import encode_jpeg
 from hma_jax.config import to_dict
 
-HZ = 2.0
+NAME = "ego4d"
+HZ = float(get_spec(NAME).hz)
 MAX_STEPS = 600
 HANDS = ("left_hand", "right_hand")
 

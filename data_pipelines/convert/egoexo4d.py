@@ -24,10 +24,14 @@ from data_pipelines.convert.hands import LAYOUT, cut_episodes, destination
 from data_pipelines.convert.settings import EgoExo4dSettings
 from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
+from data_pipelines.registry import get_spec
 from data_pipelines.rlds.writer import encode_jpeg
 from hma_jax.config import to_dict
 
-HZ = 30.0
+NAME = "exoego4d"
+"""As the release and the registry call it."""
+
+HZ = float(get_spec(NAME).hz)
 MAX_STEPS = 900  # half a minute
 FULL_SIZE = (3840, 2160)
 """Pixels of the exo cameras, in which poses are given; needed where only a downscaled video is there."""

@@ -32,9 +32,11 @@ from data_pipelines.convert.hands import LAYOUT, cut_episodes, displacement
 from data_pipelines.convert.settings import EpicKitchensSettings
 from data_pipelines.convert.video import stored_jpeg
 from data_pipelines.errors import DataError
+from data_pipelines.registry import get_spec
 from hma_jax.config import to_dict
 
-HZ = 10
+NAME = "epic_kitchen"
+HZ = float(get_spec(NAME).hz)
 FIRST_RATE, EXTENSION_RATE = 60, 50
 EXTRACTED_AT_60 = {"P01_109": 222_487, "P27_103": 146_918}
 """Frames of the extension's two videos whose first published extraction has 60 per second."""
@@ -46,7 +48,7 @@ class EpicKitchensSource:
     """Raises DataError if no video has both frames and detections."""
 
     layout = LAYOUT
-    hz = float(HZ)
+    hz = HZ
 
     def __init__(
         self,
@@ -85,7 +87,7 @@ class EpicKitchensSource:
                 f"{folder}: it has {surplus.name}, but {self._pickle(video)} ends with frame "
                 f"{len(positions)}: frames and detections are of different extractions. {ADVICE}"
             )
-        step = _rate(video, len(positions)) // HZ
+        step = int(_rate(video, len(positions)) // HZ)
         kept = np.arange(0, len(positions), step)
 
         def load(rows: np.ndarray) -> list[bytes]:

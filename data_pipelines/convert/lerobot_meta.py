@@ -15,6 +15,7 @@ from typing import Any
 
 from data_pipelines.convert.episode import require_module
 from data_pipelines.errors import DataError
+from data_pipelines.json_file import read_object
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 ADVICE = "Fetch the dataset again, meta folder included."
@@ -147,17 +148,8 @@ def _fill(info: dict[str, Any], field: str, **place: Any) -> str:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    try:
-        value = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise DataError(
-            f"{path} is missing: give the root of a LeRobot dataset, with meta, data and videos."
-        ) from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}). {ADVICE}") from error
-    if not isinstance(value, dict):
-        raise DataError(f"{path} holds no JSON object. {ADVICE}")
-    return value
+    missing = "give the root of a LeRobot dataset, with meta, data and videos."
+    return read_object(path, if_missing=missing, advice=ADVICE)
 
 
 def _json_lines(path: Path) -> list[dict[str, Any]]:

@@ -26,11 +26,12 @@ from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, To
 from data_pipelines.tokens.part import Made, Part
 from data_pipelines.tokens.release_folder import FACTOR_VOCAB, ReleaseFolder, open_folder
 from hma_jax.config import diff, require
+from hma_jax.tokenizers.config import SvdVaeConfig
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.base import Tokenizer
 
-LATENT_SCALE = 0.18215
+LATENT_SCALE = SvdVaeConfig().scale
 """Brings the latents of the Stable Video Diffusion autoencoder to about unit deviation."""
 
 PIXELS = {"magvit": 16, "temporalvae": 8}

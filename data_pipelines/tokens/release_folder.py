@@ -12,7 +12,6 @@ Files are mapped, not read. Knows nothing of the token store (see `import_tokens
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError
+from data_pipelines.json_file import read_object
 from hma_jax.config import ConfigError
 
 ADVICE = "Fetch the folder again."
@@ -87,16 +87,8 @@ def open_folder(path: str | Path) -> ReleaseFolder:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    try:
-        meta = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise DataError(
-            f"{path} is missing: give a folder of the release, with video.bin beside it."
-        ) from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}). {ADVICE}") from error
-    if not isinstance(meta, dict):
-        raise DataError(f"{path} holds no JSON object. {ADVICE}")
+    missing = "give a folder of the release, with video.bin beside it."
+    meta = read_object(path, if_missing=missing, advice=ADVICE)
     for field in ("num_images", "h", "w"):
         if type(meta.get(field)) is not int or meta[field] < 1:
             raise DataError(f"{path}: {field} is {meta.get(field)!r}, not a positive number. {ADVICE}")

@@ -56,7 +56,6 @@ def find_devices(topology: str) -> list[Any]:
         return jax.devices()
     from jax.experimental import topologies
 
-    jax.config.update("jax_enable_compilation_cache", False)  # its entries for absent devices cannot be written
     try:
         return list(topologies.get_topology_desc(platform="tpu", topology_name=topology).devices)
     except (RuntimeError, ValueError, NotImplementedError) as error:

@@ -8,10 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+from experiments.cli.bench import Model
 from experiments.progress import console, step, tidy_table
 from hma_jax.config import MeshConfig, TrainConfig
-
-Model = Literal["base", "xl", "base-continuous", "xl-continuous", "cpu", "cpu-continuous"]
 
 
 def fit(
@@ -39,6 +38,7 @@ def fit(
     if any(name != "local" for name in topology):  # read when JAX starts
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
         os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # programs for absent devices cannot be written
     from experiments.bench.fit import Fit, check_fit, find_devices
     from experiments.bench.models import make_shape
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,13 +21,10 @@ def generate(bench: Bench, decode: Decode) -> None:
     from experiments.bench.generate import ratios, time_frames
 
     subject, how = _subject(bench), _decode(decode)
-    stages: list[Stage] = []
+    stages = _over_batches(bench, "frames", lambda rows: time_frames(subject, rows, how, bench.repeats))
     found: dict[str, float] = {}
     for rows in bench.batch:
-        with step(f"time frames at batch {rows}"):
-            here = time_frames(subject, rows, how, bench.repeats)
-        stages += here
-        found |= ratios(here, rows)
+        found |= ratios(stages, rows)
     _finish("generate", bench, subject, stages, found, {"decode": how})
 
 
@@ -37,17 +34,12 @@ def rollouts(bench: Bench, decode: Decode, frames: int, prompt: int, slide: str,
     from experiments.bench.rollout import agreement, time_rollouts
 
     subject, how = _subject(bench), replace(_decode(decode), slide=slide)
-    stages: list[Stage] = []
-    found: dict[str, float] = {}
-    for rows in bench.batch:
-        with step(f"time rollouts at batch {rows}"):
-            here = time_rollouts(subject, rows, frames, prompt, how, bench.repeats, naive)
-        stages += here
-        if naive:
-            seconds = {s.name: s.timing.median for s in here}
-            found[f"recompute / rollout, batch {rows}"] = seconds["recompute"] / seconds["rollout"]
-    notes = ()
+    stages = _over_batches(
+        bench, "rollouts", lambda rows: time_rollouts(subject, rows, frames, prompt, how, bench.repeats, naive)
+    )
+    notes, found = (), {}
     if naive:
+        found = _ratios(bench, stages, "recompute", "rollout")
         with step("compare with recomputation"):
             value = agreement(subject, bench.batch[0], frames, prompt, how)
         what = "largest difference" if subject.config.diffusion else "share of equal tokens"
@@ -57,20 +49,13 @@ def rollouts(bench: Bench, decode: Decode, frames: int, prompt: int, slide: str,
 
 
 def train(bench: Bench, remat: bool) -> None:
-    from dataclasses import replace
-
     from experiments.bench.train import time_training
 
     subject = _subject(bench, remat=remat)
-    stages: list[Stage] = []
-    found: dict[str, float] = {}
-    for rows in bench.batch:
-        with step(f"time training steps at batch {rows}"):
-            here = time_training(subject, rows, bench.repeats)
-        stages += here
-        seconds = {s.name: s.timing.median for s in here}
-        found[f"step / forward, batch {rows}"] = seconds["step"] / seconds["forward"]
-    _finish("train", bench, replace(subject), stages, found, {"remat": remat})
+    stages = _over_batches(
+        bench, "training steps", lambda rows: time_training(subject, rows, bench.repeats)
+    )
+    _finish("train", bench, subject, stages, _ratios(bench, stages, "step", "forward"), {"remat": remat})
 
 
 def evaluate(bench: Bench, draws: int) -> None:
@@ -78,14 +63,10 @@ def evaluate(bench: Bench, draws: int) -> None:
     from hma_jax.config import EvalConfig
 
     subject, config = _subject(bench), EvalConfig(random_actions=draws)
-    stages: list[Stage] = []
-    found: dict[str, float] = {}
-    for rows in bench.batch:
-        with step(f"time evaluation of {rows} windows"):
-            here = time_evaluation(subject, rows, config, bench.repeats)
-        stages += here
-        seconds = {s.name: s.timing.median for s in here}
-        found[f"literal / protocol, batch {rows}"] = seconds["literal"] / seconds["protocol"]
+    stages = _over_batches(
+        bench, "evaluation", lambda rows: time_evaluation(subject, rows, config, bench.repeats)
+    )
+    found = _ratios(bench, stages, "literal", "protocol")
     _finish("eval", bench, subject, stages, found, {"eval": config})
 
 
@@ -136,6 +117,22 @@ def report(records: Sequence[Path]) -> None:
     files = [f for path in records for f in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
     require(len(files) > 0, "no records there; make one with `hma bench generate`")
     print(markdown([read_record(file) for file in files]))
+
+
+def _over_batches(bench: Bench, what: str, measure: Callable[[int], list[Stage]]) -> list[Stage]:
+    stages = []
+    for rows in bench.batch:
+        with step(f"time {what} at batch {rows}"):
+            stages += measure(rows)
+    return stages
+
+
+def _ratios(bench: Bench, stages: Sequence[Stage], above: str, below: str) -> dict[str, float]:
+    """How much longer one stage takes than another, at each batch."""
+    median = {(s.name, s.batch): s.timing.median for s in stages}
+    return {
+        f"{above} / {below}, batch {rows}": median[above, rows] / median[below, rows] for rows in bench.batch
+    }
 
 
 def _subject(bench: Bench, **changes: Any) -> Subject:

@@ -39,21 +39,21 @@ def lerobot(root: Path, to: To, settings: LeRobotSettings) -> None:
 
 
 def epic_kitchens(frames: Path, detections: Path, to: To, settings: EpicKitchensSettings) -> None:
-    from data_pipelines.convert.epic_kitchens import EpicKitchensSource
+    from data_pipelines.convert.epic_kitchens import NAME, EpicKitchensSource
 
-    _convert(EpicKitchensSource(frames, detections, settings), to, "epic_kitchen")
+    _convert(EpicKitchensSource(frames, detections, settings), to, NAME)
 
 
 def ego4d(annotations: Path, videos: Path, to: To, settings: Ego4dSettings) -> None:
-    from data_pipelines.convert.ego4d import Ego4dSource
+    from data_pipelines.convert.ego4d import NAME, Ego4dSource
 
-    _convert(Ego4dSource(annotations, videos, settings), to, "ego4d")
+    _convert(Ego4dSource(annotations, videos, settings), to, NAME)
 
 
 def egoexo4d(root: Path, to: To, settings: EgoExo4dSettings) -> None:
-    from data_pipelines.convert.egoexo4d import EgoExo4dSource
+    from data_pipelines.convert.egoexo4d import NAME, EgoExo4dSource
 
-    _convert(EgoExo4dSource(root, settings), to, "exoego4d")
+    _convert(EgoExo4dSource(root, settings), to, NAME)
 
 
 def _convert(source: Source, to: To, default_name: str) -> None:
