@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
 from hma_jax.model.initial import trunk_init
-from hma_jax.model.layers import LayerNorm
+from hma_jax.model.layers import LayerNorm, contract
 from hma_jax.params import bias, param
+from hma_jax.sharding import is_split
+
+CACHED_BYTES = 2**20
+"""A frame's attention weights above this size are not kept for the backward pass."""
 
 
 def attention_scale(config: ModelConfig) -> float:
@@ -41,25 +47,25 @@ class Attention(nnx.Module):
 
     def project(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """x [..., D] -> q, k, v [..., H, I]; q carries the scale."""
-        qkv = jnp.einsum("...d,dchi->...chi", x, self.qkv.astype(x.dtype))
+        qkv = contract(x, self.qkv.astype(x.dtype))
         if self.qkv_bias is not None:
             qkv = qkv + self.qkv_bias.astype(x.dtype)
-        q, k, v = qkv[..., 0, :, :], qkv[..., 1, :, :], qkv[..., 2, :, :]
+        q, k, v = (part.squeeze(-3) for part in jnp.split(qkv, 3, axis=-3))
         if self.norm is not None:
             q, k = self.norm(q), self.norm(k)
         return q * self.scale, k, v
 
     def project_out(self, y: jax.Array) -> jax.Array:
         """y [..., H, I] -> [..., D]."""
-        out = jnp.einsum("...hi,hid->...d", y, self.out.astype(y.dtype))
+        out = contract(y, self.out.astype(y.dtype), 2)
         return out if self.out_bias is None else out + self.out_bias.astype(y.dtype)
 
     def over_space(self, x_BTPD: jax.Array) -> jax.Array:
         """Every token sees every token of its own frame."""
         q, k, v = self.project(x_BTPD)
-        logits = jnp.einsum("btphi,btshi->bthps", q, k)
-        weights = masked_softmax(logits)
-        return self.project_out(jnp.einsum("bthps,btshi->btphi", weights, v))
+        weights = x_BTPD.shape[2] ** 2 * q.shape[-2] * q.dtype.itemsize
+        attend = attend_within if weights > CACHED_BYTES else _all_frames
+        return self.project_out(attend(q, k, v))
 
     def over_time(
         self,
@@ -87,3 +93,53 @@ def masked_softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.A
     if visible is not None:
         logits = jnp.where(visible, logits, jnp.finfo(logits.dtype).min)
     return jax.nn.softmax(logits.astype(jnp.float32), axis=-1).astype(logits.dtype)
+
+
+@jax.custom_vjp
+def attend_within(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+    """Attention among the tokens of each frame, [B, T, P, H, I] each; the weights are computed
+    again in the backward pass.
+
+    On CPU one frame and head at a time, whose weights fit the cache, which all frames' together
+    do not; on an accelerator, or where a mesh splits the batch or the heads, all at once.
+    """
+    return _per_platform(_one_frame, _all_frames)(q, k, v)
+
+
+def _attend_within_forward(q: jax.Array, k: jax.Array, v: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    return attend_within(q, k, v), (q, k, v)
+
+
+def _attend_within_backward(kept: tuple[jax.Array, ...], g: jax.Array) -> tuple[jax.Array, ...]:
+    def gradient_of(attend: Callable) -> Callable:
+        return lambda q, k, v, g: jax.vjp(attend, q, k, v)[1](g)
+
+    return _per_platform(gradient_of(_one_frame), gradient_of(_all_frames))(*kept, g)
+
+
+attend_within.defvjp(_attend_within_forward, _attend_within_backward)
+
+
+def _per_platform(one_frame: Callable, all_frames: Callable) -> Callable:
+    """`all_frames` of [B, T, ...], but on CPU `one_frame` of [...] over and over."""
+    if is_split():
+        return all_frames
+
+    def frame_by_frame(*args: jax.Array):
+        shape = args[0].shape[:2]
+        rows = tuple(x.reshape(-1, *x.shape[2:]) for x in args)
+        out = jax.lax.map(lambda frame: one_frame(*frame), rows)
+        return jax.tree.map(lambda y: y.reshape(*shape, *y.shape[1:]), out)
+
+    return lambda *args: jax.lax.platform_dependent(*args, cpu=frame_by_frame, default=all_frames)
+
+
+def _all_frames(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+    weights = masked_softmax(jnp.einsum("btphi,btshi->bthps", q, k))
+    return jnp.einsum("bthps,btshi->btphi", weights, v)
+
+
+def _one_frame(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+    """[P, H, I] each. Separate products of matrices run side by side; a batched one does not."""
+    heads = [masked_softmax(q[:, h] @ k[:, h].T) @ v[:, h] for h in range(q.shape[1])]
+    return jnp.stack(heads, axis=1)

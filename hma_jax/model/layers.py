@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
@@ -12,6 +15,7 @@ BLOCK_EPS = 1e-5
 FINE_EPS = 1e-6  # modulation, diffusion heads and the norms around the continuous trunk
 
 
+@partial(jax.checkpoint, prevent_cse=False, static_argnums=(1,))
 def normalise(x: jax.Array, eps: float) -> jax.Array:
     """x with zero mean and unit variance over its last axis; statistics in float32."""
     x32 = x.astype(jnp.float32)
@@ -19,6 +23,12 @@ def normalise(x: jax.Array, eps: float) -> jax.Array:
     centred = x32 - mean
     variance = jnp.mean(jnp.square(centred), axis=-1, keepdims=True)
     return (centred * jax.lax.rsqrt(variance + eps)).astype(x.dtype)
+
+
+@partial(jax.checkpoint, prevent_cse=False)
+def gelu(x: jax.Array) -> jax.Array:
+    """The exact one, x times the normal distribution function of x; only x is kept for the backward pass."""
+    return jax.nn.gelu(x, approximate=False)
 
 
 class LayerNorm(nnx.Module):
@@ -49,7 +59,7 @@ class Linear(nnx.Module):
         self.bias = bias((sizes[1],), (axes[1],)) if with_bias else None
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        y = x @ self.kernel.astype(x.dtype)
+        y = contract(x, self.kernel.astype(x.dtype))
         return y if self.bias is None else y + self.bias.astype(x.dtype)
 
 
@@ -79,5 +89,32 @@ def per_example(x: jax.Array, kernel: nnx.Param, embodiment_B: jax.Array) -> jax
     """x [B, ..., in] times each example's own slice of a kernel [E, in, out] -> [B, ..., out]."""
     own = jnp.take(kernel.get_value(), embodiment_B, axis=0).astype(x.dtype)
     rows = x.reshape(x.shape[0], -1, x.shape[-1])
-    y = jnp.einsum("bri,bio->bro", rows, own)
+    y = jax.vmap(contract)(rows, own)
     return y.reshape(*x.shape[:-1], y.shape[-1])
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def contract(x: jax.Array, w: jax.Array, axes: int = 1) -> jax.Array:
+    """x [..., in] times w [in, ...]; with `axes` 2 both have two axes for `in`.
+
+    The gradient is the usual one, written out because XLA on CPU transposes one of the two
+    activations for that of w: here the narrower one, where jax's own gradient leaves no choice.
+    """
+    return jnp.tensordot(x, w, axes)
+
+
+def _contract_forward(x: jax.Array, w: jax.Array, axes: int) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return contract(x, w, axes), (x, w)
+
+
+def _contract_backward(axes: int, kept: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, w = kept
+    rows, outs = tuple(range(x.ndim - axes)), w.ndim - axes
+    to_x = jnp.tensordot(g, w, (tuple(range(g.ndim - outs, g.ndim)), tuple(range(axes, w.ndim))))
+    if math.prod(w.shape[:axes]) <= math.prod(w.shape[axes:]):
+        return to_x, jnp.tensordot(x, g, (rows, rows))
+    turned = jnp.tensordot(g, x, (rows, rows))
+    return to_x, jnp.moveaxis(turned, tuple(range(outs)), tuple(range(axes, w.ndim)))
+
+
+contract.defvjp(_contract_forward, _contract_backward)

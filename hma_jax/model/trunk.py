@@ -11,7 +11,7 @@ from hma_jax.config import ModelConfig
 from hma_jax.model.attention import Attention
 from hma_jax.model.conditioning import ActionFeature, make_conditioning
 from hma_jax.model.initial import trunk_init
-from hma_jax.model.layers import LayerNorm, Linear
+from hma_jax.model.layers import LayerNorm, Linear, gelu
 from hma_jax.params import stack
 from hma_jax.sharding import constrain
 
@@ -61,7 +61,7 @@ class Block(nnx.Module):
         y, new_time = self.time.over_time(x, visible, past_time)
         x = x + y
         h = self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x)
-        x = x + self.mlp_out(jax.nn.gelu(h, approximate=False))
+        x = x + self.mlp_out(gelu(h))
         return x, TemporalCache(new_time, new_actions)
 
 
