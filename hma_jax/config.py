@@ -530,8 +530,12 @@ class EvalConfig:
     """The evaluation protocol (paper section 4, Metrics)."""
 
     windows_per_dataset: int = 500
+    # What a predicted frame follows: frames the model made, from a prompt on, or (`recorded`, as the
+    # release judges) in every case the recorded ones.
+    context: Literal["generated", "recorded"] = "generated"
     prompt_frames: int = 4
     unmask_steps: int = 2  # M
+    slide: Literal["exact", "streaming"] = "exact"  # past the model's window, see DecodeConfig
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(temperature=0.0))  # continuous
     random_actions: int = 5  # draws for delta PSNR
     batch: int = 32
@@ -542,3 +546,13 @@ class EvalConfig:
         require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
         require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
         require(self.random_actions >= 1, "eval.random_actions must be at least 1")
+
+    @property
+    def decode(self) -> DecodeConfig:
+        """How frames are filled."""
+        return DecodeConfig(self.unmask_steps, sampler=self.sampler, slide=self.slide)
+
+    @property
+    def first_predicted(self) -> int:
+        """The first frame of a window that is compared."""
+        return self.prompt_frames if self.context == "generated" else 1

@@ -57,6 +57,8 @@ def sample_tokens(
     else:
         scaled = logits_BSQV / temperature
         if top_k:
+            entries = logits_BSQV.shape[-1]
+            require(top_k <= entries, f"decode.top_k {top_k} exceeds the {entries} entries of a factor")
             least = jax.lax.top_k(scaled, top_k)[0][..., -1:]
             scaled = jnp.where(scaled < least, -jnp.inf, scaled)
         ids = jax.vmap(jax.random.categorical)(key_B, scaled)

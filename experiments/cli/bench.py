@@ -93,14 +93,18 @@ def train(bench: OmitArgPrefixes[Bench], remat: bool = False) -> None:
 
 
 @bench_app.command(name="eval")
-def evaluate(bench: OmitArgPrefixes[Bench], draws: int = 5) -> None:
+def evaluate(
+    bench: OmitArgPrefixes[Bench], context: Literal["recorded", "generated"] = "recorded", draws: int = 5
+) -> None:
     """Time the evaluation protocol against the same protocol taken literally, and compare the numbers.
 
     Args:
         bench: What is timed and how often.
+        context: What a predicted frame follows: recorded frames, as the release evaluates, or
+            generated ones.
         draws: Random action sequences for delta PSNR.
     """
-    commands.evaluate(bench, draws)
+    commands.evaluate(bench, context, draws)
 
 
 @bench_app.command(name="tokenize")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from experiments.program import command_line
 from experiments.progress import console, step, tidy_table
@@ -58,16 +58,16 @@ def train(bench: Bench, remat: bool) -> None:
     _finish("train", bench, subject, stages, _ratios(bench, stages, "step", "forward"), {"remat": remat})
 
 
-def evaluate(bench: Bench, draws: int) -> None:
+def evaluate(bench: Bench, context: Literal["recorded", "generated"], draws: int) -> None:
     from experiments.bench.evaluate import time_evaluation
     from hma_jax.config import EvalConfig
 
-    subject, config = _subject(bench), EvalConfig(random_actions=draws)
+    subject, config = _subject(bench), EvalConfig(context=context, random_actions=draws)
     stages = _over_batches(
         bench, "evaluation", lambda rows: time_evaluation(subject, rows, config, bench.repeats)
     )
     found = _ratios(bench, stages, "literal", "protocol")
-    _finish("eval", bench, subject, stages, found, {"eval": config})
+    _finish(f"eval-{context}", bench, subject, stages, found, {"eval": config})
 
 
 def tokenize(name: str, piece: int | None, repeats: int, dtype: str, seed: int, out: Path) -> None:

@@ -5,7 +5,8 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
 * likelihood: cross-entropy (continuous: diffusion loss) of each frame, wholly masked, given the
   true frames before it;
 * fidelity: PSNR and SSIM of an autoregressive rollout from the prompt against the recorded
-  frames (not their reconstruction by the tokenizer);
+  frames (not their reconstruction by the tokenizer); windows longer than the model's are
+  continued past it, and their likelihood is that of the first T frames;
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
   under random action sequences, unmasking with the same random numbers;
 * policy, where the model was trained to predict actions: squared error of every chunk after the
@@ -14,8 +15,10 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
 
 A model trained on passive video is shown no action anywhere.
 
-DIFFERS: the release's rollout replaces one context frame only (reference section 6.2); its
-random actions also overwrite the prompt's and use other random numbers (section 6.3).
+With `eval.context` "recorded" every frame is predicted from recorded ones and random actions
+replace all of a window's, as the release does: for comparison with published figures.
+DIFFERS: random and true actions share their random numbers (reference section 6.3). The
+release's own autoregressive mode replaces one context frame only (section 6.2); ours is a rollout.
 """
 
 from __future__ import annotations
@@ -24,13 +27,13 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import DecodeConfig, EvalConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ModelConfig, Setting, require
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.evaluation.metrics import (
     Stat,
@@ -42,7 +45,7 @@ from hma_jax.evaluation.metrics import (
     ssim,
     stratified,
 )
-from hma_jax.generation import next_frame_outputs, predict_actions, predict_next_actions, rollout
+from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
 from hma_jax.model import HMA, declare_model
 from hma_jax.model.frames import compose
 from hma_jax.objectives import frame_diffusion_loss
@@ -100,12 +103,12 @@ def random_actions(
 
 
 def evaluation_inputs(
-    batch: dict[str, jax.Array], table: EmbodimentTable, model: ModelConfig, config: EvalConfig
+    batch: dict[str, jax.Array], table: EmbodimentTable, config: EvalConfig
 ) -> tuple[jax.Array, jax.Array]:
     """(chunks [B, 1 + draws, T, U], keys [B]): the recorded actions, then the random ones, which
     differ from them from the first chunk that leads to a predicted frame."""
-    shape, first_free = (config.random_actions, model.frames), config.prompt_frames - 1
     actions, window = batch["actions"], batch["window"]
+    shape, first_free = (config.random_actions, actions.shape[1]), config.first_predicted - 1
     other = random_actions(config.seed, window, batch["embodiment"], table, shape)
     other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
     key = jax.random.key(config.seed + 1)
@@ -118,41 +121,84 @@ def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
     return model.action_heads and setting in ("full", "policy", "inverse")
 
 
+class Predicted(NamedTuple):
+    """Tokens of the frames that are compared: [B, n, S (, C)] from `EvalConfig.first_predicted` on."""
+
+    frames: jax.Array  # under the recorded actions
+    last_random: jax.Array  # the last one under each random sequence [B, draws, S (, C)]
+    random: jax.Array | None  # all of them under the first; None where only the last was made
+
+
 @functools.lru_cache(maxsize=4)  # a second evaluation of the same shapes compiles nothing
 def make_evaluator(
     model: ModelConfig, table: EmbodimentTable, config: EvalConfig, setting: Setting = "forward"
 ) -> Callable:
-    """A jitted f(params, batch) -> (metrics {name: [B]}, frames [B, 1 + draws, T - prompt, S (, C)])."""
+    """A jitted f(params, batch) -> (metrics {name: [B]}, Predicted)."""
     require(
-        config.prompt_frames < model.frames,
+        config.first_predicted < model.frames,
         f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of "
         f"{model.frames} frames",
     )
     declared = declare_model(model, table)
-    decode = DecodeConfig(unmask_steps=config.unmask_steps, sampler=config.sampler)
 
-    def hidden(embodiment_B: jax.Array) -> jax.Array | None:
+    def hidden(actions_BTU: jax.Array, embodiment_B: jax.Array) -> jax.Array | None:
+        shape = actions_BTU.shape[:2]
         if setting == "passive":
-            return jnp.ones((len(embodiment_B), model.frames), bool)
+            return jnp.ones(shape, bool)
         if all(table.chunks):
             return None
-        return jnp.repeat(jnp.asarray(table.chunks == 0)[embodiment_B][:, None], model.frames, axis=1)
+        return jnp.broadcast_to(jnp.asarray(table.chunks == 0)[embodiment_B][:, None], shape)
 
-    def evaluate_batch(params: Params, batch: dict[str, jax.Array]):
+    def evaluate_batch(params: Params, batch: dict[str, jax.Array]) -> tuple[dict[str, jax.Array], Predicted]:
         hma = declared.merge(params)
-        tokens, actions, embodiment = batch["tokens"], batch["actions"], batch["embodiment"]
-        not_shown = hidden(embodiment)
-        sequences, keys = evaluation_inputs(batch, table, model, config)
-        out = next_frame_outputs(hma, tokens, actions, embodiment, not_shown)
-        metrics = _likelihood(hma, out, tokens[:, 1:], keys)
+        embodiment, not_shown = batch["embodiment"], hidden(batch["actions"], batch["embodiment"])
+        sequences, keys = evaluation_inputs(batch, table, config)
+        first = lambda x: None if x is None else x[:, : model.frames]  # noqa: E731
+        window = first(batch["tokens"]), first(batch["actions"]), embodiment
+        if config.context == "recorded":
+            require(
+                batch["tokens"].shape[1] == model.frames,
+                f"with eval.context 'recorded' windows have the model's {model.frames} frames, "
+                f"got {batch['tokens'].shape[1]}",
+            )
+            out, predicted = _after_recorded(hma, window, sequences, keys, config, not_shown)
+        else:
+            out = next_frame_outputs(hma, *window, first(not_shown))
+            prompt = batch["tokens"][:, : config.prompt_frames]
+            made = rollout(hma, prompt, sequences, embodiment, keys, config.decode, hidden_BT=not_shown)
+            predicted = Predicted(made[:, 0], made[:, 1:, -1], made[:, 1])
+        metrics = _likelihood(hma, out, window[0][:, 1:], keys)
         if predicts_actions(model, setting):
-            causally = setting != "inverse"
-            first = config.prompt_frames - 1
-            metrics |= _policy_errors(hma, tokens, actions, embodiment, keys, decode, first, causally)
-        prompt = tokens[:, : config.prompt_frames]
-        return metrics, rollout(hma, prompt, sequences, embodiment, keys, decode, hidden_BT=not_shown)
+            metrics |= _policy_errors(hma, *window, keys, config, causally=setting != "inverse")
+        return metrics, predicted
 
     return jax.jit(evaluate_batch)
+
+
+def _after_recorded(
+    model: HMA,
+    window: tuple[jax.Array, jax.Array, jax.Array],
+    sequences: jax.Array,
+    key_B: jax.Array,
+    config: EvalConfig,
+    hidden_BT: jax.Array | None,
+) -> tuple[jax.Array, Predicted]:
+    """(outputs, Predicted) where every frame follows recorded ones."""
+    tokens, actions, embodiment = window
+    out, frames = next_frames(model, tokens, actions, embodiment, key_B, config.decode, hidden_BT)
+    draws = sequences.shape[1] - 1
+    each = lambda x: None if x is None else jnp.repeat(x, draws, axis=0)  # noqa: E731  [B, ...] -> [B draws, ...]
+    # The sequences differ from the first chunk on, so that nothing of the past can be shared.
+    last = rollout(
+        model,
+        each(tokens[:, :-1]),
+        sequences[:, 1:].reshape(-1, 1, *actions.shape[1:]),
+        each(embodiment),
+        each(key_B),
+        config.decode,
+        hidden_BT=each(hidden_BT),
+    )
+    return out, Predicted(frames, last.reshape(len(tokens), draws, *tokens.shape[2:]), None)
 
 
 def _likelihood(model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array) -> dict[str, jax.Array]:
@@ -172,12 +218,12 @@ def _policy_errors(
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     key_B: jax.Array,
-    decode: DecodeConfig,
-    first: int,
+    config: EvalConfig,
     causally: bool,
 ) -> dict[str, jax.Array]:
-    """Per window [B]: mean squared error of the chunks from `first` on, in variances of each live
+    """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live
     action value, of the model and of always giving the mean."""
+    decode, first = config.decode, config.prompt_frames - 1
     if causally:
         predicted = predict_next_actions(model, frames, actions_BTU, embodiment_B, key_B, decode)
     else:
@@ -220,15 +266,14 @@ def evaluate(
         arrays = {k: batch[k] for k in ("tokens", "actions", "embodiment", "window")}
         values, tokens = jax.tree.map(lambda x: np.asarray(x)[valid], evaluator(params, arrays))
         truth = batch["frames"][valid]
-        predicted, last_random = _decode_rollouts(tokenizer, tokens)
-        values |= _compare(truth, predicted, last_random, config.prompt_frames)
+        predicted, last_random = (_decode(tokenizer, x) for x in (tokens.frames, tokens.last_random))
+        values |= _compare(truth, predicted, last_random, config)
         for metric, column in values.items():
             columns.setdefault(name, {}).setdefault(metric, []).append(column)
         if name not in result.samples and samples_per_dataset > 0:
-            count = samples_per_dataset
-            result.samples[name] = _clips(
-                tokenizer, truth[:count], predicted[:count], tokens[:count], config.prompt_frames
-            )
+            few = slice(samples_per_dataset)
+            random = None if tokens.random is None else tokens.random[few]
+            result.samples[name] = _clips(tokenizer, truth[few], predicted[few], random)
         done += int(valid.sum())
         if progress is not None:
             progress(done)
@@ -243,21 +288,19 @@ def evaluate(
     return result
 
 
-def _decode_rollouts(tokenizer: Decoder, tokens: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """tokens [B, 1 + draws, T', S (, C)] -> frames under true actions [B, T', ...] and last frames
-    under random ones [B, draws, ...]."""
-    batch, _, frames, *size = tokens.shape
-    predicted = tokenizer.decode(tokens[:, 0].reshape(-1, *size))
-    last = tokenizer.decode(tokens[:, 1:, -1].reshape(-1, *size))
-    shape = predicted.shape[1:]
-    return predicted.reshape(batch, frames, *shape), last.reshape(batch, -1, *shape)
+def _decode(tokenizer: Decoder, tokens: np.ndarray) -> np.ndarray:
+    """tokens [B, n, S (, C)] -> uint8 [B, n, height, width, 3]."""
+    images = tokenizer.decode(tokens.reshape(-1, *tokens.shape[2:]))
+    return images.reshape(*tokens.shape[:2], *images.shape[1:])
 
 
 def _compare(
-    truth: np.ndarray, predicted: np.ndarray, last_random: np.ndarray, prompt: int
+    truth: np.ndarray, predicted: np.ndarray, last_random: np.ndarray, config: EvalConfig
 ) -> dict[str, np.ndarray]:
     """Image metrics per window; frames are uint8 [B, T, height, width, 3]."""
-    future, last = truth[:, prompt:], truth[:, -1]
+    first = config.first_predicted
+    future, last = truth[:, first:], truth[:, -1]
+    seen = truth[:, first - 1 : -1] if config.context == "recorded" else truth[:, first - 1 : first]
     psnr_last = psnr(predicted[:, -1], last)
     psnr_random = psnr(last_random, np.broadcast_to(last[:, None], last_random.shape)).mean(1)
     return {
@@ -265,21 +308,18 @@ def _compare(
         "psnr_last": psnr_last,
         "psnr_random": psnr_random,
         "delta_psnr": psnr_last - psnr_random,
-        # What a model scores that repeats the last prompt frame for ever.
-        "psnr_copy": psnr(np.broadcast_to(truth[:, prompt - 1 : prompt], future.shape), future).mean(1),
+        # What a model scores that repeats the last frame it is given.
+        "psnr_copy": psnr(np.broadcast_to(seen, future.shape), future).mean(1),
         "ssim": ssim(predicted, future).mean(1),
     }
 
 
 def _clips(
-    tokenizer: Decoder, truth: np.ndarray, predicted: np.ndarray, tokens: np.ndarray, prompt: int
+    tokenizer: Decoder, truth: np.ndarray, predicted: np.ndarray, random: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-    """Clips to look at: true, predicted and under the first random actions, all [n, T, ...]."""
-    size = tokens.shape[3:]
-    random = tokenizer.decode(tokens[:, 1].reshape(-1, *size)).reshape(predicted.shape)
-    start = truth[:, :prompt]
-    return {
-        "true": truth,
-        "predicted": np.concatenate([start, predicted], axis=1),
-        "random": np.concatenate([start, random], axis=1),
-    }
+    """Clips to look at: true, predicted and, where made, under the first random actions, all [n, T, ...]."""
+    start = truth[:, : truth.shape[1] - predicted.shape[1]]
+    clips = {"true": truth, "predicted": np.concatenate([start, predicted], axis=1)}
+    if random is not None:
+        clips["random"] = np.concatenate([start, _decode(tokenizer, random)], axis=1)
+    return clips

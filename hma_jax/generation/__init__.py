@@ -7,12 +7,13 @@ asks for which frame.
 from hma_jax.generation.policy import predict_actions, predict_next_actions, read_actions, rollout_policy
 from hma_jax.generation.rollout import rollout, rollout_naive
 from hma_jax.generation.session import Session, advance, start
-from hma_jax.generation.teacher import next_frame_outputs
+from hma_jax.generation.teacher import next_frame_outputs, next_frames
 
 __all__ = [
     "Session",
     "advance",
     "next_frame_outputs",
+    "next_frames",
     "predict_actions",
     "predict_next_actions",
     "read_actions",

@@ -8,6 +8,7 @@ from hma_jax.decoding import Frame, masked_counts, unmask
 from hma_jax.generation import (
     advance,
     next_frame_outputs,
+    next_frames,
     predict_actions,
     predict_next_actions,
     rollout,
@@ -237,6 +238,31 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
         np.testing.assert_allclose(fast[:, t - 1], slow, atol=1e-4 * np.abs(slow).max())
 
 
+@pytest.mark.parametrize(
+    "options, decode",
+    [
+        ({"conditioning": "concat+modulate"}, DecodeConfig(3, 1.0)),
+        ({"action_alignment": "causal"}, DecodeConfig(2, order="confidence")),
+        ({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SAMPLER)),
+        pytest.param({"conditioning": "cross_attention"}, DecodeConfig(2), marks=pytest.mark.slow),
+    ],
+    ids=["sampled", "causal", "continuous", "cross-attention"],
+)
+def test_next_frames_equal_one_rollout_of_a_frame_per_recorded_past(options: dict, decode: DecodeConfig):
+    config = model_config(**options)
+    declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
+    batch, keys = random_batch(0, config, 3), jax.random.split(jax.random.key(0), 3)
+    rest = (batch["embodiment"], keys, decode)
+    fast = jax.jit(lambda p: next_frames(declared.merge(p), batch["tokens"], batch["actions"], *rest)[1])(params)
+    for t in range(1, config.frames):
+        past, chunks = batch["tokens"][:, :t], batch["actions"][:, : t + 1]
+        slow = jax.jit(lambda p, x=past, a=chunks: rollout_naive(declared.merge(p), x, a, *rest)[:, 0])(params)
+        if config.diffusion:
+            np.testing.assert_allclose(fast[:, t - 1], slow, atol=2e-3)
+        else:
+            np.testing.assert_array_equal(fast[:, t - 1], slow)
+
+
 def test_known_positions_are_never_drawn_again():
     frame = Frame(jnp.array([[7, 0, 0, 0]]), jnp.array([[False, True, True, True]]))
     out = unmask(frame, jnp.array([[1, 2, 3, 4]]), jnp.array([[0.0, 0.1, 0.9, 0.5]]), 1)
@@ -296,6 +322,37 @@ def test_the_sliding_rollout_equals_recomputing_every_window(options: dict, deco
     got, want = whole_rollouts(model_config(**options), decode, prompt)
     assert got.shape[1] == LONG - prompt
     np.testing.assert_array_equal(got, want)
+
+
+NEW = 24
+GREEDY, SAMPLED = DecodeConfig(2), DecodeConfig(2, 1.0, top_k=4)
+
+
+def case(conditioning: str, decode: DecodeConfig, slow: bool = True):
+    name = f"{conditioning}-{'sampled' if decode.temperature else 'greedy'}"
+    return pytest.param(conditioning, decode, marks=[pytest.mark.slow] if slow else [], id=name)
+
+
+@pytest.mark.parametrize(
+    "conditioning, decode",
+    [
+        case("concat+modulate", SAMPLED, slow=False),
+        case("concat+modulate", GREEDY),
+        *(case(name, how) for name in ("modulate", "concat", "add", "cross_attention") for how in (GREEDY, SAMPLED)),
+    ],
+)
+def test_one_to_twenty_four_frames_of_different_robots_equal_the_oracle_s(conditioning: str, decode: DecodeConfig):
+    config = model_config(conditioning=conditioning, frames=4)
+    declared, params = lively_params(config)
+    batch = random_batch(0, model_config(frames=1 + NEW), TABLE.size)
+    robots, keys = np.arange(TABLE.size), jax.random.split(jax.random.key(0), TABLE.size)
+    start, actions = batch["tokens"][:, :1], batch["actions"]
+    naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, actions, robots, keys, decode))
+    want = np.asarray(naive(params))
+    for new in (1, 2, 3, 4, 9, NEW) if decode == SAMPLED else (NEW,):
+        chunks = actions[:, None, : 1 + new]
+        fast = jax.jit(lambda p, a=chunks: rollout(declared.merge(p), start, a, robots, keys, decode)[:, 0])
+        np.testing.assert_array_equal(fast(params), want[:, :new])
 
 
 def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions():

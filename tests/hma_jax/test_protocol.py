@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,8 +39,8 @@ def eval_batches(config, names=("pusher", "arm"), batch=4, batches_each=2):
             window += batch
 
 
-def run(params, config, **kwargs) -> Evaluation:
-    return evaluate(params, config, TABLE, GreyTokenizer(), eval_batches(config, **kwargs), EVAL)
+def run(params, config, settings=EVAL, **kwargs) -> Evaluation:
+    return evaluate(params, config, TABLE, GreyTokenizer(), eval_batches(config, **kwargs), settings)
 
 
 def test_metrics_cover_the_valid_windows_of_each_dataset():
@@ -96,6 +98,39 @@ def test_samples_show_true_predicted_and_randomly_driven_clips():
         k: (1, config.frames, SIZE, SIZE, 3) for k in ("true", "predicted", "random")
     }
     np.testing.assert_array_equal(clip["true"][:, :2], clip["predicted"][:, :2])
+
+
+def test_after_recorded_frames_every_frame_but_the_first_is_predicted():
+    config = model_config()
+    _, params = lively_params(config)
+    recorded, generated = (run(params, config, replace(EVAL, context=c)) for c in ("recorded", "generated"))
+    clip = recorded.samples["arm"]
+    assert set(clip) == {"true", "predicted"}
+    assert clip["predicted"].shape[1] == config.frames
+    same, other = (e.datasets["arm"]["cross_entropy"].mean for e in (recorded, generated))
+    assert same == pytest.approx(other, rel=1e-5)  # the likelihood is that of recorded frames in both
+    assert recorded.overall["delta_psnr"].sem > 0
+    deaf = jax.tree.map(lambda x: x, params)
+    deaf["stem"]["out"] = jax.tree.map(jnp.zeros_like, params["stem"]["out"])
+    quiet = run(deaf, config, replace(EVAL, context="recorded"))
+    assert abs(quiet.overall["delta_psnr"].mean) < 1e-12
+
+
+def test_windows_longer_than_the_model_s_are_continued_past_it():
+    config = model_config()
+    _, params = lively_params(config)
+    batches = lambda frames: eval_batches(model_config(frames=frames), names=("arm",), batches_each=1)  # noqa: E731
+    judge = lambda b, c: evaluate(params, config, TABLE, GreyTokenizer(), b, c)  # noqa: E731
+    exact, streamed = (judge(batches(9), replace(EVAL, slide=slide)) for slide in ("exact", "streaming"))
+    clips = [e.samples["arm"]["predicted"] for e in (exact, streamed)]
+    assert clips[0].shape[1] == 9
+    np.testing.assert_array_equal(clips[0][:, : config.frames], clips[1][:, : config.frames])
+    whole, *_ = batches(9)
+    short = {k: v[:, : config.frames] if k in ("tokens", "actions", "frames") else v for k, v in whole.items()}
+    want = judge(iter([short]), EVAL).overall["cross_entropy"].mean
+    assert exact.overall["cross_entropy"].mean == pytest.approx(want, rel=1e-6)
+    with pytest.raises(ConfigError, match="windows have the model's 6 frames, got 9"):
+        judge(batches(9), replace(EVAL, context="recorded"))
 
 
 def test_a_prompt_that_fills_the_window_is_refused():
