@@ -95,7 +95,7 @@ class _FrameGroups:
             episode = int(self.episodes[(at + k) % len(self.episodes)])
             try:
                 images = self.source.frames(
-                    episode, self.image_key, lambda n: [random_below(n, d, self.seed) for d in draws]
+                    episode, self.image_key, lambda n: [random_below(n, d, self.seed) for d in draws], self.size
                 )
                 return np.stack([fit_image(image, self.size) for image in images])
             except EpisodeError as error:

@@ -22,7 +22,7 @@ from data_pipelines.rlds.example import Feature, parse_example
 from data_pipelines.rlds.images import decode_image
 from data_pipelines.rlds.location import REMOTE_READS, is_remote
 from data_pipelines.rlds.schema import closest, field_slice, listing, read_metadata, resolve_version, step_key
-from data_pipelines.rlds.tfrecord import ShardIndex, open_record, scan_shard
+from data_pipelines.rlds.tfrecord import ShardIndex, open_record, read_parts, scan_shard
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
@@ -33,6 +33,9 @@ SUCCESS_KEY = "episode_metadata/success"
 
 MAX_SKIPPED = 16
 """Default bound of the policy corrupt='skip'."""
+
+REMEMBERED = 2**14
+"""Episodes of which it is remembered where their frames lie: 16 bytes a frame."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ class RldsDataset:
         self.corrupt = corrupt
         self.max_skipped = max_skipped
         self.skipped: dict[str, int] = {}  # reason -> episodes lost
+        self._known: dict[tuple[int, str], np.ndarray] = {}  # (episode, image) -> where its frames lie, [N, 2]
         meta = read_metadata(self.directory, split)
         self.name, self.version = meta.name, meta.version
         self.features = meta.features
@@ -156,15 +160,28 @@ class RldsDataset:
             return RawEpisode(i, images, episode.actions, episode.success)
 
     def frames(
-        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]]
+        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
     ) -> list[np.ndarray]:
-        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers."""
+        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers.
+
+        JPEG images may come smaller, see `decode_image`. A record is read and verified as a whole
+        once; where its frames lie is remembered, and after that they alone are read.
+        """
         self.check_keys(image_key, ())
         image_key = step_key(image_key)
+        known = self._known.get((i, image_key))
+        if known is not None:
+            chosen = choose(len(known))
+            path, offset, _ = self._place(i)
+            parts = read_parts(path, offset, known[chosen].tolist())
+            return [self._image(i, image_key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
         with self._open(i, [image_key]) as record:
             encoded = self._frames_of(i, record, image_key)
             chosen = choose(len(encoded))
-            return [self._image(i, image_key, t, self._encoded(i, image_key, t, encoded)) for t in chosen]
+            parts = [self._encoded(i, image_key, t, encoded) for t in chosen]
+            if len(self._known) < REMEMBERED and not is_remote(self.directory):
+                self._known[i, image_key] = np.asarray(encoded.spans)
+        return [self._image(i, image_key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
 
     def record(self, i: int, keys: Sequence[str] | None = None) -> dict[str, Feature]:
         """The flat features of episode `i`, as `example.parse_example` gives them."""
@@ -296,9 +313,9 @@ class RldsDataset:
         except OSError as error:
             raise self._unusable(i, f"step {step} of {key!r} cannot be read ({error})") from error
 
-    def _image(self, i: int, key: str, step: int, data: bytes) -> np.ndarray:
+    def _image(self, i: int, key: str, step: int, data: bytes, at_least: int = 0) -> np.ndarray:
         try:
-            return decode_image(data)
+            return decode_image(data, at_least)
         except ValueError as error:
             raise self._unusable(
                 i,

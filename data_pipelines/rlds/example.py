@@ -32,13 +32,13 @@ class LazyBytes(Sequence[bytes]):
     """The n values of a bytes feature, each cut from the record when it is asked for."""
 
     def __init__(self, data: bytes | FileView, spans: Sequence[tuple[int, int]]):
-        self._data, self._spans = data, spans
+        self._data, self.spans = data, spans
 
     def __len__(self) -> int:
-        return len(self._spans)
+        return len(self.spans)
 
     def __getitem__(self, i: int) -> bytes:
-        start, end = self._spans[i]
+        start, end = self.spans[i]
         return self._data[start:end]
 
 

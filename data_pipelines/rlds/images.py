@@ -14,14 +14,18 @@ from PIL import Image, UnidentifiedImageError
 JPEG_MAGIC = b"\xff\xd8\xff"
 
 
-def decode_image(data: bytes) -> np.ndarray:
+def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     """uint8 [H, W, 3] from JPEG or PNG bytes (grey images become RGB, alpha is dropped).
 
     The fast DCT is what TensorFlow's decoder uses by default, so pixels equal those that
-    RLDS pipelines built on TensorFlow see. Raises ValueError if the bytes are no image.
+    RLDS pipelines built on TensorFlow see. With `at_least`, a JPEG image may come smaller, as its
+    coefficients allow, but no side shorter than that: what is resized anyway costs half as much.
+    Raises ValueError if the bytes are no image.
     """
     if data.startswith(JPEG_MAGIC):
-        return simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=True)
+        return simplejpeg.decode_jpeg(
+            data, colorspace="RGB", fastdct=True, min_height=at_least, min_width=at_least
+        )
     try:
         with Image.open(io.BytesIO(data)) as image:
             return np.asarray(image.convert("RGB"))

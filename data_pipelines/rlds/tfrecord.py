@@ -140,6 +140,16 @@ def read_record(path: str | Location, offset: int, length: int, verify: bool = T
     return payload
 
 
+def read_parts(path: str | Location, offset: int, spans: Iterable[tuple[int, int]]) -> list[bytes]:
+    """Bytes [start, end) of the payload of a record that was verified before.
+
+    Raises CorruptRecordError if the file has become shorter.
+    """
+    path = locate(path)
+    with open_ranges(path) as file:
+        return [_read(file, path, offset, offset + HEADER + start, end - start) for start, end in spans]
+
+
 @contextmanager
 def open_record(path: str | Location, offset: int, length: int) -> Iterator[bytes | FileView]:
     """The verified payload of a record, for the time of a `with`, in bounded memory.

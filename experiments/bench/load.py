@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,36 @@ def make_store(root: Path, seed: int) -> TokenStore:
     return TokenStore(root)
 
 
-def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threads: int) -> tuple[Stage, float]:
-    """(stage, bytes of memory per thousand windows) of `windows` training windows; a call is a batch."""
+@dataclass(frozen=True)
+class MemoryPoint:
+    """A row of memory.csv."""
+
+    stage: str
+    drawn: int  # windows or frames so far
+    resident_bytes: int
+
+
+@dataclass(frozen=True)
+class Drained:
+    """What drawing batches took: the timing of one, and the memory as it went on."""
+
+    stage: Stage
+    memory: tuple[MemoryPoint, ...]
+
+    @property
+    def slope(self) -> float:
+        """Bytes per thousand drawn, over the second half: caches fill in the first."""
+        late = self.memory[len(self.memory) // 2 :]
+        drawn, size = ([getattr(p, name) for p in late] for name in ("drawn", "resident_bytes"))
+        return 1000 * float(np.polyfit(drawn, size, 1)[0])
+
+    def describe(self) -> str:
+        drawn = self.memory[-1].drawn
+        return f"memory over {drawn:,} {self.stage.name}: {self.slope / 1e3:+.1f} kB per thousand"
+
+
+def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threads: int) -> Drained:
+    """`windows` training windows; a call is a batch."""
     config = LoaderConfig(batch=batch, frames=frames)
     loader = make_loader(store, store.embodiment_table(store.names), config, threads=threads)
     return _drain(loader, "windows", max(windows // batch, 20), batch, batch * frames)
@@ -54,27 +83,44 @@ def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threa
 
 def time_shards(
     sources: Sequence[tuple[DatasetSpec, Path]], frames: int, batch: int, size: int, threads: int
-) -> tuple[Stage, float]:
+) -> Drained:
     """The same for single frames of RLDS shards, decoded and resized to `size` pixels."""
     loader = make_frame_loader(sources, size, batch, 0, threads=threads)
     return _drain(loader, "RLDS frames", max(frames // batch, 20), batch, batch)
 
 
-def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: int) -> tuple[Stage, float]:
+def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: int) -> Drained:
     for _ in range(10):
         next(loader)
     seconds, memory = [], []
-    for _ in range(batches):
+    for number in range(batches):
         began = time.perf_counter()
         next(loader)
         seconds.append(time.perf_counter() - began)
-        memory.append(resident_bytes())
+        memory.append(MemoryPoint(name, (number + 1) * batch, resident_bytes()))
     # The mean counts: a batch that was ready costs nothing, the next one more.
-    mean = float(np.mean(seconds))
-    timing = summarise(seconds)
-    half = len(memory) // 2  # caches fill in the first half
-    slope = np.polyfit(np.arange(half, len(memory)) * batch / 1000, memory[half:], 1)[0]
-    return Stage(name, batch, type(timing)(mean, timing.p90, timing.best, len(seconds)), frames=frames), float(slope)
+    timing = replace(summarise(seconds), median=float(np.mean(seconds)))
+    return Drained(Stage(name, batch, timing, frames=frames), tuple(memory))
+
+
+def plot_memory(drained: Sequence[Drained], path: Path) -> None:
+    """Resident memory over what was drawn, a panel per stage."""
+    import matplotlib.pyplot as plt
+
+    from experiments.report.plot_style import COLOURS, STYLE, save
+
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(
+            1, len(drained), figsize=(4.3 * len(drained), 3.2), layout="constrained", squeeze=False
+        )
+        for panel, one in zip(panels[0], drained, strict=True):
+            drawn, size = ([getattr(p, name) for p in one.memory] for name in ("drawn", "resident_bytes"))
+            panel.plot([d / 1e3 for d in drawn], [s / 2**20 for s in size], color=COLOURS["perplexity"])
+            panel.set_ylim(0, 1.2 * max(size) / 2**20)
+            panel.set_xlabel(f"thousand {one.stage.name}")
+            panel.set_ylabel("resident memory (MiB)")
+            panel.set_title(f"{one.slope / 1e3:+.1f} kB per thousand", fontsize=9)
+        save(figure, path)
 
 
 def resident_bytes() -> int:

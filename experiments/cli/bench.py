@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 from tyro.extras import SubcommandApp
 
+from experiments.cli.where import Where
 from experiments.commands import bench as commands
 
 bench_app = SubcommandApp()
@@ -107,6 +108,29 @@ def evaluate(
     commands.evaluate(bench, context, draws)
 
 
+@bench_app.command(name="quality")
+def quality(
+    run: Positional[Path],
+    where: OmitArgPrefixes[Where],
+    frames: int | None = None,
+    windows: int = 12,
+    repeats: int = 30,
+) -> None:
+    """Judge a trained model's rollouts under cheaper and dearer decoding: quality beside time per frame.
+
+    Latents: DDPM and DDIM with fewer steps. Ids: more and fewer looks at each frame. With --frames
+    beyond the model's window: an exact slide against streaming.
+
+    Args:
+        run: Directory of a trained model.
+        where: The study whose held-out windows are used.
+        frames: Length of a rollout, prompt included; the model's window if not given.
+        windows: Held-out windows per dataset.
+        repeats: Timed rollouts of every decoding.
+    """
+    commands.quality(where.setting(), run, frames, windows, repeats)
+
+
 @bench_app.command(name="tokenize")
 def tokenize(
     tokenizer: str = "magvit2",
@@ -136,6 +160,7 @@ def load(
     windows: int = 20_000,
     batch: int = 32,
     frames: int = 12,
+    size: int = 64,
     threads: int = 1,
     out: Path = Path("runs/bench"),
 ) -> None:
@@ -143,21 +168,23 @@ def load(
 
     Args:
         store: A token store; one of forty datasets with random tokens is made if not given.
-        data: RLDS directories, whose JPEG frames are read at 64 pixels.
+        data: RLDS directories, whose frames are decoded and resized.
         windows: Windows to draw.
         batch: Windows per batch; four times as many frames of RLDS directories.
         frames: Frames per window.
+        size: Pixels that frames of RLDS directories are resized to.
         threads: Threads that read ahead.
         out: Directory for the record.
     """
-    commands.load(store, data, windows, batch, frames, threads, out)
+    commands.load(store, data, windows, batch, frames, size, threads, out)
 
 
 @bench_app.command(name="report")
-def report(records: Positional[tuple[Path, ...]]) -> None:
-    """Print records as Markdown tables.
+def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
+    """Print records as Markdown tables, and draw them.
 
     Args:
         records: Record files, or directories of them.
+        figure: PNG file for bars of every stage.
     """
-    commands.report(records)
+    commands.report(records, figure)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from experiments.bench.models import Subject
     from experiments.bench.record import BenchRecord, Stage
     from experiments.cli.bench import Bench, Decode
+    from experiments.commands.study import Setting
     from hma_jax.config import DecodeConfig
 
 
@@ -70,6 +71,56 @@ def evaluate(bench: Bench, context: Literal["recorded", "generated"], draws: int
     _finish(f"eval-{context}", bench, subject, stages, found, {"eval": config})
 
 
+def quality(setting: Setting, run: Path, frames: int | None, windows: int, repeats: int) -> None:
+    from dataclasses import replace
+
+    from data_pipelines.loading.evalset import eval_batches, freeze_manifest
+    from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
+    from experiments.bench.record import Stage
+    from experiments.commands.model import check_fits
+    from experiments.rows import write_csv
+    from experiments.trial import open_materials
+    from hma_jax.training.train import load_run
+
+    trained, materials = load_run(run), open_materials(setting.workspace)
+    check_fits(trained, materials)
+    subject, config = subject_of(trained), setting.study.eval
+    config = replace(config, batch=min(config.batch, windows))  # no rows of padding
+    frames = frames or trained.model.frames
+    if frames < trained.model.frames:
+        raise ConfigError(f"--frames must be at least the model's window of {trained.model.frames}, got {frames}")
+    names = [d.dataset for d in materials.manifest.datasets if d.dataset in trained.table.names]
+    frozen = freeze_manifest(materials.store, names, frames, windows, materials.manifest.seed)
+    settings = decodings(trained.model, config, frames)
+
+    def batches():
+        return eval_batches(materials.store, trained.table, frozen, config.batch, frozen.names)
+
+    with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
+        rows, timings = judge(
+            subject, materials.tokenizer, batches, settings, frames, repeats,
+            lambda name, done: update(done, len(settings), name),
+        )  # fmt: skip
+    table = tidy_table(
+        f"{run}, {frames} frames from a prompt of {config.prompt_frames}, {rows[0].windows} windows",
+        "decoding", "PSNR", "SSIM", "delta PSNR", "ms/frame", "cost",
+    )  # fmt: skip
+    for r in rows:
+        means = (f"{r.psnr:.2f} ± {r.psnr_sem:.2f}", f"{r.ssim:.3f}", f"{r.delta_psnr:.3f} ± {r.delta_psnr_sem:.3f}")
+        table.add_row(r.decoding, *means, f"{r.milliseconds_per_frame:.2f}", f"{r.cost:.3f}")
+    console.print(table)
+    out = run / "quality"
+    out.mkdir(exist_ok=True)
+    stem = out / f"quality-{frames}"
+    write_csv(stem.with_suffix(".csv"), Judged, rows)
+    plot_quality(rows, stem.with_suffix(".png"))
+    stages = [Stage(name, 1, timing, frames=frames - config.prompt_frames) for name, timing in timings.items()]
+    gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr - rows[0].psnr for r in rows[1:]}
+    facts = {"model": trained.model, "eval": replace(config, batch=1), "frames": frames, "windows": rows[0].windows}
+    _write("quality", f"{frames}-frames", trained.model.compute_dtype, 0, facts, stages, gaps, (), out)
+    console.print(f"wrote {stem}.csv and {stem}.png", soft_wrap=True)
+
+
 def tokenize(name: str, piece: int | None, repeats: int, dtype: str, seed: int, out: Path) -> None:
     from experiments.bench.tokenize import make_tokenizer, time_tokenizer
 
@@ -82,41 +133,53 @@ def tokenize(name: str, piece: int | None, repeats: int, dtype: str, seed: int, 
 
 
 def load(
-    store: Path | None, data: Sequence[str], windows: int, batch: int, frames: int, threads: int, out: Path
+    store: Path | None,
+    data: Sequence[str],
+    windows: int,
+    batch: int,
+    frames: int,
+    size: int,
+    threads: int,
+    out: Path,
 ) -> None:
     import tempfile
 
     from data_pipelines.tokens.store import TokenStore
-    from experiments.bench.load import make_store, time_shards, time_windows
+    from experiments.bench.load import MemoryPoint, make_store, plot_memory, time_shards, time_windows
+    from experiments.rows import write_csv
 
-    stages, notes = [], []
     with tempfile.TemporaryDirectory() as scratch:
         with step("open the token store"):
             opened = make_store(Path(scratch), 0) if store is None else TokenStore(store)
         with step(f"draw windows of {len(opened.names)} datasets"):
-            stage, slope = time_windows(opened, windows, batch, frames, threads)
-        stages.append(stage)
-        notes.append(f"memory over {stage.timing.repeats * batch:,} windows: {slope / 1e3:+.1f} kB per thousand")
+            drained = [time_windows(opened, windows, batch, frames, threads)]
     if data:
         from data_pipelines.registry import get_spec
         from experiments.pipeline import name_datasets
 
         sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
         with step(f"draw frames of {len(sources)} RLDS directories"):
-            stage, slope = time_shards(sources, windows * frames // 10, 4 * batch, 64, threads)
-        stages.append(stage)
-        notes.append(f"memory over {stage.timing.repeats * 4 * batch:,} frames: {slope / 1e3:+.1f} kB per thousand")
-    settings = {"frames": frames, "threads": threads, "datasets": len(opened.names)}
-    _write("load", "store" if store is None else store.name, "none", 0, settings, stages, {}, tuple(notes), out)
+            drained.append(time_shards(sources, windows * frames // 10, 4 * batch, size, threads))
+    settings = {"frames": frames, "threads": threads, "datasets": len(opened.names), "size": size}
+    stages, notes = [d.stage for d in drained], tuple(d.describe() for d in drained)
+    name = "store" if store is None else store.name
+    _write("load", name, "none", 0, settings, stages, {}, notes, out)
+    write_csv(out / f"load-{name}-memory.csv", MemoryPoint, [p for d in drained for p in d.memory])
+    plot_memory(drained, out / f"load-{name}-memory.png")
+    console.print(f"wrote {out / f'load-{name}-memory'}.csv and .png", soft_wrap=True)
 
 
-def report(records: Sequence[Path]) -> None:
+def report(records: Sequence[Path], figure: Path | None) -> None:
     from experiments.bench.record import read_record
-    from experiments.bench.report import markdown
+    from experiments.bench.report import markdown, plot_records
 
     files = [f for path in records for f in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
     require(len(files) > 0, "no records there; make one with `hma bench generate`")
-    print(markdown([read_record(file) for file in files]))
+    found = [read_record(file) for file in files]
+    print(markdown(found))
+    if figure is not None:
+        plot_records(found, figure)
+        console.print(f"wrote {figure}", soft_wrap=True)
 
 
 def _over_batches(bench: Bench, what: str, measure: Callable[[int], list[Stage]]) -> list[Stage]:

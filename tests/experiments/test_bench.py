@@ -1,3 +1,4 @@
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -6,6 +7,7 @@ import pytest
 
 from experiments.bench.evaluate import time_evaluation
 from experiments.bench.models import make_subject
+from experiments.bench.quality import decodings
 from experiments.bench.record import Stage, make_record, read_record, write_record
 from experiments.bench.report import markdown
 from experiments.bench.rollout import agreement, time_rollouts
@@ -102,8 +104,10 @@ def test_the_command_times_frames_every_way_and_the_report_reads_its_record(tmp_
     assert set(record.ratios) == {
         "recompute / fill, batch 2", "recompute / stream, batch 2", "slide / whole window pass, batch 2"
     }  # fmt: skip
-    assert main(["bench", "report", str(tmp_path)]) == 0
+    figure = tmp_path / "bench.png"
+    assert main(["bench", "report", str(tmp_path), "--figure", str(figure)]) == 0
     assert "**generate cpu**" in capsys.readouterr().out
+    assert figure.stat().st_size > 1000
 
 
 def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
@@ -116,10 +120,34 @@ def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
     assert "give magvit2, svd-vae or a tokenizer's directory" in " ".join(capsys.readouterr().err.split())
 
 
+def test_decodings_vary_what_the_model_leaves_open():
+    ids, latents = (make_subject(name, "float32", layers=1).config for name in ("cpu", "cpu-continuous"))
+    assert list(decodings(ids, EvalConfig(), 12)) == ["M = 8", "M = 4", "M = 2", "M = 1"]
+    assert list(decodings(ids, EvalConfig(), 24)) == ["exact", "streaming"]
+    samplers = decodings(latents, EvalConfig(), 12)
+    assert list(samplers)[:2] == ["ddpm 100", "ddpm 50"] and "ddim 4" in samplers
+
+
+@pytest.mark.slow
+def test_a_trained_model_is_judged_under_every_decoding(tmp_path: Path):
+    where = ["--preset", "smoke", "--out", str(tmp_path)]
+    assert main(["train", *where]) == 0
+    options = ["--frames", "6", "--windows", "2", "--repeats", "1"]
+    assert main(["bench", "quality", str(tmp_path / "model"), *where, *options]) == 0
+    out = tmp_path / "model" / "quality"
+    assert (out / "quality-6.png").stat().st_size > 1000
+    exact, streaming = list(csv.DictReader((out / "quality-6.csv").open()))
+    assert (exact["decoding"], exact["cost"], streaming["decoding"]) == ("exact", "1.0", "streaming")
+    (file,) = out.glob("*.json")
+    assert "PSNR of streaming over exact, dB" in read_record(file).ratios
+    assert main(["bench", "quality", str(tmp_path / "model"), *where, "--frames", "3"]) == 2
+
+
 def test_loading_is_timed_with_its_memory(tmp_path: Path):
     options = ["--data", str(REAL_DATA), "--windows", "640", "--frames", "4", "--out", str(tmp_path)]
     assert main(["bench", "load", *options]) == 0
     (file,) = tmp_path.glob("load-*.json")
+    assert {f.suffix for f in tmp_path.glob("load-store-memory.*")} == {".csv", ".png"}
     record = read_record(file)
     windows, frames = record.stages
     assert (windows.frames, windows.timing.repeats) == (32 * 4, 20)

@@ -206,6 +206,17 @@ def test_actions_and_frames_of_different_number(tmp_path):
         dataset.episode(0, *KEYS)
 
 
+def test_frames_of_a_verified_episode_are_read_alone(tmp_path, monkeypatch):
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6, 5]))
+    first = dataset.frames(1, SPEC.image_key, lambda n: range(n))
+    dataset = pickle.loads(pickle.dumps(dataset))
+    monkeypatch.setattr("data_pipelines.rlds.dataset.open_record", None)
+    again = dataset.frames(1, SPEC.image_key, lambda n: [n - 1, 0])
+    np.testing.assert_array_equal(again, [first[4], first[0]])
+    with pytest.raises(TypeError):  # the other has to be opened
+        dataset.frames(0, SPEC.image_key, lambda n: [0])
+
+
 def test_episode_without_frames_is_unusable(tmp_path):
     def spoil(episode, features):
         features |= {"steps/observation/image": [], "steps/action": np.zeros((0, 3), np.float32)}

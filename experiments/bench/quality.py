@@ -1,0 +1,141 @@
+"""What cheaper decoding costs in quality: PSNR, SSIM and delta PSNR of a trained model's rollouts
+beside the time per frame, decoding by decoding, on the same held-out windows.
+
+The first decoding is the reference. For latents the sampler's kind and steps vary, for ids the
+looks at each frame; where windows are longer than the model's, so does what happens past it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from experiments.bench.models import Subject
+from experiments.bench.rollout import compile_rollout
+from experiments.bench.timing import Timing, time_by_turns
+from hma_jax.config import EvalConfig, ModelConfig, SamplerConfig, require
+from hma_jax.evaluation.protocol import evaluate
+
+SAMPLER_STEPS = (100, 50, 25, 12, 8, 4)
+LOOKS = (8, 4, 2, 1)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One decoding; a row of quality.csv. Quality is a mean over datasets with its standard error."""
+
+    decoding: str
+    frames: int  # of a rollout, prompt included
+    windows: int
+    psnr: float  # dB, mean over predicted frames
+    psnr_sem: float
+    psnr_last: float
+    psnr_last_sem: float
+    ssim: float
+    ssim_sem: float
+    delta_psnr: float  # dB, last frame
+    delta_psnr_sem: float
+    milliseconds_per_frame: float = 0.0  # median, of one rollout at a time
+    cost: float = 1.0  # time per frame over the reference's
+
+
+def decodings(model: ModelConfig, config: EvalConfig, frames: int) -> dict[str, EvalConfig]:
+    """Name -> settings, the reference first."""
+    if frames > model.frames:
+        return {slide: replace(config, slide=slide) for slide in ("exact", "streaming")}
+    if model.diffusion is None:
+        return {f"M = {m}": replace(config, unmask_steps=m) for m in LOOKS if m <= model.tokens}
+    known = model.diffusion.steps
+    samplers = [
+        replace(config.sampler, kind=kind, steps=steps)
+        for kind in ("ddpm", "ddim")
+        for steps in SAMPLER_STEPS
+        if steps <= known
+    ]
+    return {_name(s): replace(config, sampler=s) for s in samplers}
+
+
+def _name(sampler: SamplerConfig) -> str:
+    return f"{sampler.kind} {sampler.steps}"
+
+
+def judge(
+    subject: Subject,
+    tokenizer: Any,
+    batches: Callable[[], Iterable[dict[str, Any]]],
+    settings: dict[str, EvalConfig],
+    frames: int,
+    repeats: int,
+    progress: Callable[[str, int], None],
+) -> tuple[list[Judged], dict[str, Timing]]:
+    """One row per decoding, and the timings of whole rollouts; `batches()` gives the same windows each time."""
+    rows, calls = [], {}
+    for done, (name, config) in enumerate(settings.items()):
+        progress(name, done)
+        found = evaluate(
+            subject.params, subject.config, subject.table, tokenizer, iter(batches()), config, samples_per_dataset=0
+        ).overall
+        require(found["psnr"].n > 0, "there are no windows of that length to judge on; choose fewer --frames")
+        values = {
+            f"{metric}{end}": round(getattr(found[metric], kind), 5)
+            for metric in ("psnr", "psnr_last", "ssim", "delta_psnr")
+            for end, kind in (("", "mean"), ("_sem", "sem"))
+        }
+        rows.append(Judged(name, frames, found["psnr"].n, **values))
+        calls[name] = compile_rollout(subject, 1, frames, config.prompt_frames, config.decode)
+    progress("timing", len(settings))
+    weights = subject.inference_params
+    timings = time_by_turns({n: lambda c=c: c(weights) for n, c in calls.items()}, repeats)
+    made = frames - next(iter(settings.values())).prompt_frames
+    first = next(iter(timings.values())).median
+    timed = [
+        replace(
+            row,
+            milliseconds_per_frame=round(1e3 * timings[row.decoding].median / made, 4),
+            cost=round(timings[row.decoding].median / first, 5),
+        )
+        for row in rows
+    ]
+    return timed, timings
+
+
+def plot_quality(rows: Sequence[Judged], path: Path) -> None:
+    """PSNR and delta PSNR over the time per frame, every point named."""
+    import matplotlib.pyplot as plt
+
+    from experiments.report.plot_style import COLOURS, STYLE, plain_log, save
+
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(1, 2, figsize=(8.6, 3.6), layout="constrained")
+        for panel, metric, label in zip(
+            panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
+        ):
+            for kind, marker in zip(dict.fromkeys(row.decoding.split()[0] for row in rows), "osD^", strict=False):
+                ours = [r for r in rows if r.decoding.split()[0] == kind]
+                panel.errorbar(
+                    [r.milliseconds_per_frame for r in ours],
+                    [getattr(r, metric) for r in ours],
+                    [getattr(r, f"{metric}_sem") for r in ours],
+                    color=COLOURS["delta_psnr" if marker == "s" else "perplexity"],
+                    marker=marker, markersize=4, linewidth=1.2, capsize=2,
+                )  # fmt: skip
+                for row in ours:
+                    at = (row.milliseconds_per_frame, getattr(row, metric))
+                    panel.annotate(row.decoding, at, xytext=(4, 5), textcoords="offset points", fontsize=7.5)
+            plain_log(panel, panel.xaxis)
+            panel.margins(x=0.2, y=0.2)
+            panel.set_xlabel("milliseconds per frame, one rollout at a time")
+            panel.set_ylabel(label)
+        save(figure, path)
+
+
+def subject_of(trained: Any) -> Subject:
+    """A trained run as what is timed."""
+    from hma_jax.model import declare_model
+
+    declared = declare_model(trained.model, trained.table)
+    return Subject(trained.model, trained.table, declared, jax.device_put(trained.params), 0)
