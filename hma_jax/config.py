@@ -378,7 +378,10 @@ class ModelConfig:
     stem_gain: float = 0.01  # Xavier gain of the action stems
     mup: MupConfig = field(default_factory=MupConfig)
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    remat: bool = True
+    remat: bool = True  # blocks are computed again in the backward pass
+    # Large frames attend one at a time on CPU and everywhere compute their weights again in the
+    # backward pass (`by_frame`); `whole` keeps all weights at once, to compare with.
+    attention: Literal["by_frame", "whole"] = "by_frame"
 
     def __post_init__(self):
         require(

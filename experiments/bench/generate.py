@@ -2,13 +2,15 @@
 
 `recompute` is what our oracle and the official release do: M passes over the whole window.
 `fill` is a frame while the window fills (its commit fused with the next frame's first look),
-`slide` an exact frame past the window, `stream` an approximate one. `window` is one pass over the
-whole window, the unit that the others are compared with.
+`slide` an exact frame past the window, `stream` an approximate one. `whole` is one pass over the
+whole window, the unit that the others are compared with, and `plain` the same with attention over
+all frames at once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -21,7 +23,7 @@ from hma_jax.config import DecodeConfig
 from hma_jax.flops import forward_flops_per_window
 from hma_jax.generation import rollout_naive
 from hma_jax.generation.window import Window, empty_cache
-from hma_jax.model import HMA
+from hma_jax.model import HMA, declare_model
 
 
 def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int) -> list[Stage]:
@@ -38,6 +40,10 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
     def whole(params: Any) -> jax.Array:
         return window(declared.merge(params)).pass_over(batch["tokens"], None, 0).frames
 
+    def plain(params: Any) -> jax.Array:
+        model = declare_model(replace(config, attention="whole"), subject.table).merge(params)
+        return window(model).pass_over(batch["tokens"], None, 0).frames
+
     def recompute(params: Any) -> jax.Array:
         return rollout_naive(
             declared.merge(params), past, batch["actions"], batch["embodiment"], keys, decode
@@ -52,7 +58,7 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
     def stream(params: Any, cache: Any) -> Any:
         return window(declared.merge(params)).stream(cache, newest, jnp.int32(size), keys, decode)
 
-    compiled = {f.__name__: compile_call(f, weights) for f in (whole, recompute, slide)}
+    compiled = {f.__name__: compile_call(f, weights) for f in (whole, plain, recompute, slide)}
     calls: dict[str, Callable[[], Any]] = {
         name: lambda c=call: c(weights) for name, call in compiled.items()
     }
@@ -66,12 +72,13 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
     looks, per_frame = decode.unmask_steps, one_pass / size
     flops = {
         "whole": one_pass,
+        "plain": one_pass,
         "recompute": looks * one_pass,
         "slide": one_pass + (looks - 1) * per_frame,
         "fill": (looks + 1) * per_frame,
         "stream": (looks + 1) * per_frame,
     }
-    frames = dict.fromkeys(calls, rows) | {"whole": 0}
+    frames = dict.fromkeys(calls, rows) | {"whole": 0, "plain": 0}
     return make_stages(rows, compiled, timings, frames=frames, flops=flops)
 
 
@@ -93,4 +100,5 @@ def ratios(stages: list[Stage], rows: int) -> dict[str, float]:
         f"recompute / fill, batch {rows}": median["recompute"] / median["fill"],
         f"recompute / stream, batch {rows}": median["recompute"] / median["stream"],
         f"slide / whole window pass, batch {rows}": median["slide"] / median["whole"],
+        f"plain / whole window pass, batch {rows}": median["plain"] / median["whole"],
     }

@@ -60,20 +60,32 @@ class Subject:
 
 
 def make_shape(
-    name: str, dtype: str, robots: int = 1, layers: int | None = None, remat: bool = False
+    name: str,
+    dtype: str,
+    robots: int = 1,
+    layers: int | None = None,
+    width: int | None = None,
+    remat: bool = False,
 ) -> tuple[ModelConfig, EmbodimentTable]:
     """Configuration and robots. Raises ConfigError for a name that is not in the table."""
     require(name in MODELS, f"unknown model {name!r}; known: {', '.join(MODELS)}")
     model = MODELS[name]
     one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
     table = EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
-    return replace(model, compute_dtype=dtype, layers=layers or model.layers, remat=remat), table
+    sizes = {"layers": layers or model.layers, "width": width or model.width}
+    return replace(model, compute_dtype=dtype, remat=remat, **sizes), table
 
 
 def make_subject(
-    name: str, dtype: str, robots: int = 1, seed: int = 0, layers: int | None = None, remat: bool = False
+    name: str,
+    dtype: str,
+    robots: int = 1,
+    seed: int = 0,
+    layers: int | None = None,
+    width: int | None = None,
+    remat: bool = False,
 ) -> Subject:
     """As `make_shape`, with weights."""
-    config, table = make_shape(name, dtype, robots, layers, remat)
+    config, table = make_shape(name, dtype, robots, layers, width, remat)
     declared = declare_model(config, table)
     return Subject(config, table, declared, declared.init(seed), seed)

@@ -39,6 +39,8 @@ class Bench:
     """Embodiments of the model; a batch mixes them."""
     layers: Annotated[int | None, arg(metavar="N")] = None
     """Another number of layers, for a quick look."""
+    width: Annotated[int | None, arg(metavar="D")] = None
+    """Another width."""
     seed: int = 0
     out: Path = Path("runs/bench")
     """Directory for the record."""

@@ -204,7 +204,8 @@ def _subject(bench: Bench, **changes: Any) -> Subject:
     if bench.repeats < 1 or min(bench.batch, default=0) < 1:
         raise ConfigError("--repeats and --batch must be at least 1")
     with step(f"draw the weights of {bench.model}"):
-        return make_subject(bench.model, bench.dtype, bench.robots, bench.seed, bench.layers, **changes)
+        sizes = {"layers": bench.layers, "width": bench.width}
+        return make_subject(bench.model, bench.dtype, bench.robots, bench.seed, **sizes, **changes)
 
 
 def _decode(decode: Decode) -> DecodeConfig:
@@ -223,7 +224,9 @@ def _finish(
     notes: tuple[str, ...] = (),
 ) -> None:
     settings = settings | {"model": subject.config, "robots": bench.robots}
-    _write(kind, bench.model, bench.dtype, bench.seed, settings, stages, ratios, notes, bench.out)
+    sizes = {"layers": bench.layers, "width": bench.width}
+    name = "-".join([bench.model, *(f"{what}-{size}" for what, size in sizes.items() if size)])
+    _write(kind, name, bench.dtype, bench.seed, settings, stages, ratios, notes, bench.out)
 
 
 def _write(

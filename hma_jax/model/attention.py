@@ -15,7 +15,7 @@ from hma_jax.params import bias, param
 from hma_jax.sharding import is_split
 
 CACHED_BYTES = 2**20
-"""A frame's attention weights above this size are not kept for the backward pass."""
+"""What a frame's attention weights must exceed for `attend_within` to be worth it."""
 
 
 def attention_scale(config: ModelConfig) -> float:
@@ -44,6 +44,7 @@ class Attention(nnx.Module):
         self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
         self.norm = LayerNorm(head, axis=None) if config.qk_norm else None
         self.scale = attention_scale(config)
+        self.by_frame = config.attention == "by_frame"
 
     def project(self, x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """x [..., D] -> q, k, v [..., H, I]; q carries the scale."""
@@ -64,8 +65,8 @@ class Attention(nnx.Module):
         """Every token sees every token of its own frame."""
         q, k, v = self.project(x_BTPD)
         weights = x_BTPD.shape[2] ** 2 * q.shape[-2] * q.dtype.itemsize
-        attend = attend_within if weights > CACHED_BYTES else _all_frames
-        return self.project_out(attend(q, k, v))
+        by_frame = self.by_frame and weights > CACHED_BYTES
+        return self.project_out((attend_within if by_frame else _all_frames)(q, k, v))
 
     def over_time(
         self,

@@ -96,17 +96,18 @@ def test_the_command_times_frames_every_way_and_the_report_reads_its_record(tmp_
     (file,) = tmp_path.glob("*.json")
     record = read_record(file)
     stages = {s.name: s for s in record.stages}
-    assert set(stages) == {"whole", "recompute", "slide", "fill", "stream"}
+    assert set(stages) == {"whole", "plain", "recompute", "slide", "fill", "stream"}
     assert stages["recompute"].flops == 2 * stages["whole"].flops
     assert stages["fill"].flops == pytest.approx(3 / 12 * stages["whole"].flops)
     assert stages["slide"].flops == pytest.approx(13 / 12 * stages["whole"].flops)
     assert all(s.timing.median > 0 and s.compile_seconds > 0 for s in stages.values())
     assert set(record.ratios) == {
-        "recompute / fill, batch 2", "recompute / stream, batch 2", "slide / whole window pass, batch 2"
+        "recompute / fill, batch 2", "recompute / stream, batch 2", "slide / whole window pass, batch 2",
+        "plain / whole window pass, batch 2",
     }  # fmt: skip
     figure = tmp_path / "bench.png"
     assert main(["bench", "report", str(tmp_path), "--figure", str(figure)]) == 0
-    assert "**generate cpu**" in capsys.readouterr().out
+    assert "**generate cpu-layers-1**" in capsys.readouterr().out
     assert figure.stat().st_size > 1000
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,6 +7,7 @@ import pytest
 
 from hma_jax.model.attention import attend_within
 from hma_jax.model.layers import contract
+from tests.tiny import lively_params, model_config, random_batch
 
 
 def drawn(seed: int, *shape: int) -> np.ndarray:
@@ -35,3 +38,14 @@ def test_contract_has_the_gradients_of_a_tensordot(x: tuple, w: tuple, axes: int
     square = lambda product: jax.grad(lambda a, b: jnp.sum(product(a, b, axes) ** 2), argnums=(0, 1))(*args)  # noqa: E731
     for got, want in zip(square(contract), square(jnp.tensordot), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-5)
+
+
+def test_a_model_says_the_same_whichever_way_it_attends():
+    config = model_config(width=16, layers=1, tokens=260, action_tokens=4)
+    batch = random_batch(0, config, 2)
+    said = []
+    for how in ("by_frame", "whole"):
+        declared, params = lively_params(replace(config, attention=how))
+        look = jax.jit(lambda p, d=declared: d.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).frames)
+        said.append(np.asarray(look(params)))
+    np.testing.assert_allclose(*said, atol=1e-4 * np.abs(said[1]).max())
