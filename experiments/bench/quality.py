@@ -15,8 +15,9 @@ from typing import Any
 import jax
 
 from experiments.bench.models import Subject
+from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
-from experiments.bench.timing import Timing, time_by_turns
+from experiments.bench.timing import time_by_turns
 from hma_jax.config import EvalConfig, ModelConfig, SamplerConfig, require
 from hma_jax.evaluation.protocol import evaluate
 
@@ -71,8 +72,8 @@ def judge(
     frames: int,
     repeats: int,
     progress: Callable[[str, int], None],
-) -> tuple[list[Judged], dict[str, Timing]]:
-    """One row per decoding, and the timings of whole rollouts; `batches()` gives the same windows each time."""
+) -> tuple[list[Judged], list[Stage]]:
+    """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time."""
     rows, calls = [], {}
     for done, (name, config) in enumerate(settings.items()):
         progress(name, done)
@@ -100,7 +101,8 @@ def judge(
         )
         for row in rows
     ]
-    return timed, timings
+    made_by = dict.fromkeys(calls, float(made))
+    return timed, make_stages(1, calls, timings, frames=made_by, flops=dict.fromkeys(calls, 0.0))
 
 
 def plot_quality(rows: Sequence[Judged], path: Path) -> None:

@@ -76,7 +76,6 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
 
     from data_pipelines.loading.evalset import eval_batches, freeze_manifest
     from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
-    from experiments.bench.record import Stage
     from experiments.commands.model import check_fits
     from experiments.rows import write_csv
     from experiments.trial import open_materials
@@ -97,7 +96,7 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
         return eval_batches(materials.store, trained.table, frozen, config.batch, frozen.names)
 
     with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
-        rows, timings = judge(
+        rows, stages = judge(
             subject, materials.tokenizer, batches, settings, frames, repeats,
             lambda name, done: update(done, len(settings), name),
         )  # fmt: skip
@@ -114,7 +113,6 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     stem = out / f"quality-{frames}"
     write_csv(stem.with_suffix(".csv"), Judged, rows)
     plot_quality(rows, stem.with_suffix(".png"))
-    stages = [Stage(name, 1, timing, frames=frames - config.prompt_frames) for name, timing in timings.items()]
     gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr - rows[0].psnr for r in rows[1:]}
     facts = {"model": trained.model, "eval": replace(config, batch=1), "frames": frames, "windows": rows[0].windows}
     _write("quality", f"{frames}-frames", trained.model.compute_dtype, 0, facts, stages, gaps, (), out)
