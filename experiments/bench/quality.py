@@ -111,23 +111,25 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
 
     from experiments.report.plot_style import COLOURS, STYLE, plain_log, save
 
+    cost = "milliseconds_per_frame"
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(1, 2, figsize=(8.6, 3.6), layout="constrained")
         for panel, metric, label in zip(
             panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
         ):
-            for kind, marker in zip(dict.fromkeys(row.decoding.split()[0] for row in rows), "osD^", strict=False):
+            kinds = dict.fromkeys(row.decoding.split()[0] for row in rows)
+            for kind, colour, lift in zip(kinds, COLOURS.values(), (5, -12), strict=False):
                 ours = [r for r in rows if r.decoding.split()[0] == kind]
+                time, value, sem = ([getattr(r, f) for r in ours] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(
-                    [r.milliseconds_per_frame for r in ours],
-                    [getattr(r, metric) for r in ours],
-                    [getattr(r, f"{metric}_sem") for r in ours],
-                    color=COLOURS["delta_psnr" if marker == "s" else "perplexity"],
-                    marker=marker, markersize=4, linewidth=1.2, capsize=2,
-                )  # fmt: skip
+                    time, value, sem, color=colour, marker="o", markersize=4, linewidth=1.2, capsize=2, label=kind
+                )
                 for row in ours:
-                    at = (row.milliseconds_per_frame, getattr(row, metric))
-                    panel.annotate(row.decoding, at, xytext=(4, 5), textcoords="offset points", fontsize=7.5)
+                    number = row.decoding.split()[-1]
+                    at = (getattr(row, cost), getattr(row, metric))
+                    panel.annotate(number, at, xytext=(4, lift), textcoords="offset points", fontsize=7.5)
+            if len(rows) > len(kinds) > 1:
+                panel.legend()
             plain_log(panel, panel.xaxis)
             panel.margins(x=0.2, y=0.2)
             panel.set_xlabel("milliseconds per frame, one rollout at a time")

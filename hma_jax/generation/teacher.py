@@ -23,7 +23,8 @@ def next_frame_outputs(
     One pass over 2 (T - 1) frames, the true ones and the masked ones side by side, where the
     official evaluation makes T - 1 passes over the window (reference section 6.2).
     """
-    return _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT).frames[:, frames.shape[1] - 1 :]
+    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, keep=0)
+    return out.frames[:, frames.shape[1] - 1 :]
 
 
 def next_frames(
@@ -42,9 +43,8 @@ def next_frames(
     one over the true ones, where the official evaluation makes M (T - 1) over the window.
     """
     count = frames.shape[1] - 1
-    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT)
+    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, keep=count)
     first = out.frames[:, count:]
-    past = jax.tree.map(lambda x: x[:, :, :count], out.cache)
     actions = model.align(actions_BTU)[:, 1:]
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
@@ -60,7 +60,7 @@ def next_frames(
             hidden_BT=hidden,
             visible=jnp.concatenate([causal(count), jnp.eye(count, dtype=bool)], axis=1),
             first=1,
-            past=past,
+            past=out.cache,
         )
         return fold(said.frames)
 
@@ -74,6 +74,7 @@ def _look_beside(
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     hidden_BT: jax.Array | None,
+    keep: int,
 ) -> Outputs:
     """One pass over frames 0 .. T-2 and, beside them, 1 .. T-1 wholly masked."""
     count = frames.shape[1] - 1
@@ -95,5 +96,5 @@ def _look_beside(
         hidden_BT=hidden,
         visible=visible,
         positions=positions,
-        keep=True,
+        keep=keep,
     )

@@ -42,7 +42,7 @@ class Window(NamedTuple):
         count = frames.shape[1]
         if not count:
             return empty_cache(self.model, len(frames), room)
-        new = self.pass_over(frames, None, 0).cache
+        new = self.pass_over(frames, None, 0, keep=count).cache
         missing = room - count
         return jax.tree.map(lambda x: jnp.pad(x, [(0, 0)] * 2 + [(0, missing)] + [(0, 0)] * (x.ndim - 3)), new)
 
@@ -63,9 +63,8 @@ class Window(NamedTuple):
         blank = blank_frame(self.model.config, len(past))
         values = jnp.concatenate([past, blank.values[:, None].astype(past.dtype)], axis=1)
         masked = jnp.broadcast_to((jnp.arange(count + 1) == count)[None, :, None], values.shape[:3])
-        out = self.pass_over(values, masked, 0)
-        cache = jax.tree.map(lambda x: x[:, :, :count], out.cache)
-        look = lambda f: self.look(cache, f, count, jnp.ones(count, bool))  # noqa: E731
+        out = self.pass_over(values, masked, 0, keep=count)
+        look = lambda f: self.look(out.cache, f, count, jnp.ones(count, bool))  # noqa: E731
         return decode_frame(self.model, out.frames[:, -1], look, key_B, decode)
 
     def stream(
@@ -99,7 +98,7 @@ class Window(NamedTuple):
         values = jnp.stack([last, blank.values.astype(last.dtype)], axis=1)
         masked = jnp.stack([jnp.zeros_like(blank.masked), blank.masked], axis=1)
         visible = jnp.concatenate([jnp.stack([seen_by_last, seen_by_next]), causal(2)], axis=1)
-        return self.pass_over(values, masked, first, cache, visible, positions)
+        return self.pass_over(values, masked, first, cache, visible, positions, keep=1)
 
     def look(self, cache: TemporalCache, frame: Frame, t: int | jax.Array, seen: jax.Array) -> jax.Array:
         """What the model says of the frame at position t, given those that are `seen` in the cache."""
@@ -114,8 +113,9 @@ class Window(NamedTuple):
         past: TemporalCache | None = None,
         visible: jax.Array | None = None,
         positions: jax.Array | None = None,
+        keep: int = 0,
     ) -> Outputs:
-        """One pass over frames that take the actions of slots `first` onwards."""
+        """One pass over frames that take the actions of slots `first` onwards; the first `keep` are cached."""
         part = lambda x: (  # noqa: E731
             None if x is None else jax.lax.dynamic_slice_in_dim(x, first, values.shape[1], axis=1)
         )
@@ -129,7 +129,7 @@ class Window(NamedTuple):
             first=first,
             positions=positions,
             past=past,
-            keep=True,
+            keep=keep,
         )
 
 
@@ -139,8 +139,8 @@ def room_of(cache: TemporalCache) -> int:
 
 
 def write_cache(cache: TemporalCache, new: TemporalCache, slot: jax.Array) -> TemporalCache:
-    """`cache` with the first frame of `new` in `slot`."""
-    put = lambda c, n: jax.lax.dynamic_update_slice_in_dim(c, n[:, :, :1], slot, axis=2)  # noqa: E731
+    """`cache` with the one frame of `new` in `slot`."""
+    put = lambda c, n: jax.lax.dynamic_update_slice_in_dim(c, n, slot, axis=2)  # noqa: E731
     return jax.tree.map(put, cache, new)
 
 
@@ -150,7 +150,8 @@ def empty_cache(model: HMA, batch: int, room: int) -> TemporalCache:
     def one_frame() -> TemporalCache:
         blank = blank_frame(model.config, batch)
         chunks, robots = jnp.zeros((batch, 1, model.table.action_width)), jnp.zeros(batch, jnp.int32)
-        return Window.over(model, chunks, None, robots).pass_over(blank.values[:, None], blank.masked[:, None], 0).cache
+        window = Window.over(model, chunks, None, robots)
+        return window.pass_over(blank.values[:, None], blank.masked[:, None], 0, keep=1).cache
 
     shapes = jax.eval_shape(one_frame)
     return jax.tree.map(lambda x: jnp.zeros((*x.shape[:2], room, *x.shape[3:]), x.dtype), shapes)

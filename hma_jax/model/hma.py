@@ -72,7 +72,7 @@ class HMA(nnx.Module):
         first: int | jax.Array = 0,
         positions: jax.Array | None = None,
         past: TemporalCache | None = None,
-        keep: bool = False,
+        keep: int = 0,
     ) -> Outputs:
         """One pass over ids [B, T, S] or latents [B, T, S, C], masked where bool `masked` says.
 
@@ -81,7 +81,7 @@ class HMA(nnx.Module):
         not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
         instead of actions runs without action tokens and conditioning. The frames stand at window
         positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T]
-        defaults to causal. With `keep` the frames' cache is returned.
+        defaults to causal. The cache of the first `keep` frames is returned.
         """
         config = self.config
         count = frames.shape[1]

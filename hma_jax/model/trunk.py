@@ -79,19 +79,20 @@ class Trunk(nnx.Module):
         embodiment_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None = None,
-        keep: bool = False,
+        keep: int = 0,
     ) -> tuple[jax.Array, TemporalCache | None]:
         """Runs all blocks.
 
         `visible` [T, T_past + T] says which frames each frame's temporal attention may see.
-        With `keep` the new frames' cache is returned.
+        The cache of the first `keep` new frames is returned, None of none.
         """
         block_def, layers = nnx.split(self.blocks)
 
         def body(x, xs):
             layer, layer_past = xs
             x, new = nnx.merge(block_def, layer)(x, action, embodiment_B, visible, layer_past)
-            return constrain(x, ("B", None, None, "D_act")), new if keep else None
+            new = jax.tree.map(lambda y: y[:, :keep], new) if keep else None
+            return constrain(x, ("B", None, None, "D_act")), new
 
         if self.remat:
             body = jax.checkpoint(body, prevent_cse=False)

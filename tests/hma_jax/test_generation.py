@@ -243,7 +243,7 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
     [
         ({"conditioning": "concat+modulate"}, DecodeConfig(3, 1.0)),
         ({"action_alignment": "causal"}, DecodeConfig(2, order="confidence")),
-        ({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SAMPLER)),
+        pytest.param({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SAMPLER), marks=pytest.mark.slow),
         pytest.param({"conditioning": "cross_attention"}, DecodeConfig(2), marks=pytest.mark.slow),
     ],
     ids=["sampled", "causal", "continuous", "cross-attention"],
@@ -349,7 +349,7 @@ def test_one_to_twenty_four_frames_of_different_robots_equal_the_oracle_s(condit
     start, actions = batch["tokens"][:, :1], batch["actions"]
     naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, actions, robots, keys, decode))
     want = np.asarray(naive(params))
-    for new in (1, 2, 3, 4, 9, NEW) if decode == SAMPLED else (NEW,):
+    for new in (1, 4, NEW) if decode == SAMPLED else (NEW,):
         chunks = actions[:, None, : 1 + new]
         fast = jax.jit(lambda p, a=chunks: rollout(declared.merge(p), start, a, robots, keys, decode)[:, 0])
         np.testing.assert_array_equal(fast(params), want[:, :new])
