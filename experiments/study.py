@@ -20,10 +20,9 @@ from hma_jax.config import (
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
-    from_dict,
     require,
-    to_dict,
 )
+from hma_jax.config_json import from_dict, to_dict
 from hma_jax.tokenizers.config import AnyTokenizerConfig, Latents
 
 

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
 from experiments.workspace import Workspace
-from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, Setting, TrainConfig, stable_hash, to_dict
+from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, Setting, TrainConfig
+from hma_jax.config_json import stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.loading.evalset import EvalManifest

@@ -28,7 +28,8 @@ def main(directory: Path) -> int:
     from experiments.ledger import DIVERGED, FAILED
     from experiments.trial import Trial, run_trial
     from experiments.workspace import Workspace
-    from hma_jax.config import ConfigError, MeshConfig, from_dict
+    from hma_jax.config import ConfigError, MeshConfig
+    from hma_jax.config_json import from_dict
     from hma_jax.training.loop import DivergedError, Interrupted
 
     job = json.loads((directory / JOB).read_text())

@@ -12,7 +12,8 @@ from pathlib import Path
 from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
 from experiments.study import Study
-from hma_jax.config import ConfigError, from_dict, to_dict
+from hma_jax.config import ConfigError
+from hma_jax.config_json import from_dict, to_dict
 
 
 class Busy(ConfigError):

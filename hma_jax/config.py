@@ -1,19 +1,14 @@
-"""Configuration: frozen dataclasses, validated when made, JSON both ways, with a stable hash.
+"""Configuration: frozen dataclasses, validated when made.
 
 A default lives here and nowhere else; those of tokenizers that are not trained here are in
-`tokenizers.config`. Named instances live in `presets`. A config holds what determines a result;
-paths, clocks and verbosity belong to the code that calls.
+`tokenizers.config`. Named instances live in `presets`, JSON and hashes in `config_json`. A
+config holds what determines a result; paths, clocks and verbosity belong to the code that calls.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
-import json
-import types
-import typing
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 
 class ConfigError(ValueError):
@@ -24,106 +19,6 @@ def require(condition: bool, message: str) -> None:
     """Raises ConfigError(message) unless `condition` holds."""
     if not condition:
         raise ConfigError(message)
-
-
-# --- JSON and hash ---------------------------------------------------------------------------
-
-
-def to_dict(config: Any) -> Any:
-    """Plain JSON types from a config (dataclasses, tuples and scalars, nested)."""
-    if dataclasses.is_dataclass(config):
-        return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
-    if isinstance(config, (tuple, list)):
-        return [to_dict(v) for v in config]
-    if isinstance(config, dict):
-        return {k: to_dict(v) for k, v in config.items()}
-    return config
-
-
-def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
-    """A `cls` from `to_dict`'s output.
-
-    Unknown and missing keys, values of the wrong kind and choices that are not on offer raise
-    ConfigError naming the field.
-    """
-    hints = typing.get_type_hints(cls)
-    known = {f.name: f for f in dataclasses.fields(cls)}
-    where = where or cls.__name__
-    require(isinstance(values, dict), f"{where}: expected named fields ({', '.join(known)}), got {values!r}")
-    unknown = sorted(set(values) - set(known))
-    require(not unknown, f"{where}: unknown field(s) {', '.join(unknown)}; known: {', '.join(known)}")
-    missing = [
-        n
-        for n, f in known.items()
-        if n not in values
-        and f.default is dataclasses.MISSING
-        and f.default_factory is dataclasses.MISSING
-    ]
-    require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
-    return cls(**{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
-
-
-def _decode(hint: Any, value: Any, where: str) -> Any:
-    origin = typing.get_origin(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None:
-            return None
-        options = [a for a in typing.get_args(hint) if a is not type(None)]
-        return _decode(_by_kind(options, value, where), value, where)
-    if dataclasses.is_dataclass(hint):
-        return from_dict(hint, value, where)
-    if origin is Literal:
-        choices = typing.get_args(hint)
-        known = ", ".join(map(str, choices))
-        require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
-        return value
-    if origin is tuple:
-        require(isinstance(value, (list, tuple)), f"{where}: expected a list, got {value!r}")
-        args = typing.get_args(hint)
-        if len(args) == 2 and args[1] is Ellipsis:
-            args = (args[0],) * len(value)
-        require(len(value) == len(args), f"{where}: expected {len(args)} values, got {value!r}")
-        return tuple(_decode(a, v, where) for a, v in zip(args, value, strict=True))
-    if hint in (bool, int, float, str):
-        kinds = (int, float) if hint is float else hint
-        fits = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
-        require(fits, f"{where}: expected {hint.__name__}, got {value!r}")
-        return hint(value)
-    return value
-
-
-def _by_kind(options: list[Any], value: Any, where: str) -> Any:
-    """Of several configs the one whose `kind` is `value`'s; the first of them has none."""
-    if len(options) == 1 or not isinstance(value, dict) or "kind" not in value:
-        return options[0]
-    kinds = {option.kind: option for option in options if hasattr(option, "kind")}
-    require(value["kind"] in kinds, f"{where}: unknown kind {value['kind']!r}; known: {', '.join(kinds)}")
-    return kinds[value["kind"]]
-
-
-def to_json(config: Any) -> str:
-    return json.dumps(to_dict(config), indent=2, sort_keys=True)
-
-
-def from_json(cls: type, text: str) -> Any:
-    return from_dict(cls, json.loads(text))
-
-
-def stable_hash(config: Any, length: int = 16) -> str:
-    """Hex digest of the canonical JSON: the same on every machine and Python version."""
-    canonical = json.dumps(to_dict(config), sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()[:length]
-
-
-def diff(old: Any, new: Any, path: str = "") -> list[str]:
-    """Readable lines 'field: old -> new' for every difference between two configs."""
-    a, b = to_dict(old), to_dict(new)
-    if isinstance(a, dict) and isinstance(b, dict):
-        lines = []
-        for key in sorted(set(a) | set(b)):
-            lines += diff(a.get(key), b.get(key), f"{path}.{key}" if path else key)
-        return lines
-    return [] if a == b else [f"{path}: {a!r} -> {b!r}"]
 
 
 # --- Tokenizer -------------------------------------------------------------------------------

@@ -15,7 +15,8 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
-from hma_jax.config import ConfigError, from_dict, require, stable_hash, to_dict
+from hma_jax.config import ConfigError, require
+from hma_jax.config_json import from_dict, stable_hash, to_dict
 from hma_jax.embodiments import Embodiment
 
 FILE = "manifest.json"

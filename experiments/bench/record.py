@@ -14,7 +14,8 @@ import jax
 from experiments.atomic import write_atomically
 from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
 from experiments.machine import describe_machine
-from hma_jax.config import ConfigError, from_dict, to_dict
+from hma_jax.config import ConfigError
+from hma_jax.config_json import from_dict, to_dict
 
 FORMAT = 1
 

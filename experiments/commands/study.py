@@ -28,7 +28,8 @@ from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_tokenizer, on_user_data, override
 from experiments.sweep import titles, unique_trials
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
-from hma_jax.config import ConfigError, MeshConfig, to_dict
+from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.config_json import to_dict
 
 AXES = {
     "datasets": scale_datasets.plan,

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from hma_jax.config import ConfigError, ModelConfig, TrainConfig, from_dict, require
+from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
+from hma_jax.config_json import from_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.table import check_names, flat, nested
 from hma_jax.convert.tensors import read_safetensors, write_safetensors

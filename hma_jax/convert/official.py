@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require, stable_hash
+from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
+from hma_jax.config_json import stable_hash
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.official_config import (
     BASE_WIDTH,

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hma_jax.config import ConfigError, MaskingConfig, ModelConfig, from_dict, require
+from hma_jax.config import ConfigError, MaskingConfig, ModelConfig, require
+from hma_jax.config_json import from_dict
 from hma_jax.embodiments import Embodiment, EmbodimentTable
 
 BASE_WIDTH = 256

@@ -16,7 +16,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import from_dict, require
+from hma_jax.config import require
+from hma_jax.config_json import from_dict
 from hma_jax.convert.official import read_config
 from hma_jax.convert.table import check_names, nested
 from hma_jax.convert.tensors import Stored, read_safetensors

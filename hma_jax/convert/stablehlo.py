@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from hma_jax.config import ConfigError, DecodeConfig, ModelConfig, require, to_dict
+from hma_jax.config import ConfigError, DecodeConfig, ModelConfig, require
+from hma_jax.config_json import to_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.neutral import describe_tensors
 from hma_jax.convert.table import flat, nested

@@ -16,7 +16,8 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as ocp
 
-from hma_jax.config import ConfigError, diff
+from hma_jax.config import ConfigError
+from hma_jax.config_json import diff
 
 
 class CheckpointError(ConfigError):

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from hma_jax.config import MeshConfig, ModelConfig, TrainConfig, from_dict, to_dict
+from hma_jax.config import MeshConfig, ModelConfig, TrainConfig
+from hma_jax.config_json import from_dict, to_dict
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.flops import peak_flops, train_flops_per_window
 from hma_jax.model import declare_model

@@ -12,7 +12,8 @@ from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.rows import curve, difference, read_csv
 from experiments.sweep import CONTROL, POINT, reference_trial, titles, unique_trials
 from experiments.trial import trial_id
-from hma_jax.config import Conditioning, ConfigError, diff
+from hma_jax.config import Conditioning, ConfigError
+from hma_jax.config_json import diff
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
 
 

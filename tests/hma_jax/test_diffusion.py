@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, SamplerConfig, from_dict, to_dict
+from hma_jax.config import ConfigError, SamplerConfig
+from hma_jax.config_json import from_dict, to_dict
 from hma_jax.diffusion import (
     Process,
     diffusion_loss,

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, TokenizerConfig, from_dict, from_json, to_json
+from hma_jax.config import ConfigError, TokenizerConfig
+from hma_jax.config_json import from_dict, from_json, to_json
 from hma_jax.model.frames import compose, factorise
 from hma_jax.tokenizers.config import AnyTokenizerConfig, Magvit2Config, PixelsConfig, SvdVaeConfig
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
