@@ -273,9 +273,8 @@ class ModelConfig:
     stem_gain: float = 0.01  # Xavier gain of the action stems
     mup: MupConfig = field(default_factory=MupConfig)
     compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    remat: bool = True  # blocks are computed again in the backward pass
-    # Large frames attend one at a time on CPU and everywhere compute their weights again in the
-    # backward pass (`by_frame`); `whole` keeps all weights at once, to compare with.
+    remat: bool = True  # keep no more than a block's input for the backward pass; False: its products too
+    # Large frames attend one at a time on CPU (`by_frame`), or all at once (`whole`, to compare with).
     attention: Literal["by_frame", "whole"] = "by_frame"
 
     def __post_init__(self):

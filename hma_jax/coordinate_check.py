@@ -59,7 +59,11 @@ class _WatchedTrunk:
         for index in range(self.layers):
             block = nnx.merge(block_def, jax.tree.map(lambda p, i=index: p[i], layers))
             for attention, pairs in ((block.space, "btphi,btshi->bthps"), (block.time, "btphi,bsphi->bphts")):
-                _watch(attention, "project", lambda qkv, p=pairs: logits.append(jnp.einsum(p, *qkv[:2])))
+
+                def keep(qkv: jax.Array, scale: float = attention.scale, pairs: str = pairs) -> None:
+                    logits.append(scale * jnp.einsum(pairs, qkv[..., 0, :, :], qkv[..., 1, :, :]))
+
+                _watch(attention, "project", keep)
             x, _ = block(x, *rest[:3], None)
         self.note("attention logits", jnp.concatenate([y.ravel() for y in logits]))
         self.note("residual stream", x)

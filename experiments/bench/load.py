@@ -78,7 +78,7 @@ def time_windows(store: TokenStore, windows: int, batch: int, frames: int, threa
     """`windows` training windows; a call is a batch."""
     config = LoaderConfig(batch=batch, frames=frames)
     loader = make_loader(store, store.embodiment_table(store.names), config, threads=threads)
-    return _drain(loader, "windows", max(windows // batch, 20), batch, batch * frames)
+    return _drain(loader, _with_threads("windows", threads), max(windows // batch, 20), batch, batch * frames)
 
 
 def time_shards(
@@ -86,7 +86,11 @@ def time_shards(
 ) -> Drained:
     """The same for single frames of RLDS shards, decoded and resized to `size` pixels."""
     loader = make_frame_loader(sources, size, batch, 0, threads=threads)
-    return _drain(loader, "RLDS frames", max(frames // batch, 20), batch, batch)
+    return _drain(loader, _with_threads("RLDS frames", threads), max(frames // batch, 20), batch, batch)
+
+
+def _with_threads(what: str, threads: int) -> str:
+    return f"{what}, {threads} thread{'s' * (threads != 1)}"
 
 
 def _drain(loader: Iterator[Any], name: str, batches: int, batch: int, frames: int) -> Drained:

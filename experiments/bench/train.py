@@ -1,6 +1,10 @@
-"""Training throughput: the whole optimiser step against a forward pass of the same batch."""
+"""Training throughput: the whole optimiser step against forward passes of the same batch."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import jax
 
@@ -10,36 +14,45 @@ from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import TrainConfig
 from hma_jax.flops import forward_flops_per_window, train_flops_per_window
 from hma_jax.masking import mask_batch
+from hma_jax.model import declare_model
+from hma_jax.params import Declared, Params
 from hma_jax.training.step import init_state, make_train_step
 
 
 def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
-    """Stages `forward` (one clean pass over the batch, to the loss's inputs) and `step`."""
+    """Stages `forward` (a pass over the batch, to the loss's inputs), `plain` (the same, with attention over
+    all frames at once) and `step`.
+    """
     declared, table, config = subject.declared, subject.table, subject.config
     settings = TrainConfig(batch=rows, seed=subject.seed)
     batch = subject.batch(rows)
 
-    def forward(params, batch):
-        model = declared.merge(params)
-        key = jax.random.key(subject.seed)
-        masked = mask_batch(key, batch["tokens"], batch["embodiment"], config, settings.masking, table)
-        return model(
-            masked.inputs, masked.masked, model.align(batch["actions"]), batch["embodiment"]
-        ).frames
+    def passes(declared: Declared) -> Callable[[Params, dict[str, jax.Array]], jax.Array]:
+        def forward(params: Params, batch: dict[str, jax.Array]) -> jax.Array:
+            model, key = declared.merge(params), jax.random.key(subject.seed)
+            masked = mask_batch(key, batch["tokens"], batch["embodiment"], config, settings.masking, table)
+            return model(
+                masked.inputs, masked.masked, model.align(batch["actions"]), batch["embodiment"]
+            ).frames
+
+        return forward
 
     state = init_state(declared, table, subject.seed)
-    ahead = compile_call(forward, state.params, batch)
-    step = compile_call(make_train_step(declared, table, config, settings), state, batch, donate=(0,))
+    compiled = {
+        "forward": compile_call(passes(declared), state.params, batch),
+        "plain": compile_call(passes(declare_model(replace(config, attention="whole"), table)), state.params, batch),
+        "step": compile_call(make_train_step(declared, table, config, settings), state, batch, donate=(0,)),
+    }
     kept = [state]
 
-    def one_step():
-        kept[0], metrics = step(kept[0], batch)
+    def one_step() -> dict[str, jax.Array]:
+        kept[0], metrics = compiled["step"](kept[0], batch)
         return metrics
 
-    timings = time_by_turns({"forward": lambda: ahead(kept[0].params, batch), "step": one_step}, repeats)
-    flops = {
-        "forward": rows * forward_flops_per_window(config, table),
-        "step": rows * train_flops_per_window(config, table),
+    calls: dict[str, Callable[[], Any]] = {
+        name: lambda c=compiled[name]: c(kept[0].params, batch) for name in ("forward", "plain")
     }
-    frames = dict.fromkeys(flops, rows * config.frames)
-    return make_stages(rows, {"forward": ahead, "step": step}, timings, frames=frames, flops=flops)
+    timings = time_by_turns(calls | {"step": one_step}, repeats)
+    one_pass = rows * forward_flops_per_window(config, table)
+    flops = {"forward": one_pass, "plain": one_pass, "step": rows * train_flops_per_window(config, table)}
+    return make_stages(rows, compiled, timings, frames=dict.fromkeys(flops, rows * config.frames), flops=flops)

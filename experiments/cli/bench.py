@@ -163,7 +163,7 @@ def load(
     batch: int = 32,
     frames: int = 12,
     size: int = 64,
-    threads: int = 1,
+    threads: tuple[int, ...] = (1, 2),
     out: Path = Path("runs/bench"),
 ) -> None:
     """Time training windows from a token store, and frames from RLDS directories; watch the memory.
@@ -175,7 +175,7 @@ def load(
         batch: Windows per batch; four times as many frames of RLDS directories.
         frames: Frames per window.
         size: Pixels that frames of RLDS directories are resized to.
-        threads: Threads that read ahead.
+        threads: Threads that read ahead; several numbers are timed one after the other.
         out: Directory for the record.
     """
     commands.load(store, data, windows, batch, frames, size, threads, out)

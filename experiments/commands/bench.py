@@ -56,7 +56,8 @@ def train(bench: Bench, remat: bool) -> None:
     stages = _over_batches(
         bench, "training steps", lambda rows: time_training(subject, rows, bench.repeats)
     )
-    _finish("train", bench, subject, stages, _ratios(bench, stages, "step", "forward"), {"remat": remat})
+    found = _ratios(bench, stages, "step", "forward") | _ratios(bench, stages, "step", "plain")
+    _finish("train", bench, subject, stages, found, {"remat": remat})
 
 
 def evaluate(bench: Bench, context: Literal["recorded", "generated"], draws: int) -> None:
@@ -137,7 +138,7 @@ def load(
     batch: int,
     frames: int,
     size: int,
-    threads: int,
+    threads: Sequence[int],
     out: Path,
 ) -> None:
     import tempfile
@@ -150,14 +151,14 @@ def load(
         with step("open the token store"):
             opened = make_store(Path(scratch), 0) if store is None else TokenStore(store)
         with step(f"draw windows of {len(opened.names)} datasets"):
-            drained = [time_windows(opened, windows, batch, frames, threads)]
+            drained = [time_windows(opened, windows, batch, frames, n) for n in threads]
     if data:
         from data_pipelines.registry import get_spec
         from experiments.pipeline import name_datasets
 
         sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
         with step(f"draw frames of {len(sources)} RLDS directories"):
-            drained.append(time_shards(sources, windows * frames // 10, 4 * batch, size, threads))
+            drained += [time_shards(sources, windows * frames // 10, 4 * batch, size, n) for n in threads]
     settings = {"frames": frames, "threads": threads, "datasets": len(opened.names), "size": size}
     stages, notes = [d.stage for d in drained], tuple(d.describe() for d in drained)
     name = "store" if store is None else store.name

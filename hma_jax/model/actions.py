@@ -15,7 +15,8 @@ from flax import nnx
 from hma_jax.config import ModelConfig
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.model.initial import hidden_init, input_fan_out
-from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear, normalise
+from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear
+from hma_jax.model.ops import normalise
 from hma_jax.params import bias, ones, param, uniform
 
 

@@ -13,9 +13,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.model.attention import attention_scale, masked_softmax
+from hma_jax.model.attend import masked_softmax
+from hma_jax.model.attention import attention_scale
 from hma_jax.model.initial import trunk_init
-from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, normalise, per_example
+from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, per_example
+from hma_jax.model.ops import kept, normalise, over_tokens
 from hma_jax.params import bias, ones, param, used
 
 
@@ -52,7 +54,7 @@ class Modulation(nnx.Module):
     ) -> tuple[jax.Array, None]:
         del visible, past
         both = self.shift_scale(jax.nn.silu(self.hidden(action.feature_BTD, embodiment_B)), embodiment_B)
-        shift, scale = jnp.split(both[:, :, None], 2, axis=-1)
+        shift, scale = (over_tokens(part, x_BTPD.shape[2]) for part in jnp.split(both, 2, axis=-1))
         y = self.out(normalise(x_BTPD, FINE_EPS) * (1 + scale) + shift, embodiment_B)
         return _where_shown(action, y), None
 
@@ -64,7 +66,7 @@ class Addition(nnx.Module):
         self, x_BTPD: jax.Array, action: ActionFeature, embodiment_B: jax.Array, visible: jax.Array, past: None
     ) -> tuple[jax.Array, None]:
         del embodiment_B, visible, past
-        return _where_shown(action, jnp.broadcast_to(action.feature_BTD[:, :, None], x_BTPD.shape)), None
+        return _where_shown(action, over_tokens(action.feature_BTD, x_BTPD.shape[2])), None
 
 
 class CrossAttention(nnx.Module):
@@ -99,7 +101,7 @@ class CrossAttention(nnx.Module):
         """`visible` [T, T_past + T] as for temporal attention; `past` are keys, values and shown."""
         a = action.feature_BTD
         shown = jnp.ones(a.shape[:2], bool) if action.shown_BT is None else action.shown_BT
-        q = self._heads(per_example(x_BTPD, self.q, embodiment_B), embodiment_B) * self.scale
+        q = self._heads(kept(per_example(x_BTPD, self.q, embodiment_B)), embodiment_B) * self.scale
         k = self._heads(per_example(a, self.k, embodiment_B), embodiment_B)
         v = per_example(a, self.v, embodiment_B).reshape(k.shape)
         new = (k, v, shown)

@@ -15,7 +15,8 @@ from hma_jax.config import ModelConfig
 from hma_jax.diffusion import timestep_embedding
 from hma_jax.embodiments import EmbodimentTable
 from hma_jax.model.initial import readout_init
-from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear, normalise
+from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear
+from hma_jax.model.ops import normalise
 from hma_jax.params import bias, normal, param, stack, used, xavier_uniform, zeros
 
 TIME_FEATURES = 256

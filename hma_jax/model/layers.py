@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from hma_jax.model.ops import contract, normalise
 from hma_jax.params import Initializer, Role, bias, ones, param
 
 BLOCK_EPS = 1e-5
 FINE_EPS = 1e-6  # modulation, diffusion heads and the norms around the continuous trunk
-
-
-@partial(jax.checkpoint, prevent_cse=False, static_argnums=(1,))
-def normalise(x: jax.Array, eps: float) -> jax.Array:
-    """x with zero mean and unit variance over its last axis; statistics in float32."""
-    x32 = x.astype(jnp.float32)
-    mean = jnp.mean(x32, axis=-1, keepdims=True)
-    centred = x32 - mean
-    variance = jnp.mean(jnp.square(centred), axis=-1, keepdims=True)
-    return (centred * jax.lax.rsqrt(variance + eps)).astype(x.dtype)
-
-
-@partial(jax.checkpoint, prevent_cse=False)
-def gelu(x: jax.Array) -> jax.Array:
-    """The exact one, x times the normal distribution function of x; only x is kept for the backward pass."""
-    return jax.nn.gelu(x, approximate=False)
 
 
 class LayerNorm(nnx.Module):
@@ -91,30 +73,3 @@ def per_example(x: jax.Array, kernel: nnx.Param, embodiment_B: jax.Array) -> jax
     rows = x.reshape(x.shape[0], -1, x.shape[-1])
     y = jax.vmap(contract)(rows, own)
     return y.reshape(*x.shape[:-1], y.shape[-1])
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(2,))
-def contract(x: jax.Array, w: jax.Array, axes: int = 1) -> jax.Array:
-    """x [..., in] times w [in, ...]; with `axes` 2 both have two axes for `in`.
-
-    The gradient is the usual one, written out because XLA on CPU transposes one of the two
-    activations for that of w: here the narrower one, where jax's own gradient leaves no choice.
-    """
-    return jnp.tensordot(x, w, axes)
-
-
-def _contract_forward(x: jax.Array, w: jax.Array, axes: int) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return contract(x, w, axes), (x, w)
-
-
-def _contract_backward(axes: int, kept: tuple[jax.Array, jax.Array], g: jax.Array) -> tuple[jax.Array, jax.Array]:
-    x, w = kept
-    rows, outs = tuple(range(x.ndim - axes)), w.ndim - axes
-    to_x = jnp.tensordot(g, w, (tuple(range(g.ndim - outs, g.ndim)), tuple(range(axes, w.ndim))))
-    if math.prod(w.shape[:axes]) <= math.prod(w.shape[axes:]):
-        return to_x, jnp.tensordot(x, g, (rows, rows))
-    turned = jnp.tensordot(g, x, (rows, rows))
-    return to_x, jnp.moveaxis(turned, tuple(range(outs)), tuple(range(axes, w.ndim)))
-
-
-contract.defvjp(_contract_forward, _contract_backward)

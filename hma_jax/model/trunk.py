@@ -11,7 +11,8 @@ from hma_jax.config import ModelConfig
 from hma_jax.model.attention import Attention
 from hma_jax.model.conditioning import ActionFeature, make_conditioning
 from hma_jax.model.initial import trunk_init
-from hma_jax.model.layers import LayerNorm, Linear, gelu
+from hma_jax.model.layers import LayerNorm, Linear
+from hma_jax.model.ops import KEPT, gelu, kept
 from hma_jax.params import stack
 from hma_jax.sharding import constrain
 
@@ -54,13 +55,13 @@ class Block(nnx.Module):
         past_time, past_actions = past or (None, None)
         new_actions = None
         x = x_BTPD
-        x = x + self.space.over_space(self.norm_space(x) if self.norm_space else x)
+        x = kept(x + self.space.over_space(self.norm_space(x) if self.norm_space else x))
         if action is not None and self.conditioning is not None:
             y, new_actions = self.conditioning(x, action, embodiment_B, visible, past_actions)
-            x = x + y
+            x = kept(x + y)
         y, new_time = self.time.over_time(x, visible, past_time)
-        x = x + y
-        h = self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x)
+        x = kept(x + y)
+        h = kept(self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x))
         x = x + self.mlp_out(gelu(h))
         return x, TemporalCache(new_time, new_actions)
 
@@ -94,7 +95,7 @@ class Trunk(nnx.Module):
             new = jax.tree.map(lambda y: y[:, :keep], new) if keep else None
             return constrain(x, ("B", None, None, "D_act")), new
 
-        if self.remat:
-            body = jax.checkpoint(body, prevent_cse=False)
+        keep_marked = jax.checkpoint_policies.save_only_these_names(KEPT)
+        body = jax.checkpoint(body, prevent_cse=False, policy=None if self.remat else keep_marked)
         x, new = jax.lax.scan(body, x_BTPD, (layers, past))
         return x, new

@@ -45,8 +45,8 @@ def test_rollouts_are_timed_beside_recomputation_and_agree_with_it(subject):
 
 @pytest.mark.slow
 def test_training_is_timed_beside_a_forward_pass(subject):
-    forward, step = time_training(subject, 2, repeats=1)
-    assert step.flops == 3 * forward.flops
+    stages = {s.name: s.flops for s in time_training(subject, 2, repeats=1)}
+    assert stages == {"forward": stages["plain"], "plain": stages["plain"], "step": 3 * stages["plain"]}
 
 
 @pytest.mark.slow
@@ -150,7 +150,8 @@ def test_loading_is_timed_with_its_memory(tmp_path: Path):
     (file,) = tmp_path.glob("load-*.json")
     assert {f.suffix for f in tmp_path.glob("load-store-memory.*")} == {".csv", ".png"}
     record = read_record(file)
-    windows, frames = record.stages
-    assert (windows.frames, windows.timing.repeats) == (32 * 4, 20)
-    assert frames.name == "RLDS frames" and frames.frames == 128
+    names = ["windows, 1 thread", "windows, 2 threads", "RLDS frames, 1 thread", "RLDS frames, 2 threads"]
+    assert [s.name for s in record.stages] == names
+    windows, _, frames, _ = record.stages
+    assert (windows.frames, windows.timing.repeats, frames.frames) == (32 * 4, 20, 128)
     assert all("kB per thousand" in note for note in record.notes)

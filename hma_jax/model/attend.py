@@ -1,0 +1,99 @@
+"""Attention as functions of queries, keys and values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.model.ops import kept, total
+from hma_jax.sharding import is_split
+
+
+def masked_softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.Array:
+    """Softmax over the last axis in float32, over what is `visible` (which broadcasts)."""
+    if visible is not None:
+        logits = jnp.where(visible, logits, jnp.finfo(logits.dtype).min)
+    return jax.nn.softmax(logits.astype(jnp.float32), axis=-1).astype(logits.dtype)
+
+
+def attend_all_within(qkv: jax.Array, scale: float) -> jax.Array:
+    """Attention among the tokens of each frame, [B, T, P, 3, H, I] -> [B, T, P, H, I]; all weights at once."""
+    q, k, v = (part.squeeze(3) for part in jnp.split(qkv, 3, axis=3))
+    weights = masked_softmax(scale * jnp.einsum("btphi,btshi->bthps", q, k))
+    return kept(jnp.einsum("bthps,btshi->btphi", weights, v))
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(1,))
+def attend_within(qkv: jax.Array, scale: float) -> jax.Array:
+    """The same; the weights are computed again in the backward pass, from the logarithm of their sum.
+
+    On CPU one frame and head at a time, whose weights fit the cache, which all frames' together
+    do not; on an accelerator, or where a mesh splits the batch or the heads, all at once.
+    """
+    return _every_head(partial(_head, scale), (2,), qkv)[0]
+
+
+def _attend_within_forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    y, log_sum = map(kept, _every_head(partial(_head, scale), (2,), qkv))
+    return y, (qkv, y, log_sum)
+
+
+def _attend_within_backward(scale: float, saved: tuple[jax.Array, ...], g: jax.Array) -> tuple[jax.Array]:
+    qkv, y, log_sum = saved
+    shared = total(g.astype(jnp.float32) * y.astype(jnp.float32), -1)
+    return (_every_head(partial(_head_backward, scale), (2, 1, 1, 1), qkv, log_sum, shared, g),)
+
+
+attend_within.defvjp(_attend_within_forward, _attend_within_backward)
+
+
+def _head(scale: float, qkv: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """[P, 3, I] -> what is attended to [P, I], and log sum exp of the logits [P, 1]."""
+    logits, v = _logits(scale, qkv), qkv[:, 2]
+    highest = jnp.max(logits, -1, keepdims=True)
+    weights = jnp.exp(logits - highest)
+    summed = jnp.sum(weights, -1, keepdims=True)
+    return ((weights.astype(v.dtype) @ v) / summed).astype(v.dtype), highest + jnp.log(summed)
+
+
+def _head_backward(
+    scale: float, qkv: jax.Array, log_sum: jax.Array, shared: jax.Array, g: jax.Array
+) -> jax.Array:
+    """The gradient [P, 3, I]. `shared` [P, 1] is g.y, the mean over what is seen of the weights' gradient."""
+    q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
+    weights = jnp.exp(_logits(scale, qkv) - log_sum)
+    to_logits = (scale * weights * ((g @ v.T).astype(jnp.float32) - shared)).astype(q.dtype)
+    return jnp.stack([to_logits @ k, to_logits.T @ q, weights.astype(g.dtype).T @ g], axis=1)
+
+
+def _logits(scale: float, qkv: jax.Array) -> jax.Array:
+    return scale * (qkv[:, 0] @ qkv[:, 1].T).astype(jnp.float32)
+
+
+def _every_head(head: Callable, axes: tuple[int, ...], *args: jax.Array):
+    """`head` over arrays [B, T, P, ...] whose axis of heads in a frame is in `axes`.
+
+    It sees and gives what is left of a frame without that axis.
+    """
+
+    def frame(*args: jax.Array):
+        """Separate products of matrices run side by side on CPU; a batched one does not."""
+        heads = [
+            head(*(jax.lax.index_in_dim(x, h, axis, keepdims=False) for x, axis in zip(args, axes, strict=True)))
+            for h in range(args[0].shape[axes[0]])
+        ]
+        return jax.tree.map(lambda *y: jnp.stack(y, axis=y[0].ndim - 1), *heads)
+
+    def one_by_one(*args: jax.Array):
+        shape = args[0].shape[:2]
+        rows = tuple(x.reshape(-1, *x.shape[2:]) for x in args)
+        out = jax.lax.map(lambda row: frame(*row), rows)
+        return jax.tree.map(lambda y: y.reshape(*shape, *y.shape[1:]), out)
+
+    all_at_once = jax.vmap(jax.vmap(lambda *args: jax.vmap(head, in_axes=axes, out_axes=-2)(*args)))
+    if is_split():
+        return all_at_once(*args)
+    return jax.lax.platform_dependent(*args, cpu=one_by_one, default=all_at_once)
