@@ -17,7 +17,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.loading.mixture import make_mixture
-from data_pipelines.loading.order import ENDLESS, endless_shuffle, random_below, stream_seed
+from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
 from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
@@ -52,7 +52,6 @@ def make_frame_loader(
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     require(split in ("train", "val"), f"split must be 'train' or 'val', got {split!r}")
     require(len(datasets) >= 1, "no dataset was given to take frames from")
-    group = math.gcd(batch, FRAMES_PER_READ)
     streams, counts = {}, {}
     for spec, directory in datasets:
         source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
@@ -62,42 +61,57 @@ def make_frame_loader(
         counts[spec.name] = len(episodes)
         if not len(episodes):
             continue
-        seed_here = stream_seed(seed, "frames", split, spec.name)
-        streams[spec.name] = _FrameGroups(source, spec.image_key, episodes, image_size, group, seed_here)
+        order = stream_seed(seed, "frames", split, spec.name)
+        streams[spec.name] = _Stream(source, spec.image_key, episodes, order)
     mixture = make_mixture(counts, tau, dict.fromkeys(counts, f"it has no {split} episode"))
-    mixed = grain.MapDataset.mix(
-        [grain.MapDataset.source(streams[n]) for n in mixture.names], mixture.weights
-    )
-    groups = mixed.batch(batch // group).map(lambda x: x.reshape(-1, *x.shape[2:]))
-    iterator = iter(groups.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=8)))
+    group = math.gcd(batch, FRAMES_PER_READ)
+    # What is mixed are numbers: a batch of them is cheap, and then read as a whole.
+    ranges = [grain.MapDataset.range(d * ENDLESS, (d + 1) * ENDLESS) for d in range(len(mixture.names))]
+    groups = grain.MapDataset.mix(ranges, mixture.weights).batch(batch // group)
+    batches = groups.map(_Reader(tuple(streams[n] for n in mixture.names), group, image_size))
+    iterator = iter(batches.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=8)))
     iterator.set_state({"next_index": start_step})
     return iterator
 
 
 @dataclass(frozen=True)
-class _FrameGroups:
-    """Endless source: element i is `count` random frames of one episode, uint8 [count, H, W, 3]."""
+class _Stream:
+    """Endless shuffled episodes of one dataset."""
 
     source: RldsDataset
     image_key: str
-    episodes: np.ndarray
-    size: int
-    count: int
+    episodes: np.ndarray  # int64, those of the split
     seed: int
 
-    def __len__(self) -> int:
-        return ENDLESS
-
-    def __getitem__(self, i: int) -> np.ndarray:
+    def read(self, i: int, draws: np.ndarray, size: int) -> list[np.ndarray]:
+        """A frame per number of `draws` (uint64) out of the i-th episode ever drawn, at least [size, size, 3]."""
         at = endless_shuffle(i, len(self.episodes), self.seed)
-        draws = [i * self.count + k for k in range(self.count)]
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
             try:
-                images = self.source.frames(
-                    episode, self.image_key, lambda n: [random_below(n, d, self.seed) for d in draws], self.size
-                )
-                return np.stack([fit_image(image, self.size) for image in images])
+                return self.source.frames(episode, self.image_key, lambda n: (draws % n).tolist(), size)
             except EpisodeError as error:
                 self.source.skip(error)
         raise DataError(f"{self.source.name}: none of its {len(self.episodes)} episodes can be read")
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Numbers of groups to frames. Group d * ENDLESS + i is the i-th of stream d: `count` frames of an episode."""
+
+    streams: tuple[_Stream, ...]
+    count: int
+    size: int
+
+    def __call__(self, numbers: np.ndarray) -> np.ndarray:
+        """uint8 [groups * count, H, W, 3] from int64 [groups]."""
+        streams, positions = np.divmod(numbers, ENDLESS)
+        seeds = np.asarray([self.streams[d].seed for d in streams], np.uint64)
+        draws = hash64(positions[:, None] * self.count + np.arange(self.count), seeds[:, None])
+        frames = np.empty((draws.size, self.size, self.size, 3), np.uint8)
+        row = 0
+        for d, i, drawn in zip(streams.tolist(), positions.tolist(), draws, strict=True):
+            for image in self.streams[d].read(i, drawn, self.size):
+                frames[row] = fit_image(image, self.size)
+                row += 1
+        return frames

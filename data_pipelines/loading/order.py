@@ -26,8 +26,11 @@ def stream_seed(*parts: str | int) -> int:
     return int.from_bytes(digest[:8], "little") >> 1
 
 
-def hash64(values: np.ndarray, seed: int) -> np.ndarray:
-    """uint64 per integer: a bijective mix (splitmix64), the same on every machine."""
+def hash64(values: np.ndarray, seed: int | np.ndarray) -> np.ndarray:
+    """uint64 per integer: a bijective mix (splitmix64), the same on every machine.
+
+    Seeds may be an array of uint64 that broadcasts against `values`.
+    """
     with np.errstate(over="ignore"):  # wrapping multiplication is the point
         x = np.asarray(values).astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed)
         x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

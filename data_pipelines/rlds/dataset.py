@@ -167,9 +167,10 @@ class RldsDataset:
         JPEG images may come smaller, see `decode_image`. A record is read and verified as a whole
         once; where its frames lie is remembered, and after that they alone are read.
         """
-        self.check_keys(image_key, ())
+        known = self._known.get((i, step_key(image_key)))
+        if known is None:
+            self.check_keys(image_key, ())
         image_key = step_key(image_key)
-        known = self._known.get((i, image_key))
         if known is not None:
             chosen = choose(len(known))
             path, offset, _ = self._place(i)
