@@ -22,6 +22,7 @@ from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
+from data_pipelines.rlds.location import OpenFiles
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4
@@ -52,9 +53,9 @@ def make_frame_loader(
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     require(split in ("train", "val"), f"split must be 'train' or 'val', got {split!r}")
     require(len(datasets) >= 1, "no dataset was given to take frames from")
-    streams, counts = {}, {}
+    streams, counts, files = {}, {}, OpenFiles()
     for spec, directory in datasets:
-        source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
+        source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
         mask = held_out(spec.name, len(source), val_fraction, min_val, max_val)
         episodes = np.flatnonzero(mask if split == "val" else ~mask)

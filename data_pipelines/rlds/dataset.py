@@ -20,7 +20,7 @@ import numpy as np
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
 from data_pipelines.rlds.example import Feature, parse_example
 from data_pipelines.rlds.images import decode_image
-from data_pipelines.rlds.location import REMOTE_READS, is_remote
+from data_pipelines.rlds.location import REMOTE_READS, OpenFiles, is_remote
 from data_pipelines.rlds.schema import closest, field_slice, listing, read_metadata, resolve_version, step_key
 from data_pipelines.rlds.tfrecord import ShardIndex, open_record, read_parts, scan_shard
 from hma_jax.config import ConfigError, require
@@ -84,6 +84,8 @@ class RldsDataset:
     what a damaged shard still holds is indexed, `skip` accepts unusable episodes, and all
     losses are listed in `skipped`; more than `max_skipped` of them raise DataError.
 
+    Many datasets may share `files`, so that their number does not multiply the files kept open.
+
     Raises DataError for a directory that is no dataset, missing or damaged shards and a
     record count that contradicts dataset_info.json; ConfigError for an unknown split.
     """
@@ -95,6 +97,7 @@ class RldsDataset:
         *,
         corrupt: Literal["raise", "skip"] = "raise",
         max_skipped: int = MAX_SKIPPED,
+        files: OpenFiles | None = None,
     ):
         require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
         self.directory = resolve_version(directory)
@@ -102,6 +105,7 @@ class RldsDataset:
         self.corrupt = corrupt
         self.max_skipped = max_skipped
         self.skipped: dict[str, int] = {}  # reason -> episodes lost
+        self._files = OpenFiles() if files is None else files
         self._known: dict[tuple[int, str], np.ndarray] = {}  # (episode, image) -> where its frames lie, [N, 2]
         meta = read_metadata(self.directory, split)
         self.name, self.version = meta.name, meta.version
@@ -165,24 +169,24 @@ class RldsDataset:
         """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers.
 
         JPEG images may come smaller, see `decode_image`. A record is read and verified as a whole
-        once; where its frames lie is remembered, and after that they alone are read.
+        once; where its frames lie is remembered, and after that they alone are read, from a file
+        that stays open (see `OpenFiles`).
         """
-        known = self._known.get((i, step_key(image_key)))
-        if known is None:
-            self.check_keys(image_key, ())
-        image_key = step_key(image_key)
+        key = step_key(image_key)
+        known = self._known.get((i, key))
         if known is not None:
             chosen = choose(len(known))
             path, offset, _ = self._place(i)
-            parts = read_parts(path, offset, known[chosen].tolist())
-            return [self._image(i, image_key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
-        with self._open(i, [image_key]) as record:
-            encoded = self._frames_of(i, record, image_key)
-            chosen = choose(len(encoded))
-            parts = [self._encoded(i, image_key, t, encoded) for t in chosen]
-            if len(self._known) < REMEMBERED and not is_remote(self.directory):
-                self._known[i, image_key] = np.asarray(encoded.spans)
-        return [self._image(i, image_key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
+            parts = read_parts(self._files.get(path), path, offset, known[chosen].tolist())
+        else:
+            self.check_keys(image_key, ())
+            with self._open(i, [key]) as record:
+                encoded = self._frames_of(i, record, key)
+                chosen = choose(len(encoded))
+                parts = [self._encoded(i, key, t, encoded) for t in chosen]
+                if len(self._known) < REMEMBERED and not is_remote(self.directory):
+                    self._known[i, key] = np.asarray(encoded.spans)
+        return [self._image(i, key, t, data, at_least) for t, data in zip(chosen, parts, strict=True)]
 
     def record(self, i: int, keys: Sequence[str] | None = None) -> dict[str, Feature]:
         """The flat features of episode `i`, as `example.parse_example` gives them."""

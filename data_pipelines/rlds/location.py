@@ -7,7 +7,9 @@ Owns the difference between the two, which nothing else sees: a location has the
 
 from __future__ import annotations
 
+import functools
 import os
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 
 REMOTE_READS = 16
 """Requests to a remote store at a time where many places are looked up."""
+
+OPEN_FILES = 128
+"""Files that `OpenFiles` holds by default: half of what the strictest system allows a process."""
 
 
 class Ranges(Protocol):
@@ -74,24 +79,37 @@ def absolute(text: str) -> str:
 @contextmanager
 def open_ranges(location: Location) -> Iterator[Ranges]:
     """The shard at `location`. Raises DataError if it is missing or cannot be opened."""
-    missing = f"{location}: the shard is missing. Fetch it again, or check the path."
     if is_remote(location):
         try:
             file = _RemoteFile(location)
         except FileNotFoundError:
-            raise DataError(missing) from None
+            raise _missing(location) from None
         yield file
         return
-    try:
-        fd = os.open(location, os.O_RDONLY)
-    except FileNotFoundError:
-        raise DataError(missing) from None
-    except OSError as error:
-        raise DataError(f"{location}: cannot be opened: {error.strerror}.") from error
+    fd = _descriptor(location)
     try:
         yield DiskFile(fd)
     finally:
         os.close(fd)
+
+
+class OpenFiles:
+    """Files of a disk that stay open between reads: the `limit` read last.
+
+    To open one costs as much as to read a frame, on a network drive far more. A file that gives
+    way to another is closed when the last thread has read from it. Pickles as an empty one.
+    """
+
+    def __init__(self, limit: int = OPEN_FILES):
+        self._limit = limit
+        self._open = functools.lru_cache(limit)(_held)
+
+    def __reduce__(self):
+        return type(self), (self._limit,)
+
+    def get(self, path: Path) -> DiskFile:
+        """The file at `path` as it was when it was opened. Raises DataError as `open_ranges` does."""
+        return self._open(path)
 
 
 class DiskFile:
@@ -99,10 +117,34 @@ class DiskFile:
 
     def __init__(self, fd: int):
         self._fd = fd
-        self.size = os.fstat(fd).st_size
+
+    @property
+    def size(self) -> int:
+        return os.fstat(self._fd).st_size
 
     def read(self, offset: int, length: int) -> bytes:
         return os.pread(self._fd, length, offset)
+
+
+def _held(path: Path) -> DiskFile:
+    """An open file that is closed when nobody refers to it any more."""
+    fd = _descriptor(path)
+    file = DiskFile(fd)
+    weakref.finalize(file, os.close, fd).atexit = False  # threads may still read while a process ends
+    return file
+
+
+def _descriptor(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        raise _missing(path) from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be opened: {error.strerror}.") from error
+
+
+def _missing(location: Location) -> DataError:
+    return DataError(f"{location}: the shard is missing. Fetch it again, or check the path.")
 
 
 class _RemoteFile:

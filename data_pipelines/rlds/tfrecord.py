@@ -6,8 +6,8 @@ A record is: length (uint64), checksum of the length (uint32), payload, checksum
 payload (uint32), all little-endian. As lengths are known from the headers, a scan that skips
 payloads gives the place of every record, and any record is then one read away. Records of
 hundreds of megabytes are never held: their checksum is taken in pieces, and their bytes are
-read where they are looked at. Nothing here keeps a file open beyond a call or a `with`, so
-readers pickle and are safe in threads.
+read where they are looked at. Nothing here keeps a file open beyond a call or a `with`; who
+reads small parts again and again gives a file that is open (see `location.OpenFiles`).
 """
 
 from __future__ import annotations
@@ -140,14 +140,12 @@ def read_record(path: str | Location, offset: int, length: int, verify: bool = T
     return payload
 
 
-def read_parts(path: str | Location, offset: int, spans: Iterable[tuple[int, int]]) -> list[bytes]:
-    """Bytes [start, end) of the payload of a record that was verified before.
+def read_parts(file: Ranges, path: Location, offset: int, spans: Iterable[tuple[int, int]]) -> list[bytes]:
+    """Bytes [start, end) of the payload of a record that was verified before, of an open file.
 
-    Raises CorruptRecordError if the file has become shorter.
+    Raises CorruptRecordError, which names `path`, if the file has become shorter.
     """
-    path = locate(path)
-    with open_ranges(path) as file:
-        return [_read(file, path, offset, offset + HEADER + start, end - start) for start, end in spans]
+    return [_read(file, path, offset, offset + HEADER + start, end - start) for start, end in spans]
 
 
 @contextmanager
