@@ -28,6 +28,9 @@ from hma_jax.config import require
 FRAMES_PER_READ = 4
 """Frames taken from one episode at a time: reading the record costs more than decoding a frame."""
 
+AHEAD = 8
+"""Batches that are read ahead of their use; each thread has one under way, however many there are."""
+
 
 def make_frame_loader(
     datasets: Sequence[tuple[DatasetSpec, str | Path]],
@@ -70,7 +73,8 @@ def make_frame_loader(
     ranges = [grain.MapDataset.range(d * ENDLESS, (d + 1) * ENDLESS) for d in range(len(mixture.names))]
     groups = grain.MapDataset.mix(ranges, mixture.weights).batch(batch // group)
     batches = groups.map(_Reader(tuple(streams[n] for n in mixture.names), group, image_size))
-    iterator = iter(batches.to_iter_dataset(grain.ReadOptions(num_threads=threads, prefetch_buffer_size=8)))
+    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, AHEAD))
+    iterator = iter(batches.to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
     return iterator
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -61,6 +62,19 @@ class FakeLatents(FakeTokenizer):
 def make_spec(name: str = "toy", dims: tuple[int, ...] = (3,), hz: float = 4) -> DatasetSpec:
     keys = ("action",) if len(dims) == 1 else tuple(f"action/part_{i}" for i in range(len(dims)))
     return DatasetSpec(name, "observation/image", keys, dims, hz)
+
+
+def count_open(directory: Path) -> int:
+    """Descriptors of this process, in all its threads, that are files below `directory`."""
+    places = {(s.st_dev, s.st_ino) for s in (p.stat() for p in directory.rglob("*") if p.is_file())}
+    found = 0
+    for fd in os.listdir("/dev/fd"):
+        try:
+            status = os.fstat(int(fd))
+        except OSError:  # closed meanwhile, as that of the listing is
+            continue
+        found += (status.st_dev, status.st_ino) in places
+    return found
 
 
 def png(image: np.ndarray) -> bytes:

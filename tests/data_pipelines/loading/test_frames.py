@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import hashlib
 import itertools
 
 import numpy as np
@@ -9,8 +10,9 @@ from data_pipelines.errors import EpisodeError
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import get_spec
+from data_pipelines.rlds.location import OpenFiles
 from hma_jax.config import ConfigError
-from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
+from tests.data_pipelines.fakes import REAL_DATA, count_open, make_spec, write_rlds
 
 SPEC = make_spec()
 
@@ -48,6 +50,34 @@ def test_resuming_continues_exactly(rlds):
     for start in (1, 4):
         rest = take([(SPEC, rlds)], 2, start_step=start, threads=0)
         assert np.array_equal(rest, straight[start : start + 2])
+
+
+def test_number_of_threads_changes_no_frame(tmp_path, rlds):
+    other = make_spec("other")
+    datasets = [(SPEC, rlds), (other, write_rlds(tmp_path, other, [9] * 6))]
+    alone = take(datasets, 12, threads=0)
+    for threads in (1, 3, 9):
+        assert np.array_equal(take(datasets, 12, threads=threads), alone)
+
+
+def test_order_does_not_change_between_releases(tmp_path, rlds):
+    """Changing it changes the tokenizer of every study, and resumed training would not continue."""
+    other = make_spec("other")
+    datasets = [(SPEC, rlds), (other, write_rlds(tmp_path, other, [200] * 5))]
+    frames = np.concatenate(take(datasets, 50, start_step=1000))[:, 0, 0, :2]
+    assert frames[:8].tolist() == [[8, 10], [8, 0], [8, 10], [8, 2], [14, 6], [14, 12], [14, 6], [14, 6]]
+    assert hashlib.sha256(frames.tobytes()).hexdigest()[:16] == "e915d0d64aeafbaf"
+
+
+def test_files_kept_open_are_bounded_over_all_datasets(tmp_path, monkeypatch):
+    specs = [make_spec(name) for name in ("a", "b", "c")]
+    datasets = [(spec, write_rlds(tmp_path, spec, [5] * 8, shards=4)) for spec in specs]
+    monkeypatch.setattr("data_pipelines.loading.frames.OpenFiles", lambda: OpenFiles(2))
+    loader = make_frame_loader(datasets, image_size=8, batch=8, seed=1, threads=0)
+    after = list(itertools.islice(loader, 60))
+    assert count_open(tmp_path) == 2
+    monkeypatch.undo()
+    assert np.array_equal(after, take(datasets, 60, threads=0))
 
 
 def test_small_datasets_are_not_drowned(tmp_path, rlds):

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -215,6 +217,26 @@ def test_frames_of_a_verified_episode_are_read_alone(tmp_path, monkeypatch):
     np.testing.assert_array_equal(again, [first[4], first[0]])
     with pytest.raises(TypeError):  # the other has to be opened
         dataset.frames(0, SPEC.image_key, lambda n: [0])
+
+
+def test_shard_that_became_shorter_is_noticed_by_a_frame_read_alone(tmp_path):
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6, 5]))
+    for _ in range(2):  # as a whole, then alone from a file that stays open
+        dataset.frames(1, SPEC.image_key, lambda n: [n - 1])
+    shard = shards(dataset.directory)[0]
+    os.truncate(shard, shard.stat().st_size // 2)
+    with pytest.raises(CorruptRecordError, match=f"{shard.name}.*shorter since it was indexed"):
+        dataset.frames(1, SPEC.image_key, lambda n: [n - 1])
+
+
+def test_dataset_made_anew_does_not_read_the_old_one(tmp_path):
+    """Files that stay open are those of one object: the next sees what lies there now."""
+    directory, kept = tmp_path / SPEC.name, []
+    for steps in (6, 5):
+        kept.append(RldsDataset(write_rlds(tmp_path, SPEC, [steps, steps])))
+        for _ in range(2):
+            assert kept[-1].frames(1, SPEC.image_key, lambda n: [n - 1])[0][0, 0, 1] == steps - 1
+        shutil.rmtree(directory)
 
 
 def test_episode_without_frames_is_unusable(tmp_path):
