@@ -89,7 +89,7 @@ class _Stream:
     seed: int
 
     def read(self, i: int, draws: np.ndarray, size: int) -> list[np.ndarray]:
-        """A frame per number of `draws` (uint64) out of the i-th episode ever drawn, at least [size, size, 3]."""
+        """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `RldsDataset.frames`."""
         at = endless_shuffle(i, len(self.episodes), self.seed)
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
@@ -102,7 +102,7 @@ class _Stream:
 
 @dataclass(frozen=True)
 class _Reader:
-    """Numbers of groups to frames. Group d * ENDLESS + i is the i-th of stream d: `count` frames of an episode."""
+    """Numbers of groups to frames: d * ENDLESS + i is the i-th of stream d, `count` frames of an episode."""
 
     streams: tuple[_Stream, ...]
     count: int
