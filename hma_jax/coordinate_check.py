@@ -59,7 +59,6 @@ class _WatchedTrunk:
         for index in range(self.layers):
             block = nnx.merge(block_def, jax.tree.map(lambda p, i=index: p[i], layers))
             for attention, pairs in ((block.space, "btphi,btshi->bthps"), (block.time, "btphi,bsphi->bphts")):
-
                 def keep(qkv: jax.Array, scale: float = attention.scale, pairs: str = pairs) -> None:
                     logits.append(scale * jnp.einsum(pairs, qkv[..., 0, :, :], qkv[..., 1, :, :]))
 
