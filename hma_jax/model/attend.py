@@ -12,11 +12,47 @@ from hma_jax.model.ops import kept, total
 from hma_jax.sharding import is_split
 
 
+FEW = 2
+"""Frames up to here that attend to earlier ones do so one by one."""
+
+
 def masked_softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.Array:
     """Softmax over the last axis in float32, over what is `visible` (which broadcasts)."""
     if visible is not None:
         logits = jnp.where(visible, logits, jnp.finfo(logits.dtype).min)
     return jax.nn.softmax(logits.astype(jnp.float32), axis=-1).astype(logits.dtype)
+
+
+def attend_over_time(
+    q: jax.Array,
+    k: jax.Array,
+    v: jax.Array,
+    past: tuple[jax.Array, jax.Array] | None,
+    visible: jax.Array,
+    scale: float,
+) -> jax.Array:
+    """Attention of every position to itself in other frames, [B, T, P, H, I] each.
+
+    `past` holds keys and values [B, T_past, P, H, I] of earlier frames. `visible` is bool
+    [T, T_past + T].
+    """
+    if past is not None and q.shape[1] <= FEW:
+        each = (_frame_over_time(q[:, t], (past[0], k), (past[1], v), visible[t], scale) for t in range(q.shape[1]))
+        return jnp.stack(list(each), axis=1)
+    if past is not None:
+        k, v = (jnp.concatenate(both, axis=1) for both in zip(past, (k, v), strict=True))
+    weights = kept(masked_softmax(scale * jnp.einsum("btphi,bsphi->bphts", q, k), visible))
+    return kept(jnp.einsum("bphts,bsphi->btphi", weights, v))
+
+
+def _frame_over_time(
+    q: jax.Array, keys: tuple[jax.Array, ...], values: tuple[jax.Array, ...], visible: jax.Array, scale: float
+) -> jax.Array:
+    """q [B, P, H, I]: with a row per matrix, products and sums of arrays beat products of matrices."""
+    logits = jnp.concatenate([total(q[:, None] * k, -1).squeeze(-1) for k in keys], axis=1)
+    weights = masked_softmax(scale * jnp.moveaxis(logits, 1, -1), visible)
+    frames = [v[:, t] for v in values for t in range(v.shape[1])]
+    return sum(weights[..., t, None] * frame for t, frame in enumerate(frames))
 
 
 def attend_all_within(qkv: jax.Array, scale: float) -> jax.Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.model.attend import attend_all_within, attend_within, masked_softmax
+from hma_jax.model.attend import attend_all_within, attend_over_time, attend_within
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm
 from hma_jax.model.ops import contract, kept
@@ -79,15 +79,4 @@ class Attention(nnx.Module):
         bool [T, T_past + T]. Returns the output and the new frames' keys and values.
         """
         q, k, v = (part.squeeze(-3) for part in jnp.split(self.project(x_BTPD), 3, axis=-3))
-        new = (k, v)
-        if past is not None:
-            k = jnp.concatenate([past[0], k], axis=1)
-            v = jnp.concatenate([past[1], v], axis=1)
-        logits = self.scale * jnp.einsum("btphi,bsphi->bphts", q, k)
-        weights = kept(masked_softmax(logits, visible))
-        if past is None or x_BTPD.shape[1] > 2:
-            y = jnp.einsum("bphts,bsphi->btphi", weights, v)
-        else:  # XLA on CPU is several times faster at one frame's weighted sum than at two frames'
-            frames = (weights[..., t, :] for t in range(x_BTPD.shape[1]))
-            y = jnp.stack([jnp.einsum("bphs,bsphi->bphi", w, v) for w in frames], axis=1)
-        return self.project_out(kept(y)), new
+        return self.project_out(attend_over_time(q, k, v, past, visible, self.scale)), (k, v)
