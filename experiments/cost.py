@@ -66,7 +66,7 @@ def estimate(trial: Trial) -> Cost:
 
     table = declared_table(trial.datasets)
     forward = forward_flops_per_window(trial.model, table)
-    rollouts = (1 + trial.eval.random_actions) * trial.eval.unmask_steps
+    rollouts = (1 + trial.eval.random_actions) * trial.eval.decode.unmask_steps
     windows = len(trial.evaluated) * trial.eval.windows_per_dataset
     return Cost(
         parameters=declare_model(trial.model, table).count(),

@@ -8,6 +8,7 @@ from data_pipelines.registry.mixtures import FORTY
 from experiments.study import StoreConfig, Study, SuiteConfig, TransferConfig
 from hma_jax.config import (
     ConfigError,
+    DecodeConfig,
     DiffusionConfig,
     EvalConfig,
     MaskingConfig,
@@ -111,7 +112,7 @@ SMOKE_CONTINUOUS = replace(
     name="smoke-continuous",
     tokenizer=replace(SMOKE.tokenizer, quantise=False),
     model=replace(SMOKE.model, diffusion=DiffusionConfig(channels=8, patch=1, width=16, depth=1)),
-    eval=replace(SMOKE.eval, sampler=SamplerConfig(steps=3, temperature=0.0)),
+    eval=replace(SMOKE.eval, decode=DecodeConfig(sampler=SamplerConfig(steps=3, temperature=0.0))),
 )
 
 CPU_CONTINUOUS = replace(
@@ -119,7 +120,7 @@ CPU_CONTINUOUS = replace(
     name="cpu-continuous",  # the same study on latents instead of ids
     tokenizer=replace(CPU.tokenizer, quantise=False, bits=16),
     model=replace(CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=128, depth=2)),
-    eval=replace(CPU.eval, sampler=SamplerConfig(steps=20, temperature=0.0)),
+    eval=replace(CPU.eval, decode=DecodeConfig(sampler=SamplerConfig(steps=20, temperature=0.0))),
 )
 
 PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS)}

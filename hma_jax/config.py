@@ -431,9 +431,7 @@ class EvalConfig:
     # release judges) in every case the recorded ones.
     context: Literal["generated", "recorded"] = "generated"
     prompt_frames: int = 4
-    unmask_steps: int = 2  # M
-    slide: Literal["exact", "streaming"] = "exact"  # past the model's window, see DecodeConfig
-    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig(temperature=0.0))  # continuous
+    decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
     random_actions: int = 5  # draws for delta PSNR
     batch: int = 32
     perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
@@ -443,11 +441,6 @@ class EvalConfig:
         require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
         require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
         require(self.random_actions >= 1, "eval.random_actions must be at least 1")
-
-    @property
-    def decode(self) -> DecodeConfig:
-        """How frames are filled."""
-        return DecodeConfig(self.unmask_steps, sampler=self.sampler, slide=self.slide)
 
     @property
     def first_predicted(self) -> int:

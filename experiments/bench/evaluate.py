@@ -92,5 +92,5 @@ def _every_frame(
 
 def _literal_passes(frames: int, sequences: int, config: EvalConfig) -> int:
     if config.context == "recorded":
-        return (frames - 1) * config.unmask_steps * sequences
-    return (frames - 1) + sequences * config.unmask_steps * (frames - config.prompt_frames)
+        return (frames - 1) * config.decode.unmask_steps * sequences
+    return (frames - 1) + sequences * config.decode.unmask_steps * (frames - config.prompt_frames)

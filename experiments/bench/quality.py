@@ -18,7 +18,7 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
 from experiments.bench.timing import time_by_turns
-from hma_jax.config import EvalConfig, ModelConfig, SamplerConfig, require
+from hma_jax.config import EvalConfig, ModelConfig, require
 from hma_jax.evaluation.protocol import evaluate
 
 SAMPLER_STEPS = (100, 50, 25, 12, 8, 4)
@@ -46,22 +46,20 @@ class Judged:
 
 def decodings(model: ModelConfig, config: EvalConfig, frames: int) -> dict[str, EvalConfig]:
     """Name -> settings, the reference first."""
+
+    def changed(**changes: Any) -> EvalConfig:
+        return replace(config, decode=replace(config.decode, **changes))
+
     if frames > model.frames:
-        return {slide: replace(config, slide=slide) for slide in ("exact", "streaming")}
+        return {slide: changed(slide=slide) for slide in ("exact", "streaming")}
     if model.diffusion is None:
-        return {f"M = {m}": replace(config, unmask_steps=m) for m in LOOKS if m <= model.tokens}
-    known = model.diffusion.steps
-    samplers = [
-        replace(config.sampler, kind=kind, steps=steps)
+        return {f"M = {m}": changed(unmask_steps=m) for m in LOOKS if m <= model.tokens}
+    return {
+        f"{kind} {steps}": changed(sampler=replace(config.decode.sampler, kind=kind, steps=steps))
         for kind in ("ddpm", "ddim")
         for steps in SAMPLER_STEPS
-        if steps <= known
-    ]
-    return {_name(s): replace(config, sampler=s) for s in samplers}
-
-
-def _name(sampler: SamplerConfig) -> str:
-    return f"{sampler.kind} {sampler.steps}"
+        if steps <= model.diffusion.steps
+    }
 
 
 def judge(

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, EvalConfig
+from hma_jax.config import ConfigError, DecodeConfig, EvalConfig
 from hma_jax.evaluation.protocol import Evaluation, evaluate, random_actions
 from hma_jax.model import declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch
 
 SIZE = 8
-EVAL = EvalConfig(prompt_frames=2, unmask_steps=1, random_actions=3, batch=4)
+EVAL = EvalConfig(prompt_frames=2, decode=DecodeConfig(1), random_actions=3, batch=4)
 
 
 class GreyTokenizer:
@@ -121,7 +121,8 @@ def test_windows_longer_than_the_model_s_are_continued_past_it():
     _, params = lively_params(config)
     batches = lambda frames: eval_batches(model_config(frames=frames), names=("arm",), batches_each=1)  # noqa: E731
     judge = lambda b, c: evaluate(params, config, TABLE, GreyTokenizer(), b, c)  # noqa: E731
-    exact, streamed = (judge(batches(9), replace(EVAL, slide=slide)) for slide in ("exact", "streaming"))
+    decodings = (DecodeConfig(1, slide=slide) for slide in ("exact", "streaming"))
+    exact, streamed = (judge(batches(9), replace(EVAL, decode=decode)) for decode in decodings)
     clips = [e.samples["arm"]["predicted"] for e in (exact, streamed)]
     assert clips[0].shape[1] == 9
     np.testing.assert_array_equal(clips[0][:, : config.frames], clips[1][:, : config.frames])
