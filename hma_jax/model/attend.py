@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from hma_jax.model.ops import kept, total
 from hma_jax.sharding import is_split
 
-
 FEW = 2
 """Frames up to here that attend to earlier ones do so one by one."""
 
@@ -20,7 +19,7 @@ def masked_softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.A
     """Softmax over the last axis in float32, over what is `visible` (which broadcasts)."""
     if visible is not None:
         logits = jnp.where(visible, logits, jnp.finfo(logits.dtype).min)
-    return jax.nn.softmax(logits.astype(jnp.float32), axis=-1).astype(logits.dtype)
+    return jax.nn.softmax(_float32(logits), axis=-1).astype(logits.dtype)
 
 
 def attend_over_time(
@@ -48,11 +47,18 @@ def attend_over_time(
 def _frame_over_time(
     q: jax.Array, keys: tuple[jax.Array, ...], values: tuple[jax.Array, ...], visible: jax.Array, scale: float
 ) -> jax.Array:
-    """q [B, P, H, I]: with a row per matrix, products and sums of arrays beat products of matrices."""
-    logits = jnp.concatenate([total(q[:, None] * k, -1).squeeze(-1) for k in keys], axis=1)
+    """q [B, P, H, I]: with a row per matrix, products and sums of arrays beat products of matrices.
+
+    All in float32, as the sums inside a product of matrices are.
+    """
+    logits = jnp.concatenate([total(_float32(q)[:, None] * _float32(k), -1).squeeze(-1) for k in keys], axis=1)
     weights = masked_softmax(scale * jnp.moveaxis(logits, 1, -1), visible)
-    frames = [v[:, t] for v in values for t in range(v.shape[1])]
-    return sum(weights[..., t, None] * frame for t, frame in enumerate(frames))
+    frames = [_float32(v[:, t]) for v in values for t in range(v.shape[1])]
+    return sum(weights[..., t, None] * frame for t, frame in enumerate(frames)).astype(q.dtype)
+
+
+def _float32(x: jax.Array) -> jax.Array:
+    return x.astype(jnp.float32)
 
 
 def attend_all_within(qkv: jax.Array, scale: float) -> jax.Array:
@@ -79,7 +85,7 @@ def _attend_within_forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tup
 
 def _attend_within_backward(scale: float, saved: tuple[jax.Array, ...], g: jax.Array) -> tuple[jax.Array]:
     qkv, y, log_sum = saved
-    shared = total(g.astype(jnp.float32) * y.astype(jnp.float32), -1)
+    shared = total(_float32(g) * _float32(y), -1)
     return (_every_head(partial(_head_backward, scale), (2, 1, 1, 1), qkv, log_sum, shared, g),)
 
 
@@ -101,12 +107,12 @@ def _head_backward(
     """The gradient [P, 3, I]. `shared` [P, 1] is g.y, the mean over what is seen of the weights' gradient."""
     q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
     weights = jnp.exp(_logits(scale, qkv) - log_sum)
-    to_logits = (scale * weights * ((g @ v.T).astype(jnp.float32) - shared)).astype(q.dtype)
+    to_logits = (scale * weights * (_float32(g @ v.T) - shared)).astype(q.dtype)
     return jnp.stack([to_logits @ k, to_logits.T @ q, weights.astype(g.dtype).T @ g], axis=1)
 
 
 def _logits(scale: float, qkv: jax.Array) -> jax.Array:
-    return scale * (qkv[:, 0] @ qkv[:, 1].T).astype(jnp.float32)
+    return scale * _float32(qkv[:, 0] @ qkv[:, 1].T)
 
 
 def _every_head(head: Callable, axes: tuple[int, ...], *args: jax.Array):
