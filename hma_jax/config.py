@@ -431,6 +431,7 @@ class EvalConfig:
     # release judges) in every case the recorded ones.
     context: Literal["generated", "recorded"] = "generated"
     prompt_frames: int = 4
+    # Continuous tokens: the mean of each diffusion step, not a draw.
     decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
     random_actions: int = 5  # draws for delta PSNR
     batch: int = 32

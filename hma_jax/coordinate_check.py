@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -56,13 +57,14 @@ class _WatchedTrunk:
     def __call__(self, x: jax.Array, *rest: Any) -> tuple[jax.Array, None]:
         block_def, layers = nnx.split(self.blocks)
         logits = []
+
+        def keep(scale: float, pairs: str, qkv: jax.Array) -> None:
+            logits.append(scale * jnp.einsum(pairs, qkv[..., 0, :, :], qkv[..., 1, :, :]))
+
         for index in range(self.layers):
             block = nnx.merge(block_def, jax.tree.map(lambda p, i=index: p[i], layers))
             for attention, pairs in ((block.space, "btphi,btshi->bthps"), (block.time, "btphi,bsphi->bphts")):
-                def keep(qkv: jax.Array, scale: float = attention.scale, pairs: str = pairs) -> None:
-                    logits.append(scale * jnp.einsum(pairs, qkv[..., 0, :, :], qkv[..., 1, :, :]))
-
-                _watch(attention, "project", keep)
+                _watch(attention, "project", partial(keep, attention.scale, pairs))
             x, _ = block(x, *rest[:3], None)
         self.note("attention logits", jnp.concatenate([y.ravel() for y in logits]))
         self.note("residual stream", x)
