@@ -14,7 +14,7 @@ import threading
 import time
 from pathlib import Path
 
-from hma_jax.host_memory import HUGE_PAGES, keep_freed_memory
+from hma_jax.runtime.host_memory import HUGE_PAGES, keep_freed_memory
 
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
 _PR_SET_PDEATHSIG = 1

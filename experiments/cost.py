@@ -17,7 +17,7 @@ from experiments.provenance import Provenance
 from experiments.study import Study
 from experiments.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
 from experiments.trial import Trial, trial_id
-from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
@@ -56,13 +56,13 @@ ONE_ROBOT = EmbodimentTable((Embodiment("one_robot", 2, 1, mean=(0.0, 0.0), std=
 
 
 def estimate(trial: Trial) -> Cost:
-    """The cost of one trial, by formula (`hma_jax.flops`).
+    """The cost of one trial, by formula (`hma_jax.model.flops`).
 
     Evaluation of a window: one pass for the likelihood and, with the temporal cache, about
     `unmask_steps` passes for each of the 1 + random_actions rollouts.
     """
-    from hma_jax.flops import forward_flops_per_window, train_flops_per_window
-    from hma_jax.model import declare_model
+    from hma_jax.model.flops import forward_flops_per_window, train_flops_per_window
+    from hma_jax.model.hma import declare_model
 
     table = declared_table(trial.datasets)
     forward = forward_flops_per_window(trial.model, table)

@@ -24,7 +24,7 @@ from experiments.study import StoreConfig, Study
 from experiments.trial import CHECKPOINTS
 from experiments.workspace import Workspace
 from hma_jax.config import TokenizerConfig, require
-from hma_jax.config_json import stable_hash, to_dict
+from hma_jax.config.json import stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from hma_jax.config_json import stable_hash
+from hma_jax.config.json import stable_hash
 
 
 @dataclass(frozen=True)

@@ -14,16 +14,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from hma_jax.config import (
+    AnyTokenizerConfig,
     ConfigError,
     EvalConfig,
+    Latents,
     ModelConfig,
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
     require,
 )
-from hma_jax.config_json import from_dict, to_dict
-from hma_jax.tokenizers.config import AnyTokenizerConfig, Latents
+from hma_jax.config.json import from_dict, to_dict
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,14 @@ from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
 from experiments.workspace import Workspace
 from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, Setting, TrainConfig
-from hma_jax.config_json import stable_hash, to_dict
+from hma_jax.config.json import stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.tokens.store import TokenStore
-    from hma_jax.embodiments import EmbodimentTable
     from hma_jax.evaluation.protocol import Evaluation
-    from hma_jax.params import Params
+    from hma_jax.model.embodiments import EmbodimentTable
+    from hma_jax.model.params import Params
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.loop import FitResult
 
@@ -194,8 +194,8 @@ def run_trial(
     import jax
 
     from experiments.machine import describe_machine
-    from hma_jax.flops import train_flops_per_window
-    from hma_jax.model import declare_model
+    from hma_jax.model.flops import train_flops_per_window
+    from hma_jax.model.hma import declare_model
 
     started = time.perf_counter()
     materials = open_materials(workspace)

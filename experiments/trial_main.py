@@ -29,7 +29,7 @@ def main(directory: Path) -> int:
     from experiments.trial import Trial, run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError, MeshConfig
-    from hma_jax.config_json import from_dict
+    from hma_jax.config.json import from_dict
     from hma_jax.training.loop import DivergedError, Interrupted
 
     job = json.loads((directory / JOB).read_text())

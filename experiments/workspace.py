@@ -13,7 +13,7 @@ from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
 from experiments.study import Study
 from hma_jax.config import ConfigError
-from hma_jax.config_json import from_dict, to_dict
+from hma_jax.config.json import from_dict, to_dict
 
 
 class Busy(ConfigError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from hma_jax.host_memory import keep_freed_memory
+from hma_jax.runtime.host_memory import keep_freed_memory
 
 CACHE = Path(__file__).parent.parent / ".jax_cache"
 # Environment, not jax.config: child processes of the tests must find it too.

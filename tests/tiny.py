@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import DiffusionConfig, ModelConfig, MupConfig, OptimizerConfig, TrainConfig
-from hma_jax.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model import declare_model
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
 
 TABLE = EmbodimentTable(
     (

@@ -26,7 +26,7 @@ from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
 from data_pipelines.rlds.writer import encode_jpeg
-from hma_jax.config_json import to_dict
+from hma_jax.config.json import to_dict
 
 NAME = "exoego4d"
 """As the release and the registry call it."""

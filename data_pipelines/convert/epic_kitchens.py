@@ -33,7 +33,7 @@ from data_pipelines.convert.settings import EpicKitchensSettings
 from data_pipelines.convert.video import stored_jpeg
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
-from hma_jax.config_json import to_dict
+from hma_jax.config.json import to_dict
 
 NAME = "epic_kitchen"
 HZ = float(get_spec(NAME).hz)

@@ -24,7 +24,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.tfrecord import write_shard
 from data_pipelines.rlds.writer import VERSION, build_features, shard_name, write_info
 from hma_jax.config import require
-from hma_jax.config_json import stable_hash
+from hma_jax.config.json import stable_hash
 
 CONVERTER = 1
 """Raise it when a converter writes other bytes for the same source."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hma_jax.embodiments import DEAD_STD
+from hma_jax.model.embodiments import DEAD_STD
 
 SWITCH_SHARE = 0.8
 """A value that is one of two numbers at least so often is a switch."""

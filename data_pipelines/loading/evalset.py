@@ -18,8 +18,8 @@ from data_pipelines.loading.order import hash64, stream_seed
 from data_pipelines.loading.windows import cut_actions, cut_frames, cut_tokens, require_windows, val_windows
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError, require
-from hma_jax.config_json import from_dict, stable_hash, to_dict
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.model.embodiments import EmbodimentTable
 
 
 @dataclass(frozen=True)

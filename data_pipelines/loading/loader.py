@@ -18,7 +18,7 @@ from data_pipelines.loading.order import ENDLESS, endless_shuffle, random_below,
 from data_pipelines.loading.windows import WindowSet, cut_actions, cut_tokens, require_windows, train_windows
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import require
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import EmbodimentTable
 
 
 @dataclass(frozen=True)

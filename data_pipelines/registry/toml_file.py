@@ -16,7 +16,7 @@ from pathlib import Path
 
 from data_pipelines.registry.spec import DatasetSpec
 from hma_jax.config import ConfigError
-from hma_jax.config_json import from_dict
+from hma_jax.config.json import from_dict
 
 
 def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:

@@ -26,7 +26,7 @@ from data_pipelines.tokens.part import FACTS, Made, Part, PartFacts, read_part, 
 from data_pipelines.tokens.scratch import scratch
 from data_pipelines.tokens.share import Share
 from hma_jax.config import ConfigError, require
-from hma_jax.config_json import diff, stable_hash
+from hma_jax.config.json import diff, stable_hash
 
 PART_SIZE = 256 * 2**20
 """Bytes of records in one part: what a killed process has to do again, at most."""

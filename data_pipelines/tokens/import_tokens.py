@@ -25,9 +25,8 @@ from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
 from data_pipelines.tokens.part import Made, Part
 from data_pipelines.tokens.release_folder import FACTOR_VOCAB, ReleaseFolder, open_folder
-from hma_jax.config import require
-from hma_jax.config_json import diff
-from hma_jax.tokenizers.config import SvdVaeConfig
+from hma_jax.config import SvdVaeConfig, require
+from hma_jax.config.json import diff
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.base import Tokenizer

@@ -16,8 +16,8 @@ import numpy as np
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
 from hma_jax.config import ConfigError, require
-from hma_jax.config_json import from_dict, stable_hash, to_dict
-from hma_jax.embodiments import Embodiment
+from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.model.embodiments import Embodiment
 
 FILE = "manifest.json"
 SPLITS = ("train", "val")

@@ -25,7 +25,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
 from data_pipelines.tokens.moments import Moments, merge_all
 from hma_jax.config import ConfigError
-from hma_jax.config_json import from_dict, to_dict
+from hma_jax.config.json import from_dict, to_dict
 
 FACTS = "parts"
 """Directory of the facts of all parts."""

@@ -17,8 +17,8 @@ from data_pipelines.errors import DataError
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, load_manifest, part_name
 from hma_jax.config import ConfigError
-from hma_jax.config_json import stable_hash
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.config.json import stable_hash
+from hma_jax.model.embodiments import EmbodimentTable
 
 _File = tuple[str, str, int]  # dataset, split, part
 

@@ -17,12 +17,12 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import DecodeConfig, EvalConfig, require
-from hma_jax.decoding import Frame, blank_frame, decode_frame
 from hma_jax.evaluation.metrics import factored_cross_entropy
 from hma_jax.evaluation.protocol import evaluation_inputs, make_evaluator
-from hma_jax.flops import forward_flops_per_window
 from hma_jax.generation import rollout_naive
-from hma_jax.model import HMA
+from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
+from hma_jax.model.flops import forward_flops_per_window
+from hma_jax.model.hma import HMA
 
 
 def time_evaluation(subject: Subject, rows: int, config: EvalConfig, repeats: int) -> list[Stage]:

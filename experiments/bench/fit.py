@@ -17,11 +17,11 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from hma_jax.config import ConfigError, MeshConfig, ModelConfig, TrainConfig
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.flops import train_flops_per_window
-from hma_jax.model import declare_model
-from hma_jax.params import Declared, is_spec
-from hma_jax.sharding import audit_sharding, batch_sharding, make_mesh, plan_sharding
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.flops import train_flops_per_window
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Declared, is_spec
+from hma_jax.runtime.sharding import audit_sharding, batch_sharding, make_mesh, plan_sharding
 from hma_jax.training.optimizer import init_adam
 from hma_jax.training.state import TrainState
 from hma_jax.training.step import make_train_step

@@ -20,10 +20,10 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import Compiled, compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
-from hma_jax.flops import forward_flops_per_window
 from hma_jax.generation import rollout_naive
 from hma_jax.generation.window import Window, empty_cache
-from hma_jax.model import HMA, declare_model
+from hma_jax.model.flops import forward_flops_per_window
+from hma_jax.model.hma import HMA, declare_model
 
 
 def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int) -> list[Stage]:

@@ -11,9 +11,9 @@ import numpy as np
 
 from experiments.presets import CPU, CPU_CONTINUOUS
 from hma_jax.config import DiffusionConfig, ModelConfig, require
-from hma_jax.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model import declare_model
-from hma_jax.params import Declared, Params
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Declared, Params
 
 BASE = ModelConfig(action_heads=False, remat=False)
 MODELS = {

@@ -137,7 +137,7 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
 
 def subject_of(trained: Any) -> Subject:
     """A trained run as what is timed."""
-    from hma_jax.model import declare_model
+    from hma_jax.model.hma import declare_model
 
     declared = declare_model(trained.model, trained.table)
     return Subject(trained.model, trained.table, declared, jax.device_put(trained.params), 0)

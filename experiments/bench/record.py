@@ -15,7 +15,7 @@ from experiments.atomic import write_atomically
 from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
 from experiments.machine import describe_machine
 from hma_jax.config import ConfigError
-from hma_jax.config_json import from_dict, to_dict
+from hma_jax.config.json import from_dict, to_dict
 
 FORMAT = 1
 
@@ -81,7 +81,7 @@ class BenchRecord:
 
 def make_record(kind: str, subject: str, command: str, **fields: Any) -> BenchRecord:
     """A record of this machine, now."""
-    from hma_jax.flops import peak_flops
+    from hma_jax.model.flops import peak_flops
 
     return BenchRecord(
         kind,

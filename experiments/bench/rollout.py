@@ -11,8 +11,8 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import Compiled, compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
-from hma_jax.flops import forward_flops_per_window
 from hma_jax.generation import rollout, rollout_naive
+from hma_jax.model.flops import forward_flops_per_window
 
 
 def time_rollouts(

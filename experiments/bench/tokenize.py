@@ -8,8 +8,7 @@ import numpy as np
 
 from experiments.bench.record import Stage
 from experiments.bench.timing import WARM_UP, time_by_turns, time_once
-from hma_jax.config import require
-from hma_jax.tokenizers.config import Magvit2Config, SvdVaeConfig
+from hma_jax.config import Magvit2Config, SvdVaeConfig, require
 from hma_jax.tokenizers.io import load_tokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 from hma_jax.tokenizers.shared import BaseTokenizer

@@ -12,10 +12,10 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import TrainConfig
-from hma_jax.flops import forward_flops_per_window, train_flops_per_window
-from hma_jax.masking import mask_batch
-from hma_jax.model import declare_model
-from hma_jax.params import Declared, Params
+from hma_jax.model.flops import forward_flops_per_window, train_flops_per_window
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Declared, Params
+from hma_jax.objective.masking import mask_batch
 from hma_jax.training.step import init_state, make_train_step
 
 

@@ -241,7 +241,7 @@ def _write(
 ) -> None:
     from experiments.bench.record import make_record, write_record
     from experiments.bench.timing import matmul_rate
-    from hma_jax.config_json import to_dict
+    from hma_jax.config.json import to_dict
 
     record = make_record(
         kind,

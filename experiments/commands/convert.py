@@ -85,7 +85,7 @@ def to_stablehlo(
 
 
 def _describe(run: Run) -> None:
-    from hma_jax.model import declare_model
+    from hma_jax.model.hma import declare_model
 
     variant = "continuous" if run.model.diffusion else "discrete"
     count = declare_model(run.model, run.table).count()

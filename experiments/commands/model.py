@@ -36,7 +36,7 @@ def train(setting: Setting, run: Path | None, mesh: MeshConfig) -> None:
 def adapt(setting: Setting, source: Path, run: Path | None, everything: bool, mesh: MeshConfig) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.trial import open_materials
-    from hma_jax.adapt import add_embodiments
+    from hma_jax.training.adapt import add_embodiments
     from hma_jax.training.train import load_run
 
     _prepare(setting)

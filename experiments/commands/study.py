@@ -29,7 +29,7 @@ from experiments.study import Study, on_tokenizer, on_user_data, override
 from experiments.sweep import titles, unique_trials
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.config_json import to_dict
+from hma_jax.config.json import to_dict
 
 AXES = {
     "datasets": scale_datasets.plan,

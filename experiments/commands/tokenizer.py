@@ -29,8 +29,8 @@ def import_tokenizer(
 
 
 def pixel_tokenizer(out: Path, *, image_size: int, patch: int) -> None:
+    from hma_jax.config import PixelsConfig
     from hma_jax.convert import require_free
-    from hma_jax.tokenizers.config import PixelsConfig
     from hma_jax.tokenizers.pixels import PixelTokenizer
 
     require_free(out)

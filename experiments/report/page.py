@@ -27,7 +27,7 @@ from experiments.runner import State
 from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from experiments.trial import Trial, trial_id
 from experiments.workspace import Record, Workspace
-from hma_jax.config_json import to_json
+from hma_jax.config.json import to_json
 
 SHOWN_STRIPS = 6
 """Datasets whose frames are visible at once; the others unfold."""

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
-from hma_jax.config_json import from_dict
+from hma_jax.config.json import from_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.table import check_names, flat, nested
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.model import declare_model
-from hma_jax.params import ParamSpec
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import ParamSpec
 from hma_jax.training.train import Run, describe_run
 
 FORMAT, VERSION = "hma-jax", 1

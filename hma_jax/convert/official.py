@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
-from hma_jax.config_json import stable_hash
+from hma_jax.config.json import stable_hash
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.official_config import (
     BASE_WIDTH,
@@ -31,8 +31,8 @@ from hma_jax.convert.official_config import (
 from hma_jax.convert.table import check_names, flat, from_official, nested, official_parts, to_official
 from hma_jax.convert.tensors import Stored, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.model import declare_model
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
 from hma_jax.training.train import Run
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"

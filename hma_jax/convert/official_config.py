@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from hma_jax.config import ConfigError, MaskingConfig, ModelConfig, require
-from hma_jax.config_json import from_dict
-from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.config.json import from_dict
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 BASE_WIDTH = 256
 """Where the release's muP multipliers are 1. Its continuous variant has no other width."""

@@ -16,14 +16,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import require
-from hma_jax.config_json import from_dict
+from hma_jax.config import Dtype, Magvit2Config, require
+from hma_jax.config.json import from_dict
 from hma_jax.convert.official import read_config
 from hma_jax.convert.table import check_names, nested
 from hma_jax.convert.tensors import Stored, read_safetensors
 from hma_jax.convert.torch_file import read_torch
-from hma_jax.params import Declared, Params, ParamSpec
-from hma_jax.tokenizers.config import Dtype, Magvit2Config
+from hma_jax.model.params import Declared, Params, ParamSpec
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 from hma_jax.tokenizers.shared import BaseTokenizer
 

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from hma_jax.convert.aside import written_aside
-from hma_jax.params import Use
+from hma_jax.model.params import Use
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.optimizer import AdamState
 from hma_jax.training.state import TrainState

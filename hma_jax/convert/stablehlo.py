@@ -20,14 +20,14 @@ import numpy as np
 from jax import export
 
 from hma_jax.config import ConfigError, DecodeConfig, ModelConfig, require
-from hma_jax.config_json import to_dict
+from hma_jax.config.json import to_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.neutral import describe_tensors
 from hma_jax.convert.table import flat, nested
 from hma_jax.convert.tensors import write_safetensors
-from hma_jax.embodiments import EmbodimentTable
 from hma_jax.generation import rollout
-from hma_jax.model import declare_model
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
 from hma_jax.training.train import Run
 
 FORMAT, VERSION = "hma-jax-stablehlo", 1

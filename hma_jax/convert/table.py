@@ -21,8 +21,8 @@ from flax import nnx
 
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.convert.tensors import Stored
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
 
 PLACES = {LAYER_AXIS: "{layer}", EMBODIMENT_AXIS: "{robot}", "Q": "{factor}"}
 """Where the index of a stacked axis stands in an official name."""

@@ -34,7 +34,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import EvalConfig, ModelConfig, Setting, require
-from hma_jax.embodiments import EmbodimentTable
 from hma_jax.evaluation.metrics import (
     Stat,
     corpus_perplexity,
@@ -46,10 +45,11 @@ from hma_jax.evaluation.metrics import (
     stratified,
 )
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
-from hma_jax.model import HMA, declare_model
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import compose
-from hma_jax.objectives import frame_diffusion_loss
-from hma_jax.params import Params
+from hma_jax.model.hma import HMA, declare_model
+from hma_jax.model.params import Params
+from hma_jax.objective.losses import frame_diffusion_loss
 
 
 class Decoder(Protocol):

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
-from hma_jax.diffusion import make_process, respace, sample_with_key
 from hma_jax.generation.window import Window, room_of
 from hma_jax.model.hma import HMA, Outputs, causal
 from hma_jax.model.trunk import TemporalCache
+from hma_jax.objective.diffusion import make_process, respace, sample_with_key
 
 
 def predict_actions(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
-from hma_jax.decoding import Frame, blank_frame, decode_frame
+from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
 from hma_jax.generation.window import Window
 from hma_jax.model.hma import HMA
 

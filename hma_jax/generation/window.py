@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig
-from hma_jax.decoding import Frame, blank_frame, decode_frame
+from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
 from hma_jax.model.hma import HMA, Outputs, causal
 from hma_jax.model.trunk import TemporalCache
 

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.model.attend import attend_all_within, attend_over_time, attend_within
+from hma_jax.kernels.attend import attend_all_within, attend_over_time, attend_within
+from hma_jax.kernels.ops import contract, kept
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm
-from hma_jax.model.ops import contract, kept
-from hma_jax.params import bias, param
+from hma_jax.model.params import bias, param
 
 CACHED_BYTES = 2**20
 """What a frame's attention weights must exceed for `attend_within` to be worth it."""

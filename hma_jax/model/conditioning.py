@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.model.attend import masked_softmax
+from hma_jax.kernels.attend import masked_softmax
+from hma_jax.kernels.ops import kept, normalise, over_tokens
 from hma_jax.model.attention import attention_scale
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, per_example
-from hma_jax.model.ops import kept, normalise, over_tokens
-from hma_jax.params import bias, ones, param, used
+from hma_jax.model.params import bias, ones, param, used
 
 
 class ActionFeature(NamedTuple):

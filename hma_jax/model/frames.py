@@ -14,7 +14,7 @@ from flax import nnx
 from hma_jax.config import DiffusionConfig, ModelConfig
 from hma_jax.model.initial import input_fan_out, readout_init, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
-from hma_jax.params import normal, param, used, xavier_uniform, zeros
+from hma_jax.model.params import normal, param, used, xavier_uniform, zeros
 
 
 def factorise(tokens: jax.Array, factors: int, vocab: int) -> jax.Array:

@@ -7,19 +7,32 @@ Both predict normalised actions.
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.diffusion import timestep_embedding
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.kernels.ops import normalise
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import readout_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear
-from hma_jax.model.ops import normalise
-from hma_jax.params import bias, normal, param, stack, used, xavier_uniform, zeros
+from hma_jax.model.params import bias, normal, param, stack, used, xavier_uniform, zeros
 
 TIME_FEATURES = 256
+
+
+def timestep_embedding(t: jax.Array, size: int = TIME_FEATURES) -> jax.Array:
+    """[cos | sin] of t times size/2 frequencies from 1 down to nearly 1/10000: t [...] -> [..., size].
+
+    t is the raw step of the original process.
+    """
+    half = size // 2
+    frequencies = np.exp(-math.log(10_000) * np.arange(half) / half)
+    angles = t[..., None].astype(jnp.float32) * jnp.asarray(frequencies, jnp.float32)
+    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
 
 
 class ResBlock(nnx.Module):
@@ -63,7 +76,7 @@ class Denoiser(nnx.Module):
 
     def __call__(self, x: jax.Array, time: jax.Array, z: jax.Array) -> jax.Array:
         """x [..., C] noised at `time` [...] given z [..., D] -> [..., 2 C], noise first."""
-        y = self.time_out(jax.nn.silu(self.time_in(timestep_embedding(time, TIME_FEATURES))))
+        y = self.time_out(jax.nn.silu(self.time_in(timestep_embedding(time))))
         y = y + self.condition(z / self.multiplier)
         x = self.into(x)
         for block in self.blocks:

@@ -13,15 +13,15 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.model.actions import Stem
 from hma_jax.model.conditioning import ActionFeature
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import make_embed, make_frame_head
 from hma_jax.model.heads import Denoiser, make_action_head
 from hma_jax.model.layers import FINE_EPS, LayerNorm
+from hma_jax.model.params import Declared, declare, param, used, zeros
+from hma_jax.model.stems import Stem
 from hma_jax.model.trunk import TemporalCache, Trunk
-from hma_jax.params import Declared, declare, param, used, zeros
-from hma_jax.sharding import constrain
+from hma_jax.runtime.sharding import constrain
 
 
 def causal(frames: int) -> jax.Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hma_jax.config import ModelConfig
-from hma_jax.params import Initializer, xavier_uniform
+from hma_jax.model.params import Initializer, xavier_uniform
 
 READOUT_GAIN = 0.01
 

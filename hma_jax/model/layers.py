@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.model.ops import contract, normalise
-from hma_jax.params import Initializer, Role, bias, ones, param
+from hma_jax.kernels.ops import contract, normalise
+from hma_jax.model.params import Initializer, Role, bias, ones, param
 
 BLOCK_EPS = 1e-5
 FINE_EPS = 1e-6  # modulation, diffusion heads and the norms around the continuous trunk

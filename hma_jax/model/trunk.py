@@ -8,13 +8,13 @@ import jax
 from flax import nnx
 
 from hma_jax.config import ModelConfig
+from hma_jax.kernels.ops import KEPT, gelu, kept
 from hma_jax.model.attention import Attention
 from hma_jax.model.conditioning import ActionFeature, make_conditioning
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm, Linear
-from hma_jax.model.ops import KEPT, gelu, kept
-from hma_jax.params import stack
-from hma_jax.sharding import constrain
+from hma_jax.model.params import stack
+from hma_jax.runtime.sharding import constrain
 
 
 class TemporalCache(NamedTuple):

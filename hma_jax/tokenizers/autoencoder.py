@@ -13,7 +13,7 @@ import numpy as np
 
 from hma_jax.config import TokenizerConfig
 from hma_jax.evaluation.metrics import Stat, mean_and_sem, psnr
-from hma_jax.params import Declared, Params, declare
+from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.network import Autoencoder, normalise, to_pixels
 from hma_jax.tokenizers.shared import BaseTokenizer

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from hma_jax.config import require
-from hma_jax.params import Params
+from hma_jax.model.params import Params
 
 PIECE = 64
 """Images per call of a jitted encoder or decoder; smaller batches are padded to it."""

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import TokenizerConfig, require
-from hma_jax.params import Params
+from hma_jax.model.params import Params
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
 
 SCALE_BATCHES = 32

@@ -18,10 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from hma_jax.config import ConfigError, require
-from hma_jax.config_json import diff, from_dict, to_dict
-from hma_jax.params import Params, path_name
-from hma_jax.tokenizers.config import AnyTokenizerConfig
+from hma_jax.config import AnyTokenizerConfig, ConfigError, require
+from hma_jax.config.json import diff, from_dict, to_dict
+from hma_jax.model.params import Params, path_name
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.params import bias, normal, ones, param
+from hma_jax.model.params import bias, normal, ones, param
 
 PRECISION = jax.lax.Precision.HIGHEST
 """float32 is float32 on accelerators too: their default would flip bits of latents near zero."""

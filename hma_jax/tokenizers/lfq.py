@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from hma_jax.config import TokenizerConfig, require
-from hma_jax.params import Params
+from hma_jax.model.params import Params
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
 from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids, split_factors

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from einops import rearrange
 from flax import nnx
 
-from hma_jax.tokenizers.config import Magvit2Config
+from hma_jax.config import Magvit2Config
 from hma_jax.tokenizers.layers import Conv, GroupNorm, ResBlock
 
 

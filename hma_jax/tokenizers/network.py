@@ -15,7 +15,7 @@ from einops import rearrange
 from flax import nnx
 
 from hma_jax.config import TokenizerConfig
-from hma_jax.params import bias, normal, ones, param
+from hma_jax.model.params import bias, normal, ones, param
 
 
 class Conv(nnx.Module):

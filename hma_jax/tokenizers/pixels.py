@@ -11,9 +11,9 @@ from typing import Any
 import jax
 from flax import nnx
 
+from hma_jax.config import PixelsConfig
 from hma_jax.model.frames import patchify, unpatchify
-from hma_jax.params import Declared, Params, declare
-from hma_jax.tokenizers.config import PixelsConfig
+from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.network import normalise, to_pixels
 from hma_jax.tokenizers.shared import BaseTokenizer
 

@@ -14,11 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from einops import rearrange
 
-from hma_jax.config import require
+from hma_jax.config import Magvit2Config, Square, SvdVaeConfig, require
 from hma_jax.model.frames import patchify, unpatchify
-from hma_jax.params import Declared, Params, declare
+from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.base import PIECE, in_pieces
-from hma_jax.tokenizers.config import Magvit2Config, Square, SvdVaeConfig
 from hma_jax.tokenizers.magvit2 import Magvit2
 from hma_jax.tokenizers.network import normalise, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids

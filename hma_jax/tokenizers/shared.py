@@ -18,9 +18,9 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, MeshConfig, require
-from hma_jax.config_json import to_dict
-from hma_jax.params import Declared, Params, path_name
-from hma_jax.sharding import RULES, make_mesh
+from hma_jax.config.json import to_dict
+from hma_jax.model.params import Declared, Params, path_name
+from hma_jax.runtime.sharding import RULES, make_mesh
 from hma_jax.tokenizers.base import PIECE, in_pieces
 
 

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.params import param, zeros
-from hma_jax.tokenizers.config import SvdVaeConfig
+from hma_jax.config import SvdVaeConfig
+from hma_jax.model.params import param, zeros
 from hma_jax.tokenizers.layers import Attention, Conv, GroupNorm, ResBlock, TimeConv
 
 TIME_EPS = 1e-5

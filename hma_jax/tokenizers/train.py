@@ -15,8 +15,8 @@ import numpy as np
 import optax
 
 from hma_jax.config import TokenizerConfig, TokenizerTrainConfig
-from hma_jax.config_json import to_dict
-from hma_jax.params import Declared, Params
+from hma_jax.config.json import to_dict
+from hma_jax.model.params import Declared, Params
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
 from hma_jax.tokenizers.continuous import make_continuous
 from hma_jax.tokenizers.io import save_tokenizer

@@ -17,7 +17,7 @@ import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
-from hma_jax.config_json import diff
+from hma_jax.config.json import diff
 
 
 class CheckpointError(ConfigError):

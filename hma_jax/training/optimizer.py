@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optax
 
 from hma_jax.config import ModelConfig, OptimizerConfig
-from hma_jax.params import Params, ParamSpec, Use, is_spec
+from hma_jax.model.params import Params, ParamSpec, Use, is_spec
 
 
 class Presence(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from hma_jax.params import Params
+from hma_jax.model.params import Params
 
 
 class TrainState(NamedTuple):

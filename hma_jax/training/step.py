@@ -11,10 +11,10 @@ import numpy as np
 from einops import rearrange
 
 from hma_jax.config import ModelConfig, TrainConfig, require
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.masking import Masked, mask_batch
-from hma_jax.objectives import LossSums, TargetCounts, count_targets, masked_loss
-from hma_jax.params import Declared, Params, Use, is_spec
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.params import Declared, Params, Use, is_spec
+from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, masked_loss
+from hma_jax.objective.masking import Masked, mask_batch
 from hma_jax.training.optimizer import (
     Presence,
     apply_adamw,

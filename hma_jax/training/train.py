@@ -12,12 +12,12 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MeshConfig, ModelConfig, TrainConfig
-from hma_jax.config_json import from_dict, to_dict
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.flops import peak_flops, train_flops_per_window
-from hma_jax.model import declare_model
-from hma_jax.params import Declared, Params
-from hma_jax.sharding import audit_sharding, make_mesh, param_shardings, plan_sharding, put_batch
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.flops import peak_flops, train_flops_per_window
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Declared, Params
+from hma_jax.runtime.sharding import audit_sharding, make_mesh, param_shardings, plan_sharding, put_batch
 from hma_jax.training.checkpoints import CheckpointError, read_checkpoint
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, fit
 from hma_jax.training.optimizer import AdamState

@@ -13,7 +13,7 @@ from experiments.rows import curve, difference, read_csv
 from experiments.sweep import CONTROL, POINT, reference_trial, titles, unique_trials
 from experiments.trial import trial_id
 from hma_jax.config import Conditioning, ConfigError
-from hma_jax.config_json import diff
+from hma_jax.config.json import diff
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
 
 

@@ -9,8 +9,8 @@ from experiments.bench.fit import abstract_inputs, check_fit, count_collectives,
 from experiments.bench.models import MODELS
 from experiments.cli.bench import Model
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.model import declare_model
-from hma_jax.sharding import make_mesh
+from hma_jax.model.hma import declare_model
+from hma_jax.runtime.sharding import make_mesh
 from hma_jax.training.step import init_state
 from tests.tiny import TABLE, model_config, train_config
 

@@ -15,7 +15,7 @@ from experiments.study import on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
 from experiments.trial import trial_id
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.config_json import from_dict, to_dict
+from hma_jax.config.json import from_dict, to_dict
 
 PLANS = (scale_datasets.plan, scale_trajectories.plan, scale_width.plan)
 PROVENANCE = Provenance("store", "manifest", "tokenizer", "code")

@@ -15,9 +15,8 @@ from experiments.presets import get_preset
 from experiments.study import on_tokenizer, override
 from experiments.trial import open_materials
 from experiments.workspace import Workspace
-from hma_jax.config import ConfigError, TokenizerConfig
-from hma_jax.config_json import from_json, to_json
-from hma_jax.tokenizers.config import Magvit2Config, PixelsConfig, SvdVaeConfig
+from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
+from hma_jax.config.json import from_json, to_json
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.data_pipelines.fakes import write_rlds
 from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensors, write_checkpoint

@@ -14,7 +14,7 @@ from experiments.rows import LOSS, TRAINING, curve, read_csv
 from experiments.study import TransferConfig, override
 from experiments.sweep import POINT, STANDARD, unique_trials
 from hma_jax.config import ConfigError
-from hma_jax.config_json import diff
+from hma_jax.config.json import diff
 from hma_jax.model.attention import attention_scale
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
 

@@ -19,9 +19,9 @@ import numpy as np
 
 from hma_jax.convert import read_official
 from hma_jax.convert.table import official_parts, to_official
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.model import declare_model
-from hma_jax.params import Declared, Params
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Declared, Params
 from hma_jax.training.train import Run
 
 RTOL = 1e-4

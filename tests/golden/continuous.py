@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import SamplerConfig
-from hma_jax.decoding import Frame, choose_patches, commit, masked_counts
-from hma_jax.diffusion import diffusion_loss, make_process, respace, sample
+from hma_jax.generation.decoding import Frame, choose_patches, commit, masked_counts
 from hma_jax.model.frames import mask_cells, patchify, unpatchify
+from hma_jax.objective.diffusion import diffusion_loss, make_process, respace, sample
 from tests.golden.case import Case, norms
 
 

@@ -20,10 +20,10 @@ from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.convert.official import official_shapes
 from hma_jax.convert.official_config import read_model
 from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, tokenizer_shapes
-from hma_jax.embodiments import Embodiment, EmbodimentTable
 from hma_jax.evaluation import metrics
-from hma_jax.masking import MaskingDraws, corrupt, mask_tokens
-from hma_jax.model import declare_model
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.objective.masking import MaskingDraws, corrupt, mask_tokens
 from tests.data_pipelines.fakes import OneDataset
 from tests.golden.case import Case, Finding
 

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import DecodeConfig, MaskingConfig, OptimizerConfig
-from hma_jax.decoding import Frame, masked_counts, sample_tokens, unmask
-from hma_jax.embodiments import EmbodimentTable
 from hma_jax.generation import rollout
-from hma_jax.masking import Masked
-from hma_jax.model import declare_model
+from hma_jax.generation.decoding import Frame, masked_counts, sample_tokens, unmask
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import factorise
-from hma_jax.objectives import masked_loss, smoothed_cross_entropy
-from hma_jax.params import is_spec
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import is_spec
+from hma_jax.objective.losses import masked_loss, smoothed_cross_entropy
+from hma_jax.objective.masking import Masked
 from hma_jax.training.optimizer import apply_adamw, clip_by_global_norm, init_adam, learning_rate_multiplier
 from hma_jax.training.step import find_presence
 from tests.golden.case import Case, norms

@@ -6,7 +6,7 @@ import json
 
 from hma_jax.config import ModelConfig
 from hma_jax.convert.table import official_parts
-from hma_jax.params import ParamSpec
+from hma_jax.model.params import ParamSpec
 from hma_jax.training.optimizer import learning_rate_multiplier
 from tests.golden.case import Case, Finding
 

@@ -15,11 +15,12 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.images import fit_image
 from hma_jax.config import DiffusionConfig, ModelConfig, OptimizerConfig
 from hma_jax.convert.table import official_parts
-from hma_jax.decoding import masked_counts
-from hma_jax.diffusion import Process, make_process, respace, timestep_embedding
-from hma_jax.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model import declare_model
+from hma_jax.generation.decoding import masked_counts
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.frames import compose, factorise, patchify, unpatchify
+from hma_jax.model.hma import declare_model
+from hma_jax.model.heads import timestep_embedding
+from hma_jax.objective.diffusion import Process, make_process, respace
 from hma_jax.training.optimizer import make_schedule
 from tests.golden.case import Case, Finding
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hma_jax.convert import read_magvit2, read_svd_vae
 from hma_jax.convert.pretrained import SVD_VAE, read_tensors, tokenizer_params
-from hma_jax.params import declare
+from hma_jax.model.params import declare
 from hma_jax.tokenizers.network import to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids, nearest_code
 from hma_jax.tokenizers.svd_vae import VideoDecoder

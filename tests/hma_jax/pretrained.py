@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from hma_jax.config import Magvit2Config, PixelsConfig, SvdVaeConfig
 from hma_jax.convert.pretrained import MAGVIT2, SVD_VAE, Source, tokenizer_shapes
 from hma_jax.convert.tensors import write_safetensors
-from hma_jax.tokenizers.config import Magvit2Config, PixelsConfig, SvdVaeConfig
 from hma_jax.tokenizers.pixels import PixelTokenizer
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
 from hma_jax.tokenizers.shared import BaseTokenizer

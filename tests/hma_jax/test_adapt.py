@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.adapt import add_embodiments
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
-from hma_jax.embodiments import Embodiment
 from hma_jax.generation import read_actions
-from hma_jax.model import declare_model
+from hma_jax.model.embodiments import Embodiment
+from hma_jax.model.hma import declare_model
+from hma_jax.training.adapt import add_embodiments
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
 NEWCOMERS = (

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.model import attend
+from hma_jax.kernels import attend
 from tests.tiny import lively_params, model_config, random_batch
 
 

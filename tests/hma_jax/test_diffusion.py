@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, SamplerConfig
-from hma_jax.config_json import from_dict, to_dict
-from hma_jax.diffusion import (
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.model.heads import timestep_embedding
+from hma_jax.objective.diffusion import (
     Process,
     diffusion_loss,
     make_process,
     respace,
     sample,
     sample_with_key,
-    timestep_embedding,
 )
 
 FULL = make_process(1000)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
-from hma_jax.decoding import Frame, masked_counts, unmask
 from hma_jax.generation import (
     advance,
     next_frame_outputs,
@@ -16,6 +15,7 @@ from hma_jax.generation import (
     rollout_policy,
     start,
 )
+from hma_jax.generation.decoding import Frame, masked_counts, unmask
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
 SAMPLER = SamplerConfig(steps=5)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, MaskingConfig
-from hma_jax.embodiments import Embodiment, EmbodimentTable
-from hma_jax.masking import mask_batch
-from hma_jax.model import declare_model
-from hma_jax.objectives import masked_loss
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.objective.losses import masked_loss
+from hma_jax.objective.masking import mask_batch
 from hma_jax.training.step import find_presence, init_state, make_train_step
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
 

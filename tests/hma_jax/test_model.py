@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, ModelConfig, MupConfig
-from hma_jax.embodiments import Embodiment, EmbodimentTable
 from hma_jax.evaluation.metrics import factored_cross_entropy
-from hma_jax.flops import forward_flops_per_window
-from hma_jax.model import declare_model
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
+from hma_jax.model.hma import declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch
 
 

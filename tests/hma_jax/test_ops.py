@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.model.ops import contract, gelu, normalise, over_tokens
+from hma_jax.kernels.ops import contract, gelu, normalise, over_tokens
 from tests.tiny import lively_params, model_config, random_batch
 
 

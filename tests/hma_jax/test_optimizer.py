@@ -7,8 +7,8 @@ import optax
 import pytest
 
 from hma_jax.config import MupConfig, OptimizerConfig
-from hma_jax.model import declare_model
-from hma_jax.params import Use, is_spec
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Use, is_spec
 from hma_jax.training.optimizer import (
     Presence,
     apply_adamw,

@@ -4,9 +4,9 @@ import pytest
 from flax import nnx
 
 from hma_jax.config import ConfigError, ModelConfig
-from hma_jax.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model import declare_model
-from hma_jax.params import declare, normal, param, stack, zeros
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import declare, normal, param, stack, zeros
 from tests.tiny import TABLE, model_config
 
 ONE_ROBOT = EmbodimentTable((Embodiment("table", 2, 1, (0.0, 0.0), (1.0, 1.0)),))

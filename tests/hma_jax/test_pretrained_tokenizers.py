@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, TokenizerConfig
-from hma_jax.config_json import from_dict, from_json, to_json
+from hma_jax.config import AnyTokenizerConfig, ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
+from hma_jax.config.json import from_dict, from_json, to_json
 from hma_jax.model.frames import compose, factorise
-from hma_jax.tokenizers.config import AnyTokenizerConfig, Magvit2Config, PixelsConfig, SvdVaeConfig
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
 from hma_jax.tokenizers.network import normalise
 from hma_jax.tokenizers.quantizer import ids_to_codes

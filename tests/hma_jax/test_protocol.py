@@ -7,7 +7,7 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig
 from hma_jax.evaluation.protocol import Evaluation, evaluate, random_actions
-from hma_jax.model import declare_model
+from hma_jax.model.hma import declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch
 
 SIZE = 8

@@ -13,7 +13,7 @@ import pytest
 
 from hma_jax.config import ConfigError, TokenizerConfig, TokenizerTrainConfig
 from hma_jax.model.frames import compose, factorise
-from hma_jax.params import Declared, ParamSpec, normal
+from hma_jax.model.params import Declared, ParamSpec, normal
 from hma_jax.tokenizers import quantizer
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer, reconstruction_psnr
 from hma_jax.tokenizers.base import PIECE, in_pieces

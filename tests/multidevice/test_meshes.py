@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, MeshConfig, ModelConfig
-from hma_jax.model import declare_model
-from hma_jax.sharding import audit_sharding, describe_sharding, make_mesh, plan_sharding
+from hma_jax.model.hma import declare_model
+from hma_jax.runtime.sharding import audit_sharding, describe_sharding, make_mesh, plan_sharding
 from tests.tiny import TABLE, model_config
 
 PROGRAM = Path(__file__).with_name("train_on_mesh.py")

@@ -13,7 +13,7 @@ from data_pipelines.loading.loader import LoaderConfig, make_loader, select_wind
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import EmbodimentTable
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 
 STATM = Path("/proc/self/statm")

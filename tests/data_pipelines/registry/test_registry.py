@@ -19,7 +19,7 @@ from data_pipelines.registry.toml_file import load_entries, to_toml
 from data_pipelines.rlds.dataset import RldsDataset
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from hma_jax.config import ConfigError
-from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
 
 

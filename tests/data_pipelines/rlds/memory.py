@@ -79,7 +79,7 @@ def tokenize(root: Path) -> None:
     """Tokenises and prints the peak of memory, in MB, and how much of it came with the records."""
     from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from hma_jax.config import TokenizerConfig
-    from hma_jax.host_memory import keep_freed_memory
+    from hma_jax.runtime.host_memory import keep_freed_memory
     from hma_jax.tokenizers.autoencoder import declare_tokenizer
     from hma_jax.tokenizers.lfq import LfqTokenizer
 

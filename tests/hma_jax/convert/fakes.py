@@ -12,7 +12,7 @@ import numpy as np
 from hma_jax.convert.official import official_shapes
 from hma_jax.convert.official_config import CONTINUOUS_DEFAULTS, DISCRETE_DEFAULTS, read_model
 from hma_jax.convert.tensors import write_safetensors
-from hma_jax.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 SMALL = {"d_model": 16, "num_layers": 2, "num_heads": 2, "T": 3, "action_token_size": 2, "use_mup": True}
 DISCRETE = DISCRETE_DEFAULTS | SMALL | {"S": 4, "image_vocab_size": 64, "num_factored_vocabs": 2}

@@ -15,7 +15,7 @@ from hma_jax.config import ConfigError
 from hma_jax.convert import official_shapes, read_official, write_official
 from hma_jax.convert.table import flat, official_parts
 from hma_jax.convert.tensors import read_safetensors
-from hma_jax.model import declare_model
+from hma_jax.model.hma import declare_model
 from hma_jax.training.train import Run
 from tests.hma_jax.convert.fakes import (
     CONTINUOUS,

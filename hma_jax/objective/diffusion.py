@@ -109,17 +109,6 @@ def _at(table: np.ndarray, t: jax.Array) -> jax.Array:
     return jnp.asarray(table, jnp.float32)[t][..., None]
 
 
-def timestep_embedding(t: jax.Array, size: int = 256) -> jax.Array:
-    """[cos | sin] of t times size/2 frequencies from 1 down to nearly 1/10000: t [...] -> [..., size].
-
-    t is the raw step of the original process.
-    """
-    half = size // 2
-    frequencies = np.exp(-math.log(10_000) * np.arange(half) / half)
-    angles = t[..., None].astype(jnp.float32) * jnp.asarray(frequencies, jnp.float32)
-    return jnp.concatenate([jnp.cos(angles), jnp.sin(angles)], axis=-1)
-
-
 # --- What the network says -------------------------------------------------------------------
 
 

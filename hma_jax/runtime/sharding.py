@@ -7,15 +7,15 @@ Mesh axes: `data` splits the batch, `fsdp` splits the batch and the width of par
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.params import Declared, ParamSpec, is_spec
 
 RULES: dict[str, str | tuple[str, ...]] = {
     "B": ("data", "fsdp"),
@@ -70,12 +70,31 @@ def is_split() -> bool:
     return not mesh.empty and math.prod(mesh.shape.values()) > 1
 
 
+class Spec(Protocol):
+    """What a layout depends on, of one array (`model.params.ParamSpec`)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    @property
+    def axes(self) -> tuple[str | None, ...]: ...
+    @property
+    def size(self) -> int: ...
+
+
+class Declarations(Protocol):
+    """Specs as a tree and by name (`model.params.Declared`)."""
+
+    @property
+    def specs(self) -> Any: ...
+    def leaves(self) -> Mapping[str, Spec]: ...
+
+
 @dataclass(frozen=True)
 class Decision:
     """How one parameter lies on the mesh, and why if it is whole on every device."""
 
     name: str
-    spec: ParamSpec
+    spec: Spec
     partition: PartitionSpec
     reason: str
 
@@ -84,7 +103,7 @@ class Decision:
         return all(p is None for p in self.partition)
 
 
-def plan_sharding(declared: Declared, mesh: Mesh, config: MeshConfig) -> list[Decision]:
+def plan_sharding(declared: Declarations, mesh: Mesh, config: MeshConfig) -> list[Decision]:
     """One decision per parameter, in the order of `declared.leaves()`."""
     decisions = []
     for name, spec in declared.leaves().items():
@@ -121,10 +140,10 @@ def describe_sharding(decisions: list[Decision]) -> str:
     return "\n".join(rows)
 
 
-def param_shardings(declared: Declared, mesh: Mesh, config: MeshConfig) -> Any:
+def param_shardings(declared: Declarations, mesh: Mesh, config: MeshConfig) -> Any:
     """A tree of NamedSharding with the structure of the parameters."""
     layouts = {d.name: NamedSharding(mesh, d.partition) for d in plan_sharding(declared, mesh, config)}
-    treedef = jax.tree.structure(declared.specs, is_leaf=is_spec)
+    treedef = jax.tree.structure(declared.specs, is_leaf=lambda leaf: hasattr(leaf, "axes"))
     return jax.tree.unflatten(treedef, list(layouts.values()))
 
 

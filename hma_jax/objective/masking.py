@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import MaskingConfig, ModelConfig
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import compose, factorise
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from hma_jax.config import TokenizerConfig, require
+from hma_jax.config.base import require
+from hma_jax.config.tokenizer import TokenizerConfig
 
 Dtype = Literal["float32", "bfloat16"]
 

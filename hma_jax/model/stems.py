@@ -13,11 +13,11 @@ import numpy as np
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.kernels.ops import normalise
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import hidden_init, input_fan_out
 from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear
-from hma_jax.model.ops import normalise
-from hma_jax.params import bias, ones, param, uniform
+from hma_jax.model.params import bias, ones, param, uniform
 
 
 class Stem(nnx.Module):

@@ -13,7 +13,7 @@ import types
 import typing
 from typing import Any, Literal
 
-from hma_jax.config import require
+from hma_jax.config.base import require
 
 
 def to_dict(config: Any) -> Any:

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DiffusionConfig, MaskingConfig
-from hma_jax.diffusion import diffusion_loss, make_process
-from hma_jax.masking import Masked
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
+from hma_jax.objective.diffusion import diffusion_loss, make_process
+from hma_jax.objective.masking import Masked
 
 
 class LossSums(NamedTuple):

@@ -8,8 +8,8 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from hma_jax.model.ops import kept, total
-from hma_jax.sharding import is_split
+from hma_jax.kernels.ops import kept, total
+from hma_jax.runtime.sharding import is_split
 
 FEW = 2
 """Frames up to here that attend to earlier ones do so one by one."""

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 
 from hma_jax.config import ModelConfig, require
-from hma_jax.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model import declare_model
-from hma_jax.params import EMBODIMENT_AXIS, Params, ParamSpec, is_spec
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import EMBODIMENT_AXIS, Params, ParamSpec, is_spec
 
 
 def add_embodiments(

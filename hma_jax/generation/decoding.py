@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, ModelConfig, require
-from hma_jax.diffusion import make_process, respace, sample_with_key
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
+from hma_jax.objective.diffusion import make_process, respace, sample_with_key
 
 
 class Frame(NamedTuple):

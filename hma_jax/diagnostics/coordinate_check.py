@@ -19,10 +19,10 @@ import numpy as np
 from flax import nnx
 
 from hma_jax.config import ModelConfig, TrainConfig, require
-from hma_jax.embodiments import EmbodimentTable
-from hma_jax.masking import Masked, mask_batch
-from hma_jax.model import HMA, declare_model
-from hma_jax.objectives import draw_noise
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import HMA, declare_model
+from hma_jax.objective.losses import draw_noise
+from hma_jax.objective.masking import Masked, mask_batch
 from hma_jax.training.state import TrainState
 from hma_jax.training.step import Batch, init_state, make_train_step
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import jax
 
 from hma_jax.config import ModelConfig
-from hma_jax.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.heads import TIME_FEATURES
 
 

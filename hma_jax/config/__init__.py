@@ -1,0 +1,48 @@
+"""Configuration: frozen dataclasses, validated when made. Nothing here imports JAX.
+
+A default lives here and nowhere else; named instances are `experiments.presets`. `model`, `training`,
+`tokenizer`, `pretrained_tokenizers` and `evaluation` hold what determines a result, `execution` how it is
+computed; paths, clocks and verbosity belong to the code that calls. `json` reads and writes all of them.
+"""
+
+from hma_jax.config.base import ConfigError, require
+from hma_jax.config.evaluation import DecodeConfig, EvalConfig, SamplerConfig
+from hma_jax.config.execution import MeshConfig
+from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
+from hma_jax.config.pretrained_tokenizers import (
+    AnyTokenizerConfig,
+    Dtype,
+    Latents,
+    Magvit2Config,
+    PixelsConfig,
+    Square,
+    SvdVaeConfig,
+)
+from hma_jax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
+from hma_jax.config.training import MaskingConfig, OptimizerConfig, Setting, TrainConfig
+
+__all__ = [
+    "AnyTokenizerConfig",
+    "Conditioning",
+    "ConfigError",
+    "DecodeConfig",
+    "DiffusionConfig",
+    "Dtype",
+    "EvalConfig",
+    "Latents",
+    "Magvit2Config",
+    "MaskingConfig",
+    "MeshConfig",
+    "ModelConfig",
+    "MupConfig",
+    "OptimizerConfig",
+    "PixelsConfig",
+    "SamplerConfig",
+    "Setting",
+    "Square",
+    "SvdVaeConfig",
+    "TokenizerConfig",
+    "TokenizerTrainConfig",
+    "TrainConfig",
+    "require",
+]

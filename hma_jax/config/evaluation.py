@@ -1,0 +1,90 @@
+"""How frames are generated and judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from hma_jax.config.base import require
+
+
+@dataclass(frozen=True)
+class SamplerConfig:
+    """How clean vectors are drawn (`diffusion.sample`).
+
+    `ddpm` is ancestral sampling, as released; `ddim` (eta 0), as the paper states, draws nothing
+    after the initial noise. `temperature` multiplies noise; 0 leaves what the condition implies.
+    """
+
+    kind: Literal["ddpm", "ddim"] = "ddpm"
+    steps: int = 100  # of the respaced process
+    temperature: float = 1.0
+    # DIFFERS: the release multiplies the noise of the steps only, so that at "temperature 0" its
+    # samples still depend on the random numbers they start from; False: as released.
+    scale_initial_noise: bool = True
+
+    def __post_init__(self):
+        require(self.steps >= 2, f"sampler.steps must be at least 2, got {self.steps}")
+        require(self.temperature >= 0, f"sampler.temperature must not be negative, got {self.temperature}")
+        require(
+            self.kind == "ddpm" or self.scale_initial_noise or self.temperature == 1,
+            "sampler.temperature has no effect on ddim without scale_initial_noise; "
+            "set scale_initial_noise or leave the temperature at 1",
+        )
+
+    @property
+    def noisy_steps(self) -> bool:
+        """Whether the steps after the first need random numbers."""
+        return self.kind == "ddpm" and self.temperature > 0
+
+
+@dataclass(frozen=True)
+class DecodeConfig:
+    """How a masked frame is filled (`decoding`).
+
+    `temperature` divides the logits of discrete tokens; 0 takes the most likely entry of each
+    factor. DIFFERS: the release divides probabilities, which a renormalising draw ignores
+    (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
+    """
+
+    unmask_steps: int = 2  # M
+    temperature: float = 0.0
+    top_k: int = 0  # draw from the k likeliest entries of each factor; 0: from all
+    order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    resample: bool = False  # continuous: predict every patch again in each step, as released
+    # What happens past the window of T frames: `exact` computes the window again for every frame;
+    # `streaming` keeps what was computed when its frames stood elsewhere, an approximation.
+    slide: Literal["exact", "streaming"] = "exact"
+
+    def __post_init__(self):
+        require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")
+        require(self.temperature >= 0, f"decode.temperature must not be negative, got {self.temperature}")
+        require(self.top_k >= 0, f"decode.top_k must not be negative, got {self.top_k}")
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """The evaluation protocol (paper section 4, Metrics)."""
+
+    windows_per_dataset: int = 500
+    # What a predicted frame follows: frames the model made, from a prompt on, or (`recorded`, as the
+    # release judges) in every case the recorded ones.
+    context: Literal["generated", "recorded"] = "generated"
+    prompt_frames: int = 4
+    # Continuous tokens: the mean of each diffusion step, not a draw.
+    decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
+    random_actions: int = 5  # draws for delta PSNR
+    batch: int = 32
+    perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
+    seed: int = 0
+
+    def __post_init__(self):
+        require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
+        require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
+        require(self.random_actions >= 1, "eval.random_actions must be at least 1")
+
+    @property
+    def first_predicted(self) -> int:
+        """The first frame of a window that is compared."""
+        return self.prompt_frames if self.context == "generated" else 1

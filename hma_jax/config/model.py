@@ -1,0 +1,146 @@
+"""What the transformer is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from hma_jax.config.base import require
+
+
+@dataclass(frozen=True)
+class MupConfig:
+    """Width transfer (paper section 3.5; practice in Tensor Programs V).
+
+    `base_width` is where the multipliers are 1. Learning rate and initial variance of hidden
+    matrices scale with base_width / D, the read-out's input with base_width / D, attention
+    logits with `attention_scale` / head width. `without` takes single ingredients away, to show
+    that each is needed.
+    """
+
+    enabled: bool = True
+    base_width: int = 256
+    attention_scale: float = 8.0
+    without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """Diffusion over continuous vectors conditioned on the trunk (reference sections 2.4 and 2.5).
+
+    `channels` and `patch` describe what is denoised for frames: a token is a patch of
+    `patch` x `patch` latent cells of `channels` values, flattened to C = patch^2 x channels.
+    """
+
+    channels: int = 4
+    patch: int = 2
+    width: int = 1024  # of the denoising network
+    depth: int = 4  # its residual blocks
+    steps: int = 1000  # of the noising process
+    clip: float = 10.0  # predicted clean values are kept in +-clip while sampling
+    repeats: int = 1  # noised copies of each token per training step
+
+    def __post_init__(self):
+        for name in ("channels", "patch", "width", "depth", "steps", "repeats"):
+            value = getattr(self, name)
+            require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")
+        require(self.clip > 0, f"diffusion.clip must be positive, got {self.clip}")
+
+    @property
+    def cells(self) -> int:
+        """Latent cells per token."""
+        return self.patch**2
+
+    @property
+    def token_channels(self) -> int:
+        """C: values per token."""
+        return self.cells * self.channels
+
+
+Conditioning = Literal["concat+modulate", "modulate", "concat", "add", "cross_attention"]
+"""How actions reach the trunk (paper section 4.1, reference section 1.6): as K more tokens per
+frame, through a shift and scale in every block, both, added to every token in every block, or
+attended to in every block."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The HMA transformer. Defaults are the released discrete base model (43.6 M, one robot).
+
+    With `diffusion` set it is the continuous variant: tokens are latent vectors, and `factors`
+    and `factor_vocab` mean nothing.
+    """
+
+    width: int = 256  # D
+    layers: int = 32  # N
+    heads: int = 8  # H
+    frames: int = 12  # T
+    tokens: int = 256  # S
+    action_tokens: int = 64  # K
+    factors: int = 2  # Q
+    factor_vocab: int = 512  # V
+    diffusion: DiffusionConfig | None = None
+    conditioning: Conditioning = "concat+modulate"
+    # Which chunk conditions frame t: the one executed after it (`released`; the chunk that led
+    # to it then arrives through temporal attention) or the one that led to it (`causal`).
+    action_alignment: Literal["released", "causal"] = "released"
+    action_heads: bool = True  # what predicts actions; forward dynamics does without
+    mlp_ratio: float = 4.0
+    qkv_bias: bool = False
+    proj_bias: bool = True
+    mlp_bias: bool = True
+    qk_norm: bool = False
+    trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
+    stem_gain: float = 0.01  # Xavier gain of the action stems
+    mup: MupConfig = field(default_factory=MupConfig)
+    compute_dtype: Literal["float32", "bfloat16"] = "float32"
+    remat: bool = True  # keep no more than a block's input for the backward pass; False: its products too
+    # Large frames attend one at a time on CPU (`by_frame`), or all at once (`whole`, to compare with).
+    attention: Literal["by_frame", "whole"] = "by_frame"
+
+    def __post_init__(self):
+        require(
+            self.width % self.heads == 0,
+            f"model.width {self.width} is not a multiple of model.heads {self.heads}",
+        )
+        for name in ("width", "layers", "heads", "frames", "tokens", "factors", "action_tokens"):
+            require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
+        require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
+
+    @property
+    def head_width(self) -> int:
+        return self.width // self.heads
+
+    @property
+    def mlp_width(self) -> int:
+        return int(self.width * self.mlp_ratio)
+
+    @property
+    def concat(self) -> bool:
+        """Whether actions enter as tokens of their own."""
+        return "concat" in self.conditioning
+
+    @property
+    def frame_tokens(self) -> int:
+        """P: tokens per frame inside the trunk."""
+        return self.tokens + (self.action_tokens if self.concat else 0)
+
+    @property
+    def position_slots(self) -> int:
+        """Position embeddings kept per frame. As released there are some for latent cells that
+        patches never reach, and for action tokens whether or not there are any."""
+        cells = self.diffusion.cells if self.diffusion else 1
+        return self.tokens * cells + self.action_tokens
+
+    @property
+    def vocab_size(self) -> int:
+        return self.factor_vocab**self.factors
+
+    @property
+    def width_multiplier(self) -> float:
+        """muP's m = D / base width; 1 when muP is off."""
+        return self.width / self.mup.base_width if self.mup.enabled else 1.0
+
+    def mup_multiplier(self, ingredient: str) -> float:
+        """m where `ingredient` of muP applies, 1 where it was taken away."""
+        return 1.0 if ingredient in self.mup.without else self.width_multiplier

@@ -1,0 +1,1 @@
+"""What is learnt: masking, losses, and the mathematics of diffusion."""

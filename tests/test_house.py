@@ -1,0 +1,101 @@
+"""The plan of the house: who may import whom, and that there are no circles (README, "Map of the house")."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("hma_jax", "data_pipelines", "experiments")
+MAY_IMPORT = {
+    "hma_jax": {"hma_jax"},
+    "data_pipelines": {"hma_jax", "data_pipelines"},
+    "experiments": {"hma_jax", "data_pipelines", "experiments"},
+}
+
+
+def modules() -> dict[str, Path]:
+    """'hma_jax.model.hma' -> its file, for every module of the three packages."""
+    found = {}
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = modules()
+
+
+def imports_of(path: Path) -> Iterator[str]:
+    """Every module of ours that a file imports, wherever it does, for type checkers too."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] in PACKAGES)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports are not used here"
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                if whole in MODULES:
+                    yield whole
+                elif node.module in MODULES:
+                    yield node.module
+
+
+GRAPH = {name: set(imports_of(path)) - {name} for name, path in MODULES.items()}
+
+
+def find_circle(graph: dict[str, set[str]]) -> list[str]:
+    """The names along one circle of `graph`; empty without any."""
+    done: set[str] = set()
+
+    def visit(name: str, trail: list[str]) -> list[str]:
+        if name in trail:
+            return [*trail[trail.index(name) :], name]
+        if name in done:
+            return []
+        for other in sorted(graph.get(name, ())):
+            if circle := visit(other, [*trail, name]):
+                return circle
+        done.add(name)
+        return []
+
+    for name in sorted(graph):
+        if circle := visit(name, []):
+            return circle
+    return []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_package_imports_only_those_below_it(package: str):
+    for name, imported in GRAPH.items():
+        if name.split(".")[0] == package:
+            strangers = {other for other in imported if other.split(".")[0] not in MAY_IMPORT[package]}
+            assert not strangers, f"{name} imports {', '.join(sorted(strangers))}"
+
+
+CORE = {name: imported for name, imported in GRAPH.items() if name.startswith("hma_jax.")}
+
+
+def test_no_files_of_the_core_import_each_other_in_a_circle():
+    circle = find_circle(CORE)
+    assert not circle, " -> ".join(circle)
+
+
+def test_no_folders_of_the_core_import_each_other_in_a_circle():
+    def folder(name: str) -> str:
+        return ".".join(name.split(".")[:2])
+
+    folders: dict[str, set[str]] = {}
+    for name, imported in CORE.items():
+        folders.setdefault(folder(name), set()).update({folder(other) for other in imported} - {folder(name)})
+    circle = find_circle(folders)
+    assert not circle, " -> ".join(circle)
+
+
+def test_circles_are_found():
+    assert find_circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+    assert find_circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
