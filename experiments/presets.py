@@ -11,6 +11,7 @@ from hma_jax.config import (
     DecodeConfig,
     DiffusionConfig,
     EvalConfig,
+    ExecutionConfig,
     MaskingConfig,
     ModelConfig,
     MupConfig,
@@ -49,11 +50,12 @@ CPU = Study(
     tokenizer_train=TokenizerTrainConfig(steps=2000, batch=32),
     model=ModelConfig(
         width=64, layers=2, heads=2, frames=12, tokens=16, action_tokens=1, factor_vocab=64,
-        action_heads=False, mup=MupConfig(base_width=64), remat=False,
+        action_heads=False, mup=MupConfig(base_width=64),
         # Twelve thousand windows must do where the release has millions: residual branches and
         # stems that do not start near zero, and the chunk that leads to a frame given with it.
         trunk_gain=0.5, stem_gain=1.0, action_alignment="causal",
     ),
+    execution=ExecutionConfig(remat="products"),
     train=TrainConfig(
         steps=1000, batch=12,
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
@@ -74,8 +76,9 @@ ACCELERATOR = Study(
     tokenizer_train=TokenizerTrainConfig(steps=10_000, batch=128, learning_rate=5e-4),
     model=ModelConfig(
         width=256, layers=12, heads=8, frames=12, tokens=64, action_tokens=16, factor_vocab=256,
-        action_heads=False, compute_dtype="bfloat16",
+        action_heads=False,
     ),
+    execution=ExecutionConfig("bfloat16"),
     train=TrainConfig(
         steps=20_000, batch=64,
         optimizer=OptimizerConfig(learning_rate=5e-4, schedule="wsd"),
@@ -95,7 +98,8 @@ PAPER = Study(
     tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=1024,
                               encoder_blocks=3, decoder_blocks=6),
     tokenizer_train=TokenizerTrainConfig(steps=200_000, batch=64, learning_rate=1e-4),
-    model=ModelConfig(action_heads=False, compute_dtype="bfloat16"),
+    model=ModelConfig(action_heads=False),
+    execution=ExecutionConfig("bfloat16"),
     train=TrainConfig(steps=60_000, batch=64),
     eval=EvalConfig(windows_per_dataset=500),
     store=StoreConfig(val_fraction=0.01, max_val=500),

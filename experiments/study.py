@@ -17,6 +17,7 @@ from hma_jax.config import (
     AnyTokenizerConfig,
     ConfigError,
     EvalConfig,
+    ExecutionConfig,
     Latents,
     ModelConfig,
     TokenizerConfig,
@@ -98,6 +99,7 @@ class Study:
     seeds: tuple[int, ...] = (0,)
     ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
     transfer: TransferConfig = field(default_factory=TransferConfig)
+    execution: ExecutionConfig = field(default_factory=ExecutionConfig)  # how trials are computed; names none
     flops_per_second: float = 1e13  # sustained; only for the cost estimates of --dry-run
 
     def __post_init__(self):

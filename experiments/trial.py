@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
 from experiments.workspace import Workspace
-from hma_jax.config import EvalConfig, MeshConfig, ModelConfig, Setting, TrainConfig
+from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, TrainConfig
 from hma_jax.config.json import stable_hash, to_dict
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def train_trial(
     materials: Materials,
     run_dir: Path,
     *,
-    mesh: MeshConfig = MeshConfig(),
+    execution: ExecutionConfig = ExecutionConfig(),
     progress: Progress = lambda *_: None,
     table: EmbodimentTable | None = None,
     initial: Params | None = None,
@@ -132,7 +132,7 @@ def train_trial(
             store, table, loader, start_step=start,
             process_index=jax.process_index(), process_count=jax.process_count(),
         ),
-        mesh=mesh,
+        execution=execution,
         run_dir=run_dir,
         provenance={
             "store": store.hash(trial.datasets),
@@ -155,6 +155,7 @@ def evaluate_on(
     config: EvalConfig,
     setting: Setting = "forward",
     *,
+    execution: ExecutionConfig = ExecutionConfig(),
     first_batches: bool = False,
     progress: Progress = lambda *_: None,
 ) -> Evaluation:
@@ -174,6 +175,7 @@ def evaluate_on(
         _first_of_each_dataset(batches) if first_batches else batches,
         config,
         setting=setting,
+        execution=execution,
         progress=lambda done: progress("evaluating", done, windows),
     )
 
@@ -183,7 +185,7 @@ def run_trial(
     workspace: Workspace,
     directory: Path,
     *,
-    mesh: MeshConfig = MeshConfig(),
+    execution: ExecutionConfig = ExecutionConfig(),
     progress: Progress = lambda *_: None,
 ) -> dict[str, Any]:
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
@@ -201,14 +203,16 @@ def run_trial(
     materials = open_materials(workspace)
     table = materials.store.embodiment_table(trial.datasets)
     declared = declare_model(trial.model, table)
-    trained = train_trial(trial, materials, directory / "run", mesh=mesh, progress=progress)
+    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress)
 
     subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
-    evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, progress=progress)
+    evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, execution=execution, progress=progress)
     untrained = None
     if trial.measure_untrained:  # what it says of one batch it says of all: it has learnt nothing
         fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))
-        untrained = evaluate_on(trial.evaluated, fresh, *subject, first_batches=True).to_dict()
+        untrained = evaluate_on(
+            trial.evaluated, fresh, *subject, execution=execution, first_batches=True
+        ).to_dict()
 
     write_samples(directory / "samples.npz", evaluation.samples)
     result = {

@@ -28,7 +28,7 @@ def main(directory: Path) -> int:
     from experiments.ledger import DIVERGED, FAILED
     from experiments.trial import Trial, run_trial
     from experiments.workspace import Workspace
-    from hma_jax.config import ConfigError, MeshConfig
+    from hma_jax.config import ConfigError, ExecutionConfig
     from hma_jax.config.json import from_dict
     from hma_jax.training.loop import DivergedError, Interrupted
 
@@ -39,7 +39,7 @@ def main(directory: Path) -> int:
             from_dict(Trial, job["trial"]),
             Workspace(directory.parent.parent),
             directory,
-            mesh=from_dict(MeshConfig, job["mesh"]),
+            execution=from_dict(ExecutionConfig, job["execution"]),
             progress=report,
         )
         return 0

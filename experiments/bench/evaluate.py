@@ -51,14 +51,14 @@ def time_evaluation(subject: Subject, rows: int, config: EvalConfig, repeats: in
         last = [under(sequences[:, r])[1][:, -1] for r in range(1, sequences.shape[1])]
         return entropy, frames, jnp.stack(last, axis=1)
 
-    fast = compile_call(make_evaluator(model, table, config), weights, batch)
+    fast = compile_call(make_evaluator(model, table, config, execution=subject.execution), weights, batch)
     slow = compile_call(literal, weights)
     calls = {"protocol": lambda: fast(weights, batch), "literal": lambda: slow(weights)}
     (metrics, predicted), (entropy, frames, last) = (call() for call in calls.values())
     gap = float(jnp.abs(metrics["cross_entropy"] - entropy).max())
     same = float(jnp.minimum((predicted.frames == frames).mean(), (predicted.last_random == last).mean()))
     require(
-        gap < 1e-3 and same == 1 or model.compute_dtype != "float32",
+        gap < 1e-3 and same == 1 or subject.execution.dtype != "float32",
         f"the fast protocol differs from the literal one: cross-entropy by {gap:g}, {1 - same:.2%} of tokens",
     )
     timings = time_by_turns(calls, repeats)

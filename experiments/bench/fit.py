@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from hma_jax.config import ConfigError, MeshConfig, ModelConfig, TrainConfig
+from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, ModelConfig, TrainConfig
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_window
 from hma_jax.model.hma import declare_model
@@ -67,10 +67,11 @@ def find_devices(topology: str) -> list[Any]:
 
 
 def check_fit(
-    model: ModelConfig, table: EmbodimentTable, train: TrainConfig, mesh_config: MeshConfig, devices: list[Any]
+    model: ModelConfig, table: EmbodimentTable, train: TrainConfig, execution: ExecutionConfig, devices: list[Any]
 ) -> Fit:
     """Compiles the training step for `devices`. Raises ConfigError if the mesh does not suit them."""
-    declared = declare_model(model, table)
+    declared = declare_model(model, table, execution)
+    mesh_config = execution.mesh
     mesh = make_mesh(mesh_config, devices)
     audit_sharding(plan_sharding(declared, mesh, mesh_config), mesh)
     split = mesh.shape["data"] * mesh.shape["fsdp"]
@@ -87,7 +88,9 @@ def check_fit(
     with jax.set_mesh(mesh):
         shardings = jax.tree.map(lambda x: x.sharding, state)
         step = jax.jit(
-            make_train_step(declared, table, model, train), donate_argnums=0, out_shardings=(shardings, None)
+            make_train_step(declared, table, model, train, execution.accumulate),
+            donate_argnums=0,
+            out_shardings=(shardings, None),
         )
         lowered = step.trace(state, batch).lower(lowering_platforms=(devices[0].platform,))
         try:

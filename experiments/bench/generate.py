@@ -41,7 +41,8 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
         return window(declared.merge(params)).pass_over(batch["tokens"], None, 0).frames
 
     def plain(params: Any) -> jax.Array:
-        model = declare_model(replace(config, attention="whole"), subject.table).merge(params)
+        execution = replace(subject.execution, attention="plain")
+        model = declare_model(config, subject.table, execution).merge(params)
         return window(model).pass_over(batch["tokens"], None, 0).frames
 
     def recompute(params: Any) -> jax.Array:

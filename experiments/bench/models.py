@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.presets import CPU, CPU_CONTINUOUS
-from hma_jax.config import DiffusionConfig, ModelConfig, require
+from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, require
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
 
-BASE = ModelConfig(action_heads=False, remat=False)
+BASE = ModelConfig(action_heads=False)
+EXECUTION = ExecutionConfig(remat="products")
 MODELS = {
     "base": BASE,
     "xl": replace(BASE, width=1024),
@@ -34,6 +35,7 @@ class Subject:
     """A model to be timed, with random weights and inputs."""
 
     config: ModelConfig
+    execution: ExecutionConfig
     table: EmbodimentTable
     declared: Declared
     params: Params
@@ -42,7 +44,7 @@ class Subject:
     @property
     def inference_params(self) -> Params:
         """Matrices in the type they are used in: in bfloat16 a pass reads half the bytes."""
-        dtype = jnp.dtype(self.config.compute_dtype)
+        dtype = jnp.dtype(self.execution.dtype)
         return jax.tree.map(lambda x: x.astype(dtype) if x.ndim > 1 else x, self.params)
 
     def batch(self, rows: int, frames: int | None = None) -> dict[str, Any]:
@@ -60,12 +62,7 @@ class Subject:
 
 
 def make_shape(
-    name: str,
-    dtype: str,
-    robots: int = 1,
-    layers: int | None = None,
-    width: int | None = None,
-    remat: bool = False,
+    name: str, robots: int = 1, layers: int | None = None, width: int | None = None
 ) -> tuple[ModelConfig, EmbodimentTable]:
     """Configuration and robots. Raises ConfigError for a name that is not in the table."""
     require(name in MODELS, f"unknown model {name!r}; known: {', '.join(MODELS)}")
@@ -73,19 +70,18 @@ def make_shape(
     one = Embodiment("robot", ROBOT_DIM, ROBOT_STRIDE, (0.0,) * ROBOT_DIM, (1.0,) * ROBOT_DIM)
     table = EmbodimentTable(tuple(replace(one, name=f"robot_{i}") for i in range(robots)))
     sizes = {"layers": layers or model.layers, "width": width or model.width}
-    return replace(model, compute_dtype=dtype, remat=remat, **sizes), table
+    return replace(model, **sizes), table
 
 
 def make_subject(
     name: str,
-    dtype: str,
+    execution: ExecutionConfig = EXECUTION,
     robots: int = 1,
     seed: int = 0,
     layers: int | None = None,
     width: int | None = None,
-    remat: bool = False,
 ) -> Subject:
     """As `make_shape`, with weights."""
-    config, table = make_shape(name, dtype, robots, layers, width, remat)
-    declared = declare_model(config, table)
-    return Subject(config, table, declared, declared.init(seed), seed)
+    config, table = make_shape(name, robots, layers, width)
+    declared = declare_model(config, table, execution)
+    return Subject(config, execution, table, declared, declared.init(seed), seed)

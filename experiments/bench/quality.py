@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from experiments.bench.models import Subject
+from experiments.bench.models import EXECUTION, Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
 from experiments.bench.timing import time_by_turns
@@ -139,5 +139,5 @@ def subject_of(trained: Any) -> Subject:
     """A trained run as what is timed."""
     from hma_jax.model.hma import declare_model
 
-    declared = declare_model(trained.model, trained.table)
-    return Subject(trained.model, trained.table, declared, jax.device_put(trained.params), 0)
+    declared = declare_model(trained.model, trained.table, EXECUTION)
+    return Subject(trained.model, EXECUTION, trained.table, declared, jax.device_put(trained.params), 0)

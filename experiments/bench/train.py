@@ -40,7 +40,7 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
     state = init_state(declared, table, subject.seed)
     compiled = {
         "forward": compile_call(passes(declared), state.params, batch),
-        "plain": compile_call(passes(declare_model(replace(config, attention="whole"), table)), state.params, batch),
+        "plain": compile_call(passes(declare_model(config, table, replace(subject.execution, attention="plain"))), state.params, batch),
         "step": compile_call(make_train_step(declared, table, config, settings), state, batch, donate=(0,)),
     }
     kept = [state]

@@ -11,6 +11,7 @@ from tyro.extras import SubcommandApp
 
 from experiments.cli.where import Where
 from experiments.commands import bench as commands
+from hma_jax.config.execution import Dtype, Remat
 
 bench_app = SubcommandApp()
 
@@ -33,7 +34,7 @@ class Bench:
     """Examples at a time; several numbers give several measurements."""
     repeats: int = 30
     """Timed calls of every stage, after two untimed ones."""
-    dtype: Literal["float32", "bfloat16"] = "float32"
+    dtype: Dtype = "float32"
     """What is computed in."""
     robots: int = 1
     """Embodiments of the model; a batch mixes them."""
@@ -85,12 +86,12 @@ def rollout(
 
 
 @bench_app.command(name="train")
-def train(bench: OmitArgPrefixes[Bench], remat: bool = False) -> None:
+def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
     """Time optimiser steps against forward passes of the same batch.
 
     Args:
         bench: What is timed and how often.
-        remat: Compute activations again in the backward pass, to save memory.
+        remat: What a block keeps for the backward pass; the rest is computed again.
     """
     commands.train(bench, remat)
 
@@ -138,7 +139,7 @@ def tokenize(
     tokenizer: str = "magvit2",
     piece: int | None = None,
     repeats: int = 30,
-    dtype: Literal["float32", "bfloat16"] = "float32",
+    dtype: Dtype = "float32",
     seed: int = 0,
     out: Path = Path("runs/bench"),
 ) -> None:

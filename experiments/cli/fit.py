@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import arg
 
 from experiments.cli.bench import Model
 from experiments.progress import console, step, tidy_table
-from hma_jax.config import MeshConfig, TrainConfig
+from hma_jax.config import ExecutionConfig, MeshConfig, TrainConfig
+from hma_jax.config.execution import Dtype, Remat
 
 
 def fit(
@@ -19,8 +20,8 @@ def fit(
     batch: int = 64,
     mesh: tuple[int, int, int] = (1, -1, 1),
     robots: int = 1,
-    dtype: Literal["float32", "bfloat16"] = "bfloat16",
-    remat: bool = True,
+    dtype: Dtype = "bfloat16",
+    remat: Remat = "everything",
 ) -> None:
     """Compile the real training step and say what every device would hold: does it fit?
 
@@ -33,7 +34,7 @@ def fit(
         mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
         robots: Embodiments of the model.
         dtype: What is computed in; parameters and moments are float32.
-        remat: Compute activations again in the backward pass.
+        remat: What a block keeps for the backward pass; the rest is computed again.
     """
     if any(name != "local" for name in topology):  # read when JAX starts
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -42,16 +43,17 @@ def fit(
     from experiments.bench.fit import Fit, check_fit, find_devices
     from experiments.bench.models import make_shape
 
-    config, table = make_shape(model, dtype, robots, remat=remat)
+    config, table = make_shape(model, robots)
+    execution = ExecutionConfig(dtype, remat, mesh=MeshConfig(*mesh))
     train = replace(TrainConfig(), batch=batch)
     rows: list[tuple[str, Fit]] = []
     for name in topology:
         devices = find_devices(name)
         with step(f"compile {model} for {name} ({len(devices)} devices)"):
-            rows.append((name, check_fit(config, table, train, MeshConfig(*mesh), devices)))
+            rows.append((name, check_fit(config, table, train, execution, devices)))
     parameters = rows[0][1].parameters
     report = tidy_table(
-        f"{model}: {parameters / 1e6:,.1f} M parameters, batch {batch}, {dtype}, {'with' if remat else 'no'} remat",
+        f"{model}: {parameters / 1e6:,.1f} M parameters, batch {batch}, {dtype}, remat {remat}",
         "topology", "mesh", "arguments", "temporary", "peak", "TFLOP/step", "verdict",
     )  # fmt: skip
     for name, fit in rows:

@@ -11,7 +11,7 @@ from experiments.cli.where import How, Where
 from experiments.commands import model as model_commands
 from experiments.commands import study as commands
 from experiments.commands import tokenize as tokenize_commands
-from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.config import ConfigError
 
 Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]
 
@@ -37,11 +37,12 @@ def _run(where: Where, how: How, axes: tuple[str, ...]) -> None:
     setting = where.setting()
     if how.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {how.workers}")
-    mesh = MeshConfig(*how.mesh)
     if how.dry_run:
         commands.dry_run(setting.study, axes)
         return
-    commands.run_study(setting, axes, workers=how.workers, retry_failed=how.retry_failed, mesh=mesh)
+    commands.run_study(
+        commands.on_mesh(setting, how.mesh), axes, workers=how.workers, retry_failed=how.retry_failed
+    )
 
 
 def tokenize(
@@ -70,16 +71,17 @@ def tokenize(
 def train(
     where: OmitArgPrefixes[Where],
     run: Path | None = None,
-    mesh: tuple[int, int, int] = (-1, 1, 1),
+    mesh: tuple[int, int, int] | None = None,
 ) -> None:
     """Train one model, the study's reference trial; change it with --set.
 
     Args:
         where: Study, data, output directory and settings.
         run: Directory of the training run; OUT/model if not given. Resumed if it exists.
-        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
+        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left. Short for --set
+            execution.mesh.data=... and so on.
     """
-    model_commands.train(where.setting(), run, MeshConfig(*mesh))
+    model_commands.train(commands.on_mesh(where.setting(), mesh), run)
 
 
 def adapt(
@@ -87,7 +89,7 @@ def adapt(
     where: OmitArgPrefixes[Where],
     run: Path | None = None,
     everything: bool = False,
-    mesh: tuple[int, int, int] = (-1, 1, 1),
+    mesh: tuple[int, int, int] | None = None,
 ) -> None:
     """Add new robots to a trained model and train them on the study's datasets.
 
@@ -99,9 +101,10 @@ def adapt(
         where: The study with the new datasets. Give --tokenizer: the one of the trained model.
         run: Directory of the new training run; OUT/model if not given. Resumed if it exists.
         everything: Train the whole model, not the new robots' own parameters alone.
-        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
+        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left. Short for --set
+            execution.mesh.data=... and so on.
     """
-    model_commands.adapt(where.setting(), source, run, everything, MeshConfig(*mesh))
+    model_commands.adapt(commands.on_mesh(where.setting(), mesh), source, run, everything)
 
 
 def evaluate(run: Positional[Path], where: OmitArgPrefixes[Where]) -> None:

@@ -50,5 +50,5 @@ class How:
     """Run trials again that failed or diverged; otherwise they stay as they are, and visible."""
     dry_run: Annotated[bool, arg(name="dry-run")] = False
     """Print trials, parameters, FLOPs and expected time, and stop."""
-    mesh: tuple[int, int, int] = (-1, 1, 1)
+    mesh: tuple[int, int, int] | None = None
     """Devices for data, fsdp and tensor parallelism; -1 takes those that are left."""

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from experiments.cli.bench import Bench, Decode
     from experiments.commands.study import Setting
     from hma_jax.config import DecodeConfig
+    from hma_jax.config.execution import Remat
 
 
 def generate(bench: Bench, decode: Decode) -> None:
@@ -49,7 +50,7 @@ def rollouts(bench: Bench, decode: Decode, frames: int, prompt: int, slide: str,
     _finish("rollout", bench, subject, stages, found, settings, notes)
 
 
-def train(bench: Bench, remat: bool) -> None:
+def train(bench: Bench, remat: Remat) -> None:
     from experiments.bench.train import time_training
 
     subject = _subject(bench, remat=remat)
@@ -57,7 +58,7 @@ def train(bench: Bench, remat: bool) -> None:
         bench, "training steps", lambda rows: time_training(subject, rows, bench.repeats)
     )
     found = _ratios(bench, stages, "step", "forward") | _ratios(bench, stages, "step", "plain")
-    _finish("train", bench, subject, stages, found, {"remat": remat})
+    _finish("train", bench, subject, stages, found, {})
 
 
 def evaluate(bench: Bench, context: Literal["recorded", "generated"], draws: int) -> None:
@@ -116,7 +117,7 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     plot_quality(rows, stem.with_suffix(".png"))
     gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr - rows[0].psnr for r in rows[1:]}
     facts = {"model": trained.model, "eval": replace(config, batch=1), "frames": frames, "windows": rows[0].windows}
-    _write("quality", f"{frames}-frames", trained.model.compute_dtype, 0, facts, stages, gaps, (), out)
+    _write("quality", f"{frames}-frames", subject.execution.dtype, 0, facts, stages, gaps, (), out)
     console.print(f"wrote {stem}.csv and {stem}.png", soft_wrap=True)
 
 
@@ -197,14 +198,16 @@ def _ratios(bench: Bench, stages: Sequence[Stage], above: str, below: str) -> di
     }
 
 
-def _subject(bench: Bench, **changes: Any) -> Subject:
+def _subject(bench: Bench, remat: Remat = "products") -> Subject:
     from experiments.bench.models import make_subject
+    from hma_jax.config import ExecutionConfig
 
     if bench.repeats < 1 or min(bench.batch, default=0) < 1:
         raise ConfigError("--repeats and --batch must be at least 1")
     with step(f"draw the weights of {bench.model}"):
         sizes = {"layers": bench.layers, "width": bench.width}
-        return make_subject(bench.model, bench.dtype, bench.robots, bench.seed, **sizes, **changes)
+        execution = ExecutionConfig(bench.dtype, remat)
+        return make_subject(bench.model, execution, bench.robots, bench.seed, **sizes)
 
 
 def _decode(decode: Decode) -> DecodeConfig:
@@ -222,7 +225,7 @@ def _finish(
     settings: dict[str, Any],
     notes: tuple[str, ...] = (),
 ) -> None:
-    settings = settings | {"model": subject.config, "robots": bench.robots}
+    settings = settings | {"model": subject.config, "execution": subject.execution, "robots": bench.robots}
     sizes = {"layers": bench.layers, "width": bench.width}
     name = "-".join([bench.model, *(f"{what}-{size}" for what, size in sizes.items() if size)])
     _write(kind, name, bench.dtype, bench.seed, settings, stages, ratios, notes, bench.out)

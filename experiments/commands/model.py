@@ -12,7 +12,7 @@ from experiments.atomic import write_atomically
 from experiments.commands.study import Setting, next_command, short, wrote
 from experiments.progress import console, step, tidy_table
 from experiments.sweep import reference_trial
-from hma_jax.config import ConfigError, MeshConfig, require
+from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
     from experiments.trial import Materials, Trial
@@ -26,14 +26,14 @@ SHOWN = (
 """Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all."""
 
 
-def train(setting: Setting, run: Path | None, mesh: MeshConfig) -> None:
+def train(setting: Setting, run: Path | None) -> None:
     """Trains the study's reference trial by itself."""
     _prepare(setting)
     trial = reference_trial(setting.study, setting.study.seeds[0])
-    _train(setting, trial, run or setting.workspace.root / "model", mesh)
+    _train(setting, trial, run or setting.workspace.root / "model")
 
 
-def adapt(setting: Setting, source: Path, run: Path | None, everything: bool, mesh: MeshConfig) -> None:
+def adapt(setting: Setting, source: Path, run: Path | None, everything: bool) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.trial import open_materials
     from hma_jax.training.adapt import add_embodiments
@@ -56,7 +56,7 @@ def adapt(setting: Setting, source: Path, run: Path | None, everything: bool, me
     )
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     origin = {"step": trained.step, "provenance": trained.provenance}
-    _train(setting, trial, run or setting.workspace.root / "model", mesh, table=table, initial=params, origin=origin)
+    _train(setting, trial, run or setting.workspace.root / "model", table=table, initial=params, origin=origin)
 
 
 def _prepare(setting: Setting) -> None:
@@ -66,7 +66,7 @@ def _prepare(setting: Setting) -> None:
         prepare(setting.study, setting.workspace, setting.data, setting.tokenizer)
 
 
-def _train(setting: Setting, trial: Trial, run: Path, mesh: MeshConfig, **start: Any) -> None:
+def _train(setting: Setting, trial: Trial, run: Path, **start: Any) -> None:
     from experiments.trial import open_materials, train_trial
 
     with step(f"train: {trial.title}") as update:
@@ -74,7 +74,7 @@ def _train(setting: Setting, trial: Trial, run: Path, mesh: MeshConfig, **start:
             trial,
             open_materials(setting.workspace),
             run,
-            mesh=mesh,
+            execution=setting.study.execution,
             progress=lambda phase, done, total: update(done, total, phase),
             **start,
         )
@@ -102,6 +102,7 @@ def evaluate(setting: Setting, run: Path) -> None:
             materials,
             setting.study.eval,
             trained.train.masking.setting,
+            execution=setting.study.execution,
             progress=lambda phase, done, total: update(done, total, phase),
         )
     metrics = [m for m in SHOWN if m in evaluation.overall]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.markup import escape
@@ -28,7 +28,7 @@ from experiments.runner import Job, State, read_states, run_missing
 from experiments.study import Study, on_tokenizer, on_user_data, override
 from experiments.sweep import titles, unique_trials
 from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
-from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
 
 AXES = {
@@ -95,6 +95,15 @@ def make_setting(
     return Setting(study, directories, workspace, tokenizer and tokenizer.absolute(), registry and registry.absolute())
 
 
+def on_mesh(setting: Setting, mesh: tuple[int, int, int] | None) -> Setting:
+    """The same, its trials on devices for (data, fsdp, tensor) parallelism; None: as the study says."""
+    if mesh is None:
+        return setting
+    study = setting.study
+    sizes = replace(study.execution.mesh, data=mesh[0], fsdp=mesh[1], tensor=mesh[2])
+    return replace(setting, study=replace(study, execution=replace(study.execution, mesh=sizes)))
+
+
 def use_entries(registry: Path | None) -> None:
     """Adds the entries of a TOML file to the registry, for the rest of this process."""
     if registry is not None:
@@ -124,9 +133,7 @@ def dry_run(study: Study, axes: Sequence[str]) -> None:
     console.print(plan_table(study, [AXES[axis](study) for axis in axes]))
 
 
-def run_study(
-    setting: Setting, axes: Sequence[str], *, workers: int, retry_failed: bool, mesh: MeshConfig
-) -> None:
+def run_study(setting: Setting, axes: Sequence[str], *, workers: int, retry_failed: bool) -> None:
     """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end."""
     from experiments.pipeline import prepare, require_simulated
 
@@ -140,7 +147,7 @@ def run_study(
         record = Record(study, setting.data, all_axes, command_line(), provenance)
         save_record(workspace, record)
         trials = unique_trials(sweeps, provenance)
-        common = {"provenance": to_dict(provenance), "mesh": to_dict(mesh)}
+        common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution)}
         # The widest take longest: first, so that no worker is left with one at the end.
         ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
         names = titles(sweeps, provenance)

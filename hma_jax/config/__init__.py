@@ -7,11 +7,10 @@ computed; paths, clocks and verbosity belong to the code that calls. `json` read
 
 from hma_jax.config.base import ConfigError, require
 from hma_jax.config.evaluation import DecodeConfig, EvalConfig, SamplerConfig
-from hma_jax.config.execution import MeshConfig
+from hma_jax.config.execution import Dtype, ExecutionConfig, MeshConfig
 from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
 from hma_jax.config.pretrained_tokenizers import (
     AnyTokenizerConfig,
-    Dtype,
     Latents,
     Magvit2Config,
     PixelsConfig,
@@ -29,6 +28,7 @@ __all__ = [
     "DiffusionConfig",
     "Dtype",
     "EvalConfig",
+    "ExecutionConfig",
     "Latents",
     "Magvit2Config",
     "MaskingConfig",

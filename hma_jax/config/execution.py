@@ -1,10 +1,30 @@
-"""How a run is computed; nothing here is part of what it is."""
+"""How a program is computed: recorded with a run, but no part of what the run is.
+
+Two starts of one run may differ in all of this (`training.train`); what they compute differs by
+rounding at most.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 from hma_jax.config.base import require
+
+Dtype = Literal["float32", "bfloat16"]
+
+Remat = Literal["none", "products", "attention", "everything", "offload"]
+"""What a block keeps for its backward pass; what it does not keep is computed again.
+
+    none        whatever the gradient asks for: most memory, nothing computed twice
+    products    matrix products and attention; norms and activations are computed again
+    attention   attention and the first product of the MLP
+    everything  the block's input alone
+    offload     the block's input alone, in the memory of the host
+"""
+
+Attention = Literal["auto", "plain", "cpu", "cudnn", "splash"]
+"""What computes attention (`hma_jax.kernels`); `auto` takes what suits the platform and the shapes."""
 
 
 @dataclass(frozen=True)
@@ -20,3 +40,17 @@ class MeshConfig:
         sizes = (self.data, self.fsdp, self.tensor)
         require(sizes.count(-1) <= 1, f"mesh: only one axis may be -1, got {sizes}")
         require(all(s == -1 or s >= 1 for s in sizes), f"mesh axes must be -1 or at least 1, got {sizes}")
+
+
+@dataclass(frozen=True)
+class ExecutionConfig:
+    """Number format, memory, kernels and devices of a program."""
+
+    dtype: Dtype = "float32"  # of activations and of weights where they are used; parameters are float32
+    remat: Remat = "everything"
+    attention: Attention = "auto"
+    accumulate: int = 1  # micro-batches per optimiser step
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+
+    def __post_init__(self):
+        require(self.accumulate >= 1, f"execution.accumulate must be at least 1, got {self.accumulate}")

@@ -93,10 +93,6 @@ class ModelConfig:
     trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
     stem_gain: float = 0.01  # Xavier gain of the action stems
     mup: MupConfig = field(default_factory=MupConfig)
-    compute_dtype: Literal["float32", "bfloat16"] = "float32"
-    remat: bool = True  # keep no more than a block's input for the backward pass; False: its products too
-    # Large frames attend one at a time on CPU (`by_frame`), or all at once (`whole`, to compare with).
-    attention: Literal["by_frame", "whole"] = "by_frame"
 
     def __post_init__(self):
         require(

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hma_jax.config.base import require
+from hma_jax.config.execution import Dtype
 from hma_jax.config.tokenizer import TokenizerConfig
-
-Dtype = Literal["float32", "bfloat16"]
 
 
 class Square:

@@ -75,7 +75,6 @@ class TrainConfig:
 
     steps: int = 60_000
     batch: int = 64
-    accumulate: int = 1  # micro-batches per step
     seed: int = 0
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
@@ -83,7 +82,4 @@ class TrainConfig:
 
     def __post_init__(self):
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
-        require(
-            self.batch % self.accumulate == 0,
-            f"train.batch {self.batch} is not a multiple of train.accumulate {self.accumulate}",
-        )
+        require(self.batch >= 1, f"train.batch must be at least 1, got {self.batch}")

@@ -33,7 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import EvalConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.metrics import (
     Stat,
     corpus_perplexity,
@@ -131,7 +131,11 @@ class Predicted(NamedTuple):
 
 @functools.lru_cache(maxsize=4)  # a second evaluation of the same shapes compiles nothing
 def make_evaluator(
-    model: ModelConfig, table: EmbodimentTable, config: EvalConfig, setting: Setting = "forward"
+    model: ModelConfig,
+    table: EmbodimentTable,
+    config: EvalConfig,
+    setting: Setting = "forward",
+    execution: ExecutionConfig = ExecutionConfig(),
 ) -> Callable:
     """A jitted f(params, batch) -> (metrics {name: [B]}, Predicted)."""
     require(
@@ -139,7 +143,7 @@ def make_evaluator(
         f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of "
         f"{model.frames} frames",
     )
-    declared = declare_model(model, table)
+    declared = declare_model(model, table, execution)
 
     def hidden(actions_BTU: jax.Array, embodiment_B: jax.Array) -> jax.Array | None:
         shape = actions_BTU.shape[:2]
@@ -248,6 +252,7 @@ def evaluate(
     config: EvalConfig,
     *,
     setting: Setting = "forward",
+    execution: ExecutionConfig = ExecutionConfig(),
     samples_per_dataset: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> Evaluation:
@@ -257,7 +262,7 @@ def evaluate(
     valid (bool [B]: rows that are not padding). `setting` is what the model was trained for.
     `progress` is told the windows done so far.
     """
-    evaluator = make_evaluator(model, table, config, setting)
+    evaluator = make_evaluator(model, table, config, setting, execution)
     columns: dict[str, dict[str, list[np.ndarray]]] = {}
     result = Evaluation()
     done = 0

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.config import ModelConfig
+from hma_jax.config import ExecutionConfig, ModelConfig
 from hma_jax.kernels.attend import attend_all_within, attend_over_time, attend_within
 from hma_jax.kernels.ops import contract, kept
 from hma_jax.model.initial import trunk_init
@@ -31,7 +31,7 @@ def attention_scale(config: ModelConfig) -> float:
 class Attention(nnx.Module):
     """q, k, v and output projections; the caller says over which axis and what is visible."""
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: ModelConfig, execution: ExecutionConfig):
         width, heads, head = config.width, config.heads, config.head_width
         # The fans are those of the fused (3D, D) matrix of the release.
         init = trunk_init(config, width, 3 * width)
@@ -43,7 +43,7 @@ class Attention(nnx.Module):
         self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
         self.norm = LayerNorm(head, axis=None) if config.qk_norm else None
         self.heads, self.scale = heads, attention_scale(config)
-        self.by_frame = config.attention == "by_frame"
+        self.by_frame = execution.attention != "plain"
 
     def project(self, x: jax.Array) -> jax.Array:
         """x [..., D] -> queries, keys and values [..., 3, H, I]."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.config import ModelConfig
+from hma_jax.config import ExecutionConfig, ModelConfig
 from hma_jax.model.conditioning import ActionFeature
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import make_embed, make_frame_head
@@ -40,8 +40,8 @@ class Outputs(NamedTuple):
 class HMA(nnx.Module):
     """Both variants, under every conditioning."""
 
-    def __init__(self, config: ModelConfig, table: EmbodimentTable):
-        self.config, self.table = config, table
+    def __init__(self, config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig):
+        self.config, self.table, self.dtype = config, table, jnp.dtype(execution.dtype)
         self.embed = make_embed(config)
         shape = (config.frames, config.position_slots, config.width)
         self.positions = param(shape, ("T", "P", "D"), zeros, role="vector")
@@ -50,7 +50,7 @@ class HMA(nnx.Module):
         # One vector per frame for actions that are hidden.
         self.action_mask = param((config.frames, config.width), ("T", "D"), zeros, role="vector")
         self.action_mask.set_metadata(use="actions_hidden")
-        self.trunk = Trunk(config, table.size)
+        self.trunk = Trunk(config, table.size, execution)
         self.frame_head = make_frame_head(config)
         self.denoiser = (
             used("frames_predicted", Denoiser(config, config.diffusion.token_channels))
@@ -85,20 +85,19 @@ class HMA(nnx.Module):
         """
         config = self.config
         count = frames.shape[1]
-        dtype = jnp.dtype(config.compute_dtype)
         if positions is None:
             positions = first + jnp.arange(count)
         if visible is None:
             visible = causal(count)
-        x = self.embed(frames, masked, dtype)
+        x = self.embed(frames, masked, self.dtype)
         action = None
         if actions_BTU is not None:
-            feature = self.stem(actions_BTU, embodiment_B, dtype)
+            feature = self.stem(actions_BTU, embodiment_B, self.dtype)
             shown = None if hidden_BT is None or leak != "none" else ~hidden_BT
             action = ActionFeature(feature, shown)
             if config.concat:
                 x = jnp.concatenate([x, self._action_tokens(feature, hidden_BT, leak, positions)], axis=2)
-        x = x + jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]].astype(dtype)
+        x = x + jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]].astype(self.dtype)
         if self.norm is not None:
             x = self.norm(x)
         x = constrain(x, ("B", None, None, "D_act"))
@@ -139,6 +138,8 @@ class HMA(nnx.Module):
         return jnp.concatenate([jnp.ones_like(hidden_BT[:, :1]), hidden_BT[:, :-1]], axis=1)
 
 
-def declare_model(config: ModelConfig, table: EmbodimentTable) -> Declared:
-    """The model's declarations; see `params.Declared` for init, merge and count."""
-    return declare(lambda: HMA(config, table))
+def declare_model(
+    config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+) -> Declared:
+    """The model's declarations, which do not depend on how it is executed; see `params.Declared`."""
+    return declare(lambda: HMA(config, table, execution))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 from flax import nnx
 
-from hma_jax.config import ModelConfig
+from hma_jax.config import ExecutionConfig, ModelConfig
 from hma_jax.kernels.ops import KEPT, gelu, kept
 from hma_jax.model.attention import Attention
 from hma_jax.model.conditioning import ActionFeature, make_conditioning
@@ -31,12 +31,12 @@ class Block(nnx.Module):
     attention: the released checkpoints were trained so.
     """
 
-    def __init__(self, config: ModelConfig, embodiments: int):
+    def __init__(self, config: ModelConfig, embodiments: int, execution: ExecutionConfig):
         # With qk_norm the release drops both block norms (reference section 1.4).
         self.norm_space = None if config.qk_norm else LayerNorm(config.width)
-        self.space = Attention(config)
+        self.space = Attention(config, execution)
         self.conditioning = make_conditioning(config, embodiments)
-        self.time = Attention(config)
+        self.time = Attention(config, execution)
         self.norm_mlp = None if config.qk_norm else LayerNorm(config.width)
         sizes = (config.width, config.mlp_width)
         options = {"init": trunk_init(config, *sizes), "role": "hidden", "with_bias": config.mlp_bias}
@@ -69,9 +69,9 @@ class Block(nnx.Module):
 class Trunk(nnx.Module):
     """The part all robots share, but for the conditioning inside its blocks."""
 
-    def __init__(self, config: ModelConfig, embodiments: int):
-        self.blocks = stack(lambda: Block(config, embodiments), config.layers)
-        self.remat = config.remat
+    def __init__(self, config: ModelConfig, embodiments: int, execution: ExecutionConfig):
+        self.blocks = stack(lambda: Block(config, embodiments, execution), config.layers)
+        self.remat = execution.remat
 
     def __call__(
         self,
@@ -96,6 +96,6 @@ class Trunk(nnx.Module):
             return constrain(x, ("B", None, None, "D_act")), new
 
         keep_marked = jax.checkpoint_policies.save_only_these_names(KEPT)
-        body = jax.checkpoint(body, prevent_cse=False, policy=None if self.remat else keep_marked)
+        body = jax.checkpoint(body, prevent_cse=False, policy=keep_marked if self.remat == "products" else None)
         x, new = jax.lax.scan(body, x_BTPD, (layers, past))
         return x, new

@@ -47,7 +47,7 @@ def init_state(
 
 
 def make_train_step(
-    declared: Declared, table: EmbodimentTable, model: ModelConfig, config: TrainConfig
+    declared: Declared, table: EmbodimentTable, model: ModelConfig, config: TrainConfig, accumulate: int = 1
 ) -> Callable[[TrainState, Batch], tuple[TrainState, dict[str, jax.Array]]]:
     """step(state, batch) -> (state, metrics), to be jitted with the state donated.
 
@@ -55,6 +55,10 @@ def make_train_step(
     its hidden actions, whatever the number of micro-batches. Randomness is fold_in(seed, step),
     then the example's row.
     """
+    require(
+        config.batch % accumulate == 0,
+        f"train.batch {config.batch} is not a multiple of execution.accumulate {accumulate}",
+    )
     schedule = make_schedule(config.optimizer, config.steps)
     masking = config.masking
     require(
@@ -86,10 +90,10 @@ def make_train_step(
 
     def accumulated(params: Any, batch: Batch, counts: TargetCounts) -> tuple[Any, LossSums]:
         gradient = jax.grad(sums, has_aux=True)
-        if config.accumulate == 1:
+        if accumulate == 1:
             return gradient(params, batch, counts)
         # Micro-batch a takes rows a, a + A, ...: every device keeps the rows it has.
-        micro = jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=config.accumulate), batch)
+        micro = jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=accumulate), batch)
         zero = jax.tree.map(jnp.zeros_like, params)
 
         def body(carry: tuple[Any, LossSums], one: Batch) -> tuple[tuple[Any, LossSums], None]:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
-from hma_jax.config import MeshConfig, ModelConfig, TrainConfig
+from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import peak_flops, train_flops_per_window
@@ -45,7 +45,7 @@ def train_model(
     *,
     run_dir: Path,
     provenance: dict[str, Any],
-    mesh: MeshConfig = MeshConfig(),
+    execution: ExecutionConfig = ExecutionConfig(),
     options: LoopOptions = LoopOptions(),
     progress: Progress | None = None,
     initial: Params | None = None,
@@ -54,16 +54,18 @@ def train_model(
 
     `make_batches(start)` yields this process's rows of the global batches from step `start`
     on. A new run starts from `initial` parameters, or from a draw. `provenance` says what data
-    the batches come from; resuming on other data is refused. Raises ConfigError, CheckpointError, DivergedError, Interrupted.
+    the batches come from; resuming on other data is refused. `execution` says how it is computed, and may
+    be another one each time. Raises ConfigError, CheckpointError, DivergedError, Interrupted.
     """
-    declared = declare_model(model, table)
+    declared = declare_model(model, table, execution)
+    mesh = execution.mesh
     device_mesh = make_mesh(mesh)
     audit_sharding(plan_sharding(declared, device_mesh, mesh), device_mesh)
     shardings = state_shardings(declared, device_mesh, mesh)
     with jax.set_mesh(device_mesh):
         state = init_state(declared, table, config.seed, shardings, initial)
         step = jax.jit(
-            make_train_step(declared, table, model, config),
+            make_train_step(declared, table, model, config, execution.accumulate),
             donate_argnums=0,
             out_shardings=(shardings, None),
         )

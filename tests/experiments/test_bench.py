@@ -14,13 +14,13 @@ from experiments.bench.rollout import agreement, time_rollouts
 from experiments.bench.timing import Timing, summarise, time_by_turns
 from experiments.bench.train import time_training
 from experiments.cli.main import main
-from hma_jax.config import ConfigError, DecodeConfig, EvalConfig
+from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig
 from tests.data_pipelines.fakes import REAL_DATA
 
 
 @pytest.fixture(scope="module")
 def subject():
-    return make_subject("cpu", "float32", robots=2, layers=1)
+    return make_subject("cpu", robots=2, layers=1)
 
 
 def test_stages_take_turns_and_are_warmed_up():
@@ -57,11 +57,11 @@ def test_the_fast_evaluation_has_the_numbers_of_the_literal_one(subject):
 
 def test_an_unknown_model_is_refused_by_name():
     with pytest.raises(ConfigError, match="unknown model 'huge'; known: base, xl"):
-        make_subject("huge", "float32")
+        make_subject("huge")
 
 
 def test_inference_weights_are_read_in_the_type_they_are_used_in():
-    subject = make_subject("cpu", "bfloat16", layers=1)
+    subject = make_subject("cpu", ExecutionConfig("bfloat16"), layers=1)
     kernels = [x for x in jax.tree.leaves(subject.inference_params) if x.ndim > 1]
     assert {x.dtype.name for x in kernels} == {"bfloat16"}
     assert {x.dtype.name for x in jax.tree.leaves(subject.params)} == {"float32"}
@@ -122,7 +122,7 @@ def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
 
 
 def test_decodings_vary_what_the_model_leaves_open():
-    ids, latents = (make_subject(name, "float32", layers=1).config for name in ("cpu", "cpu-continuous"))
+    ids, latents = (make_subject(name, layers=1).config for name in ("cpu", "cpu-continuous"))
     assert list(decodings(ids, EvalConfig(), 12)) == ["M = 8", "M = 4", "M = 2", "M = 1"]
     assert list(decodings(ids, EvalConfig(), 24)) == ["exact", "streaming"]
     samplers = decodings(latents, EvalConfig(), 12)

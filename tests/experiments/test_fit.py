@@ -8,7 +8,7 @@ import pytest
 from experiments.bench.fit import abstract_inputs, check_fit, count_collectives, find_devices
 from experiments.bench.models import MODELS
 from experiments.cli.bench import Model
-from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.sharding import make_mesh
 from hma_jax.training.step import init_state
@@ -35,7 +35,7 @@ def test_the_abstract_state_has_the_shapes_of_a_real_one():
 
 def test_a_step_that_fits_is_reported_with_its_memory_and_parameters():
     config, train = model_config(layers=1), train_config()
-    fit = check_fit(config, TABLE, train, MeshConfig(), jax.devices()[:1])
+    fit = check_fit(config, TABLE, train, ExecutionConfig(), jax.devices()[:1])
     assert fit.parameters == declare_model(config, TABLE).count() and fit.devices == 1
     assert fit.arguments > 3 * 4 * fit.parameters  # weights and two moments
     assert not fit.refusal and not fit.collectives
@@ -43,7 +43,7 @@ def test_a_step_that_fits_is_reported_with_its_memory_and_parameters():
 
 def test_a_mesh_that_does_not_suit_the_devices_is_refused():
     with pytest.raises(ConfigError, match="does not fit 1 device"):
-        check_fit(model_config(), TABLE, train_config(), MeshConfig(2, 1, 1), jax.devices()[:1])
+        check_fit(model_config(), TABLE, train_config(), ExecutionConfig(mesh=MeshConfig(2, 1, 1)), jax.devices()[:1])
 
 
 def test_collectives_are_counted_whole_or_started():

@@ -78,10 +78,10 @@ def test_user_data_cuts_the_counts():
 
 def test_override_sets_nested_fields_and_lists():
     study = override(SMOKE, ["model.frames=3", "widths=4,16", "train.optimizer.learning_rate=1", "seeds=[0,1]",
-                             "model.compute_dtype=bfloat16", "store.frame_step=1", "model.remat=false"])  # fmt: skip
+                             "execution.dtype=bfloat16", "store.frame_step=1", "model.mup.enabled=false"])  # fmt: skip
     assert (study.model.frames, study.widths, study.seeds) == (3, (4, 16), (0, 1))
     assert study.train.optimizer.learning_rate == 1.0 and study.store.frame_step == 1
-    assert study.model.compute_dtype == "bfloat16" and study.model.remat is False
+    assert study.execution.dtype == "bfloat16" and study.model.mup.enabled is False
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def test_override_sets_nested_fields_and_lists():
         ("model.frames", "path=value"),
         ("model.frames=many", "not a number"),
         ("model.frames=2.5", "expected a value like"),
-        ("model.remat=3", "expected a value like"),
+        ("model.mup.enabled=3", "expected a value like"),
         ("eval.prompt_frames=4", "leaves nothing to predict"),
         ("model.tokens=9", "the tokenizer makes 16"),
         ("widths=4,8", "must contain model.width"),

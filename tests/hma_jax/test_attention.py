@@ -1,12 +1,12 @@
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hma_jax.config import ExecutionConfig
 from hma_jax.kernels import attend
-from tests.tiny import lively_params, model_config, random_batch
+from hma_jax.model.hma import declare_model
+from tests.tiny import TABLE, lively_params, model_config, random_batch
 
 
 def drawn(seed: int, *shape: int) -> np.ndarray:
@@ -36,8 +36,9 @@ def test_a_model_says_the_same_whichever_way_it_attends():
     config = model_config(width=16, layers=1, tokens=260, action_tokens=4)
     batch = random_batch(0, config, 2)
     said = []
-    for how in ("by_frame", "whole"):
-        declared, params = lively_params(replace(config, attention=how))
+    _, params = lively_params(config)
+    for how in ("auto", "plain"):
+        declared = declare_model(config, TABLE, ExecutionConfig(attention=how))
         look = jax.jit(lambda p, d=declared: d.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).frames)
         said.append(np.asarray(look(params)))
     np.testing.assert_allclose(*said, atol=1e-4 * np.abs(said[1]).max())

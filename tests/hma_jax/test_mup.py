@@ -47,7 +47,7 @@ def variant(name: str, **changes) -> ModelConfig:
     """
     settings = dict(
         width=BASE, layers=1, heads=2, frames=3, tokens=4, action_tokens=1, action_heads=False,
-        stem_gain=1.0, remat=False, mup=MupConfig(base_width=BASE, attention_scale=4.0),
+        stem_gain=1.0, mup=MupConfig(base_width=BASE, attention_scale=4.0),
     )  # fmt: skip
     return model_config(**settings | VARIANTS[name] | changes)
 

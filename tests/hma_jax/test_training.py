@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.config import OptimizerConfig
+from hma_jax.config import ExecutionConfig, OptimizerConfig
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.loop import DivergedError, Interrupted, LoopOptions
 from hma_jax.training.train import load_run, train_model
@@ -129,7 +129,7 @@ def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path
 
 def test_micro_batches_change_nothing_but_rounding(tmp_path: Path):
     whole = train(tmp_path / "whole")
-    split = train(tmp_path / "split", config=train_config(accumulate=4))
+    split = train(tmp_path / "split", execution=ExecutionConfig(accumulate=4))
     np.testing.assert_allclose(split.losses, whole.losses, rtol=1e-5)
 
 

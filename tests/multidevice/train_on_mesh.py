@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax
 
-from hma_jax.config import MeshConfig
+from hma_jax.config import ExecutionConfig, MeshConfig
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
 from tests.tiny import TABLE, batches, model_config, train_config
@@ -22,7 +22,7 @@ def main(mesh: str, run_dir: str, steps: str) -> None:
         batches(model),
         run_dir=Path(run_dir),
         provenance={},
-        mesh=MeshConfig(data=data, fsdp=fsdp, tensor=tensor, min_shard_size=64),
+        execution=ExecutionConfig(mesh=MeshConfig(data, fsdp, tensor, min_shard_size=64)),
         options=LoopOptions(),
     )
     arrays = jax.tree.leaves(result.state.params)
