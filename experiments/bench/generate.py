@@ -20,8 +20,8 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import Compiled, compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
-from hma_jax.generation import rollout_naive
-from hma_jax.generation.window import Window, empty_cache
+from hma_jax.generation import rollout_naive, steps
+from hma_jax.generation.cache import Window
 from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.hma import HMA, declare_model
 
@@ -32,18 +32,21 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
     size, batch, weights = config.frames, subject.batch(rows), subject.inference_params
     keys = jax.random.split(jax.random.key(subject.seed), rows)
     past, newest = batch["tokens"][:, :-1], batch["tokens"][:, -2]
-    cache = jax.jit(lambda p: empty_cache(declared.merge(p), rows, size - 1))(weights)
-
     def window(model: HMA) -> Window:
         return Window.over(model, batch["actions"], None, batch["embodiment"])
 
+    cache = jax.jit(lambda p: window(declared.merge(p)).start(past, size - 1))(weights)
+
+    def window_pass(model: HMA) -> jax.Array:
+        return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).said
+
     def whole(params: Any) -> jax.Array:
-        return window(declared.merge(params)).pass_over(batch["tokens"], None, 0).frames
+        return window_pass(declared.merge(params))
 
     def plain(params: Any) -> jax.Array:
         execution = replace(subject.execution, attention="plain")
         model = declare_model(config, subject.table, execution).merge(params)
-        return window(model).pass_over(batch["tokens"], None, 0).frames
+        return window_pass(model)
 
     def recompute(params: Any) -> jax.Array:
         return rollout_naive(
@@ -51,13 +54,13 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
         )
 
     def slide(params: Any) -> jax.Array:
-        return window(declared.merge(params)).slide(past, keys, decode)
+        return steps.slide(window(declared.merge(params)), past, keys, decode)
 
     def fill(params: Any, cache: Any) -> Any:
-        return window(declared.merge(params)).fill(cache, newest, jnp.int32(size - 1), keys, decode)
+        return steps.fill(window(declared.merge(params)), cache, newest, jnp.int32(size - 1), keys, decode)
 
     def stream(params: Any, cache: Any) -> Any:
-        return window(declared.merge(params)).stream(cache, newest, jnp.int32(size), keys, decode)
+        return steps.stream(window(declared.merge(params)), cache, newest, jnp.int32(size), keys, decode)
 
     compiled = {f.__name__: compile_call(f, weights) for f in (whole, plain, recompute, slide)}
     calls: dict[str, Callable[[], Any]] = {

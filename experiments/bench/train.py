@@ -33,7 +33,7 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
             masked = mask_batch(key, batch["tokens"], batch["embodiment"], config, settings.masking, table)
             return model(
                 masked.inputs, masked.masked, model.align(batch["actions"]), batch["embodiment"]
-            ).frames
+            ).said
 
         return forward
 

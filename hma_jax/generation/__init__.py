@@ -1,7 +1,7 @@
 """Generation: whole rollouts, one frame at a time, teacher-forced looks, and policies.
 
-One way of filling a frame (`decoding`), one set of cached passes (`window`); the rest is who
-asks for which frame.
+One way of filling a frame (`decoding`), one cache of finished frames (`cache`), three ways to the next one
+(`steps`); the rest is who asks for which frame.
 """
 
 from hma_jax.generation.policy import predict_actions, predict_next_actions, read_actions, rollout_policy

@@ -6,9 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
-from hma_jax.generation.window import Window, room_of
-from hma_jax.model.hma import HMA, Outputs, causal
-from hma_jax.model.trunk import TemporalCache
+from hma_jax.generation import steps
+from hma_jax.generation.cache import FrameCache, Window
+from hma_jax.generation.rollout import fold_in
+from hma_jax.generation.teacher import beside
+from hma_jax.model.hma import HMA, Outputs
 from hma_jax.objective.diffusion import make_process, respace, sample_with_key
 
 
@@ -53,19 +55,17 @@ def predict_next_actions(
     if model.config.action_alignment == "causal":
         nothing = jnp.zeros((batch, count), bool)
         return predict_actions(model, frames, actions_BTU, embodiment_B, nothing, key_B, decode)
-    twice = lambda x: jnp.concatenate([x, x], axis=1)  # noqa: E731
     hidden = jnp.broadcast_to(jnp.arange(2 * count) >= count, (batch, 2 * count))
-    past, before = causal(count), jnp.tril(jnp.ones((count, count), bool), -1)
-    visible = jnp.block([[past, jnp.zeros_like(past)], [before, jnp.eye(count, dtype=bool)]])
-    positions = jnp.concatenate([jnp.arange(count)] * 2)
+    before = jnp.tril(jnp.ones((count, count), bool), -1)
     out = model(
-        twice(frames),
+        jnp.concatenate([frames, frames], axis=1),
         None,
-        twice(actions_BTU),
+        jnp.concatenate([actions_BTU, actions_BTU], axis=1),
         embodiment_B,
         hidden_BT=hidden,
-        visible=visible,
-        positions=positions,
+        visible=beside(before),
+        positions=jnp.tile(jnp.arange(count), 2),
+        said_from=2 * count,
     )
     own = out._replace(actions=None if out.actions is None else out.actions[:, count:])
     return read_actions(model, own, embodiment_B, key_B, decode)
@@ -79,18 +79,30 @@ def read_actions(
         model.action_head is not None and out.actions is not None,
         "the model predicts no actions; train one with model.action_heads=true and a conditioning with concat",
     )
-    config = model.config.diffusion
-    if config:
-        process = respace(make_process(config.steps), decode.sampler.steps)
-        shape = (*out.actions.shape[:2], model.table.action_width)
-        # In training padding and dead dimensions are 0 also when noised.
-        alive_BTU = jnp.asarray(model.table.alive())[embodiment_B][:, None]
-        head = model.action_head
-        network = lambda x, t: head(jnp.where(alive_BTU, x, 0), t, out.actions, embodiment_B)  # noqa: E731
-        normalised = sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)
+    if model.config.diffusion:
+        normalised = _sample_actions(model, out.actions, embodiment_B, key_B, decode)
     else:
         normalised = model.action_head(out.actions, embodiment_B)
     return model.table.unnormalise(normalised, embodiment_B)
+
+
+def _sample_actions(
+    model: HMA, features_BTD: jax.Array, embodiment_B: jax.Array, key_B: jax.Array, decode: DecodeConfig
+) -> jax.Array:
+    """Normalised chunks [B, T, U]. Each value has random numbers of its own: those of a robot do not depend
+    on U, which others decide."""
+    config, width = model.config.diffusion, model.table.action_width
+    process = respace(make_process(config.steps), decode.sampler.steps)
+    shape = (*features_BTD.shape[:2], width)
+    value = 2**16 * jnp.arange(shape[1])[:, None] + jnp.arange(width)
+    keys = jax.vmap(lambda key: jax.vmap(jax.vmap(lambda n: jax.random.fold_in(key, n)))(value))(key_B)
+    # In training padding and dead dimensions are 0 also when noised.
+    alive_BTU = jnp.asarray(model.table.alive())[embodiment_B][:, None]
+
+    def network(x: jax.Array, t: jax.Array) -> jax.Array:
+        return model.action_head(jnp.where(alive_BTU, x, 0), t, features_BTD, embodiment_B)
+
+    return sample_with_key(network, keys, shape, process, decode.sampler, config.clip)
 
 
 def rollout_policy(
@@ -120,19 +132,17 @@ def rollout_policy(
         unknown = jnp.broadcast_to(jnp.arange(frames) >= unknown_from, shape)
         return Window.over(model, chunks, unknown, embodiment_B)
 
-    cache = window(actions_BTU, count - 1).prefill(prompt[:, :-1], frames - 1)
-    nothing_masked = jnp.zeros((len(prompt), 1, model.config.tokens), bool)
+    cache = window(actions_BTU, count - 1).start(prompt[:, :-1], frames - 1)
 
-    def next_frame(carry: tuple[TemporalCache, jax.Array, jax.Array], t: jax.Array):
+    def next_frame(carry: tuple[FrameCache, jax.Array, jax.Array], t: jax.Array):
         cache, last, chunks = carry
         # The chunk after frame t - 1, read with that chunk hidden.
-        seen = jnp.append(jnp.arange(room_of(cache)) < t - 1, True)[None]
-        out = window(chunks, t - 1).pass_over(last[:, None], nothing_masked, t - 1, cache, seen)
-        keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(key_B)
+        out = window(chunks, t - 1).read(cache, last, t - 1)
+        keys = jax.vmap(jax.random.split)(fold_in(key_B, t))
         chunk = read_actions(model, out, embodiment_B, keys[:, 0], decode)
         chunks = jax.lax.dynamic_update_slice_in_dim(chunks, chunk, t - 1, axis=1)
         # Now it is known; the one after frame t is not.
-        cache, frame = window(chunks, t).fill(cache, last, t, keys[:, 1], decode)
+        cache, frame = steps.fill(window(chunks, t), cache, last, t, keys[:, 1], decode)
         return (cache, frame, chunks), frame
 
     carry = (cache, prompt[:, -1], actions_BTU)

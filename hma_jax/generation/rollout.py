@@ -8,13 +8,34 @@ is `decoding`'s business; everything here serves both variants.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
+from hma_jax.generation import steps
+from hma_jax.generation.cache import FrameCache, Window, cut
 from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
-from hma_jax.generation.window import Window
 from hma_jax.model.hma import HMA
+
+
+class Sequences(NamedTuple):
+    """Action sequences of B examples in a row, R of each, and what belongs to them."""
+
+    chunks: jax.Array  # raw [B R, T, U]
+    hidden: jax.Array | None  # [B R, T]
+    robots: jax.Array  # [B R]
+    keys: jax.Array  # [B R]
+
+    def window(self, model: HMA, first: int | jax.Array, size: int) -> Window:
+        """The window of `size` frames whose first position is frame `first`."""
+        hidden = None if self.hidden is None else cut(self.hidden, first, size)
+        return Window.over(model, cut(self.chunks, first, size), hidden, self.robots)
+
+    def keys_at(self, t: jax.Array) -> jax.Array:
+        """The keys of frame t."""
+        return fold_in(self.keys, t)
 
 
 def rollout(
@@ -40,48 +61,66 @@ def rollout(
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape
     count, size = prompt.shape[1], min(frames, model.config.frames)
-    flat = lambda x: None if x is None else jnp.repeat(x, repeats, axis=0)  # noqa: E731  [B, ...] -> [B R, ...]
-    chunks, hidden, robots, keys = (
+    sequences = Sequences(
         actions_BRTU.reshape(batch * repeats, frames, -1),
-        flat(hidden_BT),
-        flat(embodiment_B),
-        flat(key_B),
+        None if hidden_BT is None else jnp.repeat(hidden_BT, repeats, axis=0),
+        jnp.repeat(embodiment_B, repeats, axis=0),
+        jnp.repeat(key_B, repeats, axis=0),
     )
-
-    def window(first: int | jax.Array) -> Window:
-        """The one whose first position is frame `first`."""
-        cut = lambda x: None if x is None else jax.lax.dynamic_slice_in_dim(x, first, size, axis=1)  # noqa: E731
-        return Window.over(model, cut(chunks), cut(hidden), robots)
-
-    def frame_keys(t: jax.Array) -> jax.Array:
-        return jax.vmap(lambda k: jax.random.fold_in(k, t))(keys)
-
     # All prompt frames but the last, whose chunk may differ between sequences.
-    shared = Window.over(model, actions_BRTU[:, 0], hidden_BT, embodiment_B)
-    cache = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=1), shared.prefill(prompt[:, :-1], size - 1))
-    filling = window(0)
+    shared = Window.over(model, actions_BRTU[:, 0], hidden_BT, embodiment_B).start(prompt[:, :-1], size - 1)
+    layers = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=1), shared.layers)
+    seen = jnp.repeat(prompt, repeats, axis=0)
+    cache, new = _fill(model, sequences, FrameCache(layers, shared.valid), seen, size, decode)
+    if frames > size:
+        past = jnp.concatenate([seen, new], axis=1)[:, 1 - size :]
+        further = _slide if decode.slide == "exact" else _stream
+        more = further(model, sequences, cache, past, jnp.arange(size, frames), decode)
+        new = jnp.concatenate([new, more], axis=1)
+    return new.reshape(batch, repeats, -1, *prompt.shape[2:])
 
-    def fill(carry, t):
-        cache, frame = filling.fill(*carry, t, frame_keys(t), decode)
+
+def _fill(
+    model: HMA, sequences: Sequences, cache: FrameCache, prompt: jax.Array, size: int, decode: DecodeConfig
+) -> tuple[FrameCache, jax.Array]:
+    """(cache, frames after the prompt [B R, ...]) up to the end of the first window."""
+    window = sequences.window(model, 0, size)
+
+    def step(carry: tuple[FrameCache, jax.Array], t: jax.Array):
+        cache, frame = steps.fill(window, *carry, t, sequences.keys_at(t), decode)
         return (cache, frame), frame
 
-    def stream(carry, t):
-        cache, frame = window(t + 1 - size).stream(*carry, t, frame_keys(t), decode)
-        return (cache, frame), frame
+    (cache, _), new = jax.lax.scan(step, (cache, prompt[:, -1]), jnp.arange(prompt.shape[1], size))
+    return cache, jnp.moveaxis(new, 0, 1)
 
-    def slide(past, t):
-        frame = window(t + 1 - size).slide(past, frame_keys(t), decode)
+
+def _slide(
+    model: HMA, sequences: Sequences, cache: FrameCache, past: jax.Array, times: jax.Array, decode: DecodeConfig
+) -> jax.Array:
+    """Exact frames at `times` past the first window; `past` are the T - 1 before them."""
+    del cache
+    size = past.shape[1] + 1
+
+    def step(past: jax.Array, t: jax.Array):
+        window = sequences.window(model, t + 1 - size, size)
+        frame = steps.slide(window, past, sequences.keys_at(t), decode)
         return jnp.concatenate([past[:, 1:], frame[:, None]], axis=1), frame
 
-    carry = (cache, flat(prompt[:, -1]))
-    carry, new = jax.lax.scan(fill, carry, jnp.arange(count, size))
-    new = jnp.moveaxis(new, 0, 1)
-    if frames > size:
-        if decode.slide == "exact":
-            carry = jnp.concatenate([flat(prompt), new], axis=1)[:, 1 - size :]
-        _, more = jax.lax.scan(slide if decode.slide == "exact" else stream, carry, jnp.arange(size, frames))
-        new = jnp.concatenate([new, jnp.moveaxis(more, 0, 1)], axis=1)
-    return new.reshape(batch, repeats, -1, *prompt.shape[2:])
+    return jnp.moveaxis(jax.lax.scan(step, past, times)[1], 0, 1)
+
+
+def _stream(
+    model: HMA, sequences: Sequences, cache: FrameCache, past: jax.Array, times: jax.Array, decode: DecodeConfig
+) -> jax.Array:
+    """The same, approximately, from the cache of the first window."""
+    size = past.shape[1] + 1
+
+    def step(carry: tuple[FrameCache, jax.Array], t: jax.Array):
+        window = sequences.window(model, t + 1 - size, size)
+        cache, frame = steps.stream(window, *carry, t, sequences.keys_at(t), decode)
+        return (cache, frame), frame
+
+    return jnp.moveaxis(jax.lax.scan(step, (cache, past[:, -1]), times)[1], 0, 1)
 
 
 def rollout_naive(
@@ -100,37 +139,39 @@ def rollout_naive(
     Without actions (None) there are neither action tokens nor conditioning, and `frames` says
     how many to fill up to.
     """
-    if actions_BTU is None:
-        actions_BRTU = jnp.zeros((len(prompt), 1, frames, 0))
-    else:
-        actions_BRTU = actions_BTU[:, None]
+    batch = len(prompt)
+    actions_BRTU = jnp.zeros((batch, 1, frames, 0)) if actions_BTU is None else actions_BTU[:, None]
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     frames, count = actions_BRTU.shape[2], prompt.shape[1]
     size = min(frames, model.config.frames)
-    blank = blank_frame(model.config, len(prompt))
+    blank = blank_frame(model.config, batch)
     future = [blank.values[:, None].astype(prompt.dtype)] * (frames - count)
 
     def next_frame(known: jax.Array, t: jax.Array):
         first = jnp.maximum(t + 1 - size, 0)
-        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, first, size, axis=1)  # noqa: E731
         aligned = hidden = None
         if actions_BTU is not None:
-            aligned = model.align(cut(actions_BRTU[:, 0]))
-            hidden = model.align_hidden(None if hidden_BT is None else cut(hidden_BT), (len(prompt), size))
+            aligned = model.align(cut(actions_BRTU[:, 0], first, size))
+            shown = None if hidden_BT is None else cut(hidden_BT, first, size)
+            hidden = model.align_hidden(shown, (batch, size))
 
         def look(frame: Frame) -> jax.Array:
-            values = cut(known)
+            values = cut(known, first, size)
             unknown = jnp.broadcast_to(jnp.arange(size)[None, :, None] >= t - first, values.shape[:3])
             values = values.at[:, t - first].set(frame.values)
             unknown = unknown.at[:, t - first].set(frame.masked)
-            return model(values, unknown, aligned, embodiment_B, hidden_BT=hidden).frames[:, t - first]
+            return model(values, unknown, aligned, embodiment_B, hidden_BT=hidden).said[:, t - first]
 
-        frame_keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)
-        frame = decode_frame(model, look(blank), look, frame_keys, decode)
+        frame = decode_frame(model, look(blank), look, fold_in(key_B, t), decode)
         return known.at[:, t].set(frame), None
 
     known, _ = jax.lax.scan(next_frame, jnp.concatenate([prompt, *future], axis=1), jnp.arange(count, frames))
     return known[:, count:]
+
+
+def fold_in(key_B: jax.Array, data: int | jax.Array) -> jax.Array:
+    """`data` folded into every key."""
+    return jax.vmap(lambda key: jax.random.fold_in(key, data))(key_B)
 
 
 def _recent(

@@ -13,15 +13,16 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig, require
-from hma_jax.generation.window import Window
+from hma_jax.generation import steps
+from hma_jax.generation.cache import FrameCache, Window
+from hma_jax.generation.rollout import fold_in
 from hma_jax.model.hma import HMA
-from hma_jax.model.trunk import TemporalCache
 
 
 class Session(NamedTuple):
     """Where B simulated episodes stand; all are equally long."""
 
-    cache: TemporalCache  # of finished frames but the newest, room for T - 1
+    cache: FrameCache  # of finished frames but the newest, room for T - 1
     frames: jax.Array  # the newest T - 1, oldest first: [B, T - 1, S (, C)]
     chunks_BTU: jax.Array  # raw, the one executed after each of them, then one spare
     hidden_BT: jax.Array  # chunks the model is not shown
@@ -48,12 +49,10 @@ def start(
         f"{count} prompt frames have {count - 1} chunks between them, got {chunks_BTU.shape[1]}",
     )
     old = max(count - room, 0)
-    kept = count - old
     hidden = jnp.zeros(chunks_BTU.shape[:2], bool) if hidden_BT is None else hidden_BT
-    whole = lambda x, size: jnp.pad(x[:, old:], [(0, 0), (0, size - x.shape[1] + old)] + [(0, 0)] * (x.ndim - 2))  # noqa: E731
-    chunks, hidden = whole(chunks_BTU, room + 1), whole(hidden, room + 1)
-    past = Window.over(model, chunks, hidden, embodiment_B).prefill(prompt[:, old:-1], room)
-    return Session(past, whole(prompt, room), chunks, hidden, embodiment_B, jnp.int32(kept))
+    chunks, hidden = (_padded(x[:, old:], room + 1) for x in (chunks_BTU, hidden))
+    past = Window.over(model, chunks, hidden, embodiment_B).start(prompt[:, old:-1], room)
+    return Session(past, _padded(prompt[:, old:], room), chunks, hidden, embodiment_B, jnp.int32(count - old))
 
 
 def advance(
@@ -76,25 +75,34 @@ def advance(
     hidden_B = jnp.zeros(len(chunk_BU), bool) if hidden_B is None else hidden_B
     last = jnp.minimum(t, room) - 1
     both = jnp.stack([chunk_BU, chunk_BU if next_chunk_BU is None else next_chunk_BU], axis=1)
-    write = lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y.astype(x.dtype), last, axis=1)  # noqa: E731
-    chunks = write(session.chunks_BTU, both)
-    hidden = write(session.hidden_BT, jnp.stack([hidden_B, hidden_B], axis=1))
+    chunks = _written(session.chunks_BTU, both, last)
+    hidden = _written(session.hidden_BT, jnp.stack([hidden_B, hidden_B], axis=1), last)
     window = Window.over(model, chunks, hidden, session.embodiment_B)
     newest = jax.lax.dynamic_index_in_dim(session.frames, last, axis=1, keepdims=False)
-    keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)
+    keys = fold_in(key_B, t)
 
-    def fill() -> tuple[TemporalCache, jax.Array]:
-        return window.fill(session.cache, newest, t, keys, decode)
+    def within_the_window() -> tuple[FrameCache, jax.Array]:
+        return steps.fill(window, session.cache, newest, t, keys, decode)
 
-    def past_the_window() -> tuple[TemporalCache, jax.Array]:
+    def past_the_window() -> tuple[FrameCache, jax.Array]:
         if decode.slide == "streaming":
-            return window.stream(session.cache, newest, t, keys, decode)
-        return session.cache, window.slide(session.frames, keys, decode)
+            return steps.stream(window, session.cache, newest, t, keys, decode)
+        return session.cache, steps.slide(window, session.frames, keys, decode)
 
-    cache, frame = jax.lax.cond(t <= room, fill, past_the_window)
+    cache, frame = jax.lax.cond(t <= room, within_the_window, past_the_window)
     full = t >= room  # then the oldest frame makes place
-    shift = lambda x: jnp.where(full, jnp.roll(x, -1, axis=1), x)  # noqa: E731
-    frames = jax.lax.dynamic_update_slice_in_dim(
-        shift(session.frames), frame[:, None].astype(session.frames.dtype), jnp.minimum(t, room - 1), axis=1
+    frames, chunks, hidden = (
+        jnp.where(full, jnp.roll(x, -1, axis=1), x) for x in (session.frames, chunks, hidden)
     )
-    return Session(cache, frames, shift(chunks), shift(hidden), session.embodiment_B, t + 1), frame
+    frames = _written(frames, frame[:, None], jnp.minimum(t, room - 1))
+    return Session(cache, frames, chunks, hidden, session.embodiment_B, t + 1), frame
+
+
+def _padded(x: jax.Array, size: int) -> jax.Array:
+    """[B, T', ...] -> [B, size, ...], zeros at the end."""
+    return jnp.pad(x, [(0, 0), (0, size - x.shape[1])] + [(0, 0)] * (x.ndim - 2))
+
+
+def _written(x: jax.Array, new: jax.Array, at: jax.Array) -> jax.Array:
+    """x [B, T, ...] with `new` [B, n, ...] from frame `at` on."""
+    return jax.lax.dynamic_update_slice_in_dim(x, new.astype(x.dtype), at, axis=1)

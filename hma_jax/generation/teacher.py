@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from hma_jax.config import DecodeConfig
 from hma_jax.generation.decoding import Frame, decode_frame
+from hma_jax.generation.rollout import fold_in
 from hma_jax.model.hma import HMA, Outputs, causal
 
 
@@ -23,8 +24,7 @@ def next_frame_outputs(
     One pass over 2 (T - 1) frames, the true ones and the masked ones side by side, where the
     official evaluation makes T - 1 passes over the window (reference section 6.2).
     """
-    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, keep=0)
-    return out.frames[:, frames.shape[1] - 1 :]
+    return _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, remember=0).said
 
 
 def next_frames(
@@ -43,18 +43,16 @@ def next_frames(
     one over the true ones, where the official evaluation makes M (T - 1) over the window.
     """
     count = frames.shape[1] - 1
-    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, keep=count)
-    first = out.frames[:, count:]
+    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, remember=count)
     actions = model.align(actions_BTU)[:, 1:]
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
-    fold = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731  [B, T - 1, ...] -> [B (T - 1), ...]
-    unfold = lambda x: x.reshape(-1, count, *x.shape[1:])  # noqa: E731
 
     def look(frame: Frame) -> jax.Array:
-        said = model(
-            unfold(frame.values),
-            unfold(frame.masked),
+        """Of all masked frames at once, as if they were examples: [B (T - 1), S, ...]."""
+        out_of_past = model(
+            _by_window(frame.values, count),
+            _by_window(frame.masked, count),
             actions,
             embodiment_B,
             hidden_BT=hidden,
@@ -62,10 +60,21 @@ def next_frames(
             first=1,
             past=out.cache,
         )
-        return fold(said.frames)
+        return _by_frame(out_of_past.said)
 
-    keys = jax.vmap(lambda k: jax.vmap(lambda t: jax.random.fold_in(k, t))(jnp.arange(1, count + 1)))(key_B)
-    return first, unfold(decode_frame(model, fold(first), look, fold(keys), decode))
+    keys = jnp.stack([fold_in(key_B, t) for t in range(1, count + 1)], axis=1)
+    filled = decode_frame(model, _by_frame(out.said), look, _by_frame(keys), decode)
+    return out.said, _by_window(filled, count)
+
+
+def _by_frame(x: jax.Array) -> jax.Array:
+    """[B, T - 1, ...] -> [B (T - 1), ...]."""
+    return x.reshape(-1, *x.shape[2:])
+
+
+def _by_window(x: jax.Array, count: int) -> jax.Array:
+    """The inverse."""
+    return x.reshape(-1, count, *x.shape[1:])
 
 
 def _look_beside(
@@ -74,27 +83,33 @@ def _look_beside(
     actions_BTU: jax.Array,
     embodiment_B: jax.Array,
     hidden_BT: jax.Array | None,
-    keep: int,
+    remember: int,
 ) -> Outputs:
-    """One pass over frames 0 .. T-2 and, beside them, 1 .. T-1 wholly masked."""
+    """One pass over frames 0 .. T-2 and, beside them, 1 .. T-1 wholly masked; of these it says something."""
     count = frames.shape[1] - 1
     both = jnp.concatenate([frames[:, :-1]] * 2, axis=1)
     masked = jnp.broadcast_to((jnp.arange(2 * count) >= count)[None, :, None], both.shape[:3])
-    twice = lambda x: jnp.concatenate([x[:, :-1], x[:, 1:]], axis=1)  # noqa: E731
-    actions = twice(model.align(actions_BTU))
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
-    hidden = None if hidden is None else twice(hidden)
-    positions = jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)])
-    past, itself = causal(count), jnp.eye(count, dtype=bool)
-    # A masked frame t sees the true frames before it and itself; nobody sees a masked frame.
-    visible = jnp.block([[past, jnp.zeros_like(past)], [past, itself]])
     return model(
         both,
         masked,
-        actions,
+        _twice(model.align(actions_BTU)),
         embodiment_B,
-        hidden_BT=hidden,
-        visible=visible,
-        positions=positions,
-        keep=keep,
+        hidden_BT=None if hidden is None else _twice(hidden),
+        visible=beside(jnp.tril(jnp.ones((count, count), bool))),
+        positions=jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)]),
+        remember=remember,
+        said_from=count,
     )
+
+
+def beside(past: jax.Array) -> jax.Array:
+    """bool [2 T, 2 T]: what frames and, beside them, T masked ones may see. A masked frame sees the true
+    frames that `past` [T, T] allows it, and itself; nobody sees a masked frame."""
+    count = len(past)
+    return jnp.block([[causal(count), jnp.zeros_like(past)], [past, jnp.eye(count, dtype=bool)]])
+
+
+def _twice(x: jax.Array) -> jax.Array:
+    """[B, T, ...] -> [B, 2 (T - 1), ...]: frames 0 .. T-2, then 1 .. T-1."""
+    return jnp.concatenate([x[:, :-1], x[:, 1:]], axis=1)

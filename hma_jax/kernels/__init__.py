@@ -1,1 +1,11 @@
-"""What knows platforms: attention and linear maps, computed as each backend does it best."""
+"""What knows platforms. The model's text is mathematics; which program computes it is decided here.
+
+`attention`     attention within frames, over time and over a cache, behind one call each
+`plain`         the formulas, for every platform: what the other backends must equal
+`cpu`, `cudnn`, `splash`   the same for CPUs, for NVIDIA GPUs, for TPUs
+`dense`         products with a weight, and one weight per robot
+`pointwise`     layer norm without its parameters, GELU, broadcast over tokens
+
+Gradients that are written out, and thresholds, are in this folder and nowhere else. A new backend is one
+file with the functions of `attention.Backend` and one line in its table.
+"""

@@ -1,20 +1,27 @@
-"""Multi-head attention over one axis, with optional keys and values kept from earlier frames."""
+"""Multi-head attention of a frame's tokens to each other, and of a position to itself over time."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ExecutionConfig, ModelConfig
-from hma_jax.kernels.attend import attend_all_within, attend_over_time, attend_within
-from hma_jax.kernels.ops import contract, kept
+from hma_jax.kernels import remat
+from hma_jax.kernels.attention import find_backend
+from hma_jax.kernels.dense import contract
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm
 from hma_jax.model.params import bias, param
 
-CACHED_BYTES = 2**20
-"""What a frame's attention weights must exceed for `attend_within` to be worth it."""
+
+class Past(NamedTuple):
+    """Keys and values of earlier frames, [B, T_past, P, H, I] each."""
+
+    keys: jax.Array
+    values: jax.Array
 
 
 def attention_scale(config: ModelConfig) -> float:
@@ -42,15 +49,14 @@ class Attention(nnx.Module):
         self.out = param((heads, head, width), ("H", None, "D"), init, role="hidden")
         self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
         self.norm = LayerNorm(head, axis=None) if config.qk_norm else None
-        self.heads, self.scale = heads, attention_scale(config)
-        self.by_frame = execution.attention != "plain"
+        self.scale, self.backend = attention_scale(config), execution.attention
 
     def project(self, x: jax.Array) -> jax.Array:
         """x [..., D] -> queries, keys and values [..., 3, H, I]."""
         qkv = contract(x, self.qkv.astype(x.dtype))
         if self.qkv_bias is not None:
             qkv = qkv + self.qkv_bias.astype(x.dtype)
-        qkv = kept(qkv)
+        qkv = remat.product(qkv)
         if self.norm is None:
             return qkv
         return jnp.concatenate([self.norm(qkv[..., :2, :, :]), qkv[..., 2:, :, :]], axis=-3)
@@ -62,21 +68,16 @@ class Attention(nnx.Module):
 
     def over_space(self, x_BTPD: jax.Array) -> jax.Array:
         """Every token sees every token of its own frame."""
-        weights = x_BTPD.shape[2] ** 2 * self.heads * x_BTPD.dtype.itemsize
-        by_frame = self.by_frame and weights > CACHED_BYTES
-        attend = attend_within if by_frame else attend_all_within
-        return self.project_out(attend(self.project(x_BTPD), self.scale))
+        return self.project_out(find_backend(self.backend).within(self.project(x_BTPD), self.scale))
 
-    def over_time(
-        self,
-        x_BTPD: jax.Array,
-        visible: jax.Array,
-        past: tuple[jax.Array, jax.Array] | None,
-    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Every token sees its own position in other frames, where `visible` allows.
+    def over_time(self, x_BTPD: jax.Array, visible: jax.Array, past: Past | None) -> tuple[jax.Array, Past]:
+        """Every token sees its own position in the frames that `visible`, bool [T, T_past + T], allows.
 
-        `past` holds keys and values [B, T_past, P, H, I] of earlier frames. `visible` is
-        bool [T, T_past + T]. Returns the output and the new frames' keys and values.
+        Returns the output and the new frames' keys and values.
         """
-        q, k, v = (part.squeeze(-3) for part in jnp.split(self.project(x_BTPD), 3, axis=-3))
-        return self.project_out(attend_over_time(q, k, v, past, visible, self.scale)), (k, v)
+        qkv, kernels = self.project(x_BTPD), find_backend(self.backend)
+        if past is None:
+            y = kernels.over_time(qkv, visible, self.scale)
+        else:
+            y = kernels.over_cache(qkv, past.keys, past.values, visible, self.scale)
+        return self.project_out(y), Past(qkv[..., 1, :, :], qkv[..., 2, :, :])

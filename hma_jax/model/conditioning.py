@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.kernels.attend import masked_softmax
-from hma_jax.kernels.ops import kept, normalise, over_tokens
+from hma_jax.kernels import plain, remat
+from hma_jax.kernels.dense import per_robot
+from hma_jax.kernels.pointwise import layer_norm, over_tokens
 from hma_jax.model.attention import attention_scale
 from hma_jax.model.initial import trunk_init
-from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, per_example
+from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, own
 from hma_jax.model.params import bias, ones, param, used
 
 
@@ -50,12 +51,12 @@ class Modulation(nnx.Module):
         self.out = EmbodimentLinear(embodiments, square, axes, init=init, role="hidden")
 
     def __call__(
-        self, x_BTPD: jax.Array, action: ActionFeature, embodiment_B: jax.Array, visible: jax.Array, past: None
+        self, x_BTPD: jax.Array, action: ActionFeature, slice_B: jax.Array, visible: jax.Array, past: None
     ) -> tuple[jax.Array, None]:
         del visible, past
-        both = self.shift_scale(jax.nn.silu(self.hidden(action.feature_BTD, embodiment_B)), embodiment_B)
+        both = self.shift_scale(jax.nn.silu(self.hidden(action.feature_BTD, slice_B)), slice_B)
         shift, scale = (over_tokens(part, x_BTPD.shape[2]) for part in jnp.split(both, 2, axis=-1))
-        y = self.out(normalise(x_BTPD, FINE_EPS) * (1 + scale) + shift, embodiment_B)
+        y = self.out(layer_norm(x_BTPD, FINE_EPS) * (1 + scale) + shift, slice_B)
         return _where_shown(action, y), None
 
 
@@ -63,9 +64,9 @@ class Addition(nnx.Module):
     """The feature itself, on every token of its frame; no parameters."""
 
     def __call__(
-        self, x_BTPD: jax.Array, action: ActionFeature, embodiment_B: jax.Array, visible: jax.Array, past: None
+        self, x_BTPD: jax.Array, action: ActionFeature, slice_B: jax.Array, visible: jax.Array, past: None
     ) -> tuple[jax.Array, None]:
-        del embodiment_B, visible, past
+        del slice_B, visible, past
         return _where_shown(action, over_tokens(action.feature_BTD, x_BTPD.shape[2])), None
 
 
@@ -94,34 +95,33 @@ class CrossAttention(nnx.Module):
         self,
         x_BTPD: jax.Array,
         action: ActionFeature,
-        embodiment_B: jax.Array,
+        slice_B: jax.Array,
         visible: jax.Array,
         past: tuple[jax.Array, jax.Array, jax.Array] | None,
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array, jax.Array]]:
         """`visible` [T, T_past + T] as for temporal attention; `past` are keys, values and shown."""
         a = action.feature_BTD
         shown = jnp.ones(a.shape[:2], bool) if action.shown_BT is None else action.shown_BT
-        q = self._heads(kept(per_example(x_BTPD, self.q, embodiment_B)), embodiment_B) * self.scale
-        k = self._heads(per_example(a, self.k, embodiment_B), embodiment_B)
-        v = per_example(a, self.v, embodiment_B).reshape(k.shape)
+        q = self._heads(remat.product(self._map(x_BTPD, self.q, slice_B)), slice_B)
+        k = self._heads(self._map(a, self.k, slice_B), slice_B)
+        v = self._map(a, self.v, slice_B).reshape(k.shape)
         new = (k, v, shown)
         if past is not None:
             k, v, shown = (jnp.concatenate([old, own], axis=1) for old, own in zip(past, new, strict=True))
         allowed_BTs = visible & shown[:, None]
-        logits = jnp.einsum("btphi,bshi->bphts", q, k)
-        weights = masked_softmax(logits, allowed_BTs[:, None, None])
+        logits = self.scale * jnp.einsum("btphi,bshi->bphts", q, k, preferred_element_type=jnp.float32)
+        weights = plain.softmax(logits, allowed_BTs[:, None, None]).astype(v.dtype)
         y = jnp.einsum("bphts,bshi->btphi", weights, v).reshape(x_BTPD.shape)
         some = jnp.any(allowed_BTs, axis=-1)
-        return jnp.where(some[:, :, None, None], self.out(y, embodiment_B), 0), new
+        return jnp.where(some[:, :, None, None], self.out(y, slice_B), 0), new
 
-    def _heads(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """[B, ..., D] -> normalised [B, ..., H, I]."""
-        x = normalise(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
-        gain, offset = (
-            jnp.take(v.get_value(), embodiment_B, 0).astype(x.dtype) for v in (self.gain, self.bias)
-        )
-        shape = (-1, *(1,) * (x.ndim - 2), x.shape[-1])
-        return x * gain.reshape(shape) + offset.reshape(shape)
+    def _map(self, x: jax.Array, kernel: nnx.Param, slice_B: jax.Array) -> jax.Array:
+        return per_robot(x, kernel.astype(x.dtype), slice_B)
+
+    def _heads(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
+        """[B, ..., D] -> [B, ..., H, I], a layer norm over each head."""
+        x = layer_norm(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
+        return x * own(self.gain, slice_B, x) + own(self.bias, slice_B, x)
 
 
 def _where_shown(action: ActionFeature, y: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import DiffusionConfig, ModelConfig
+from hma_jax.kernels.dense import look_up
 from hma_jax.model.initial import input_fan_out, readout_init, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
 from hma_jax.model.params import normal, param, used, xavier_uniform, zeros
@@ -68,7 +69,7 @@ class TokenEmbed(nnx.Module):
         """ids [...] and bool [...] -> [..., D]."""
         q, v, _ = self.tables.shape
         digits = factorise(ids, q, v)
-        x = sum(jnp.take(self.tables[i].astype(dtype), digits[..., i], axis=0) for i in range(q))
+        x = sum(look_up(self.tables[i], digits[..., i]) for i in range(q)).astype(dtype)
         return x if masked is None else jnp.where(masked[..., None], self.mask.astype(dtype), x)
 
 
@@ -98,8 +99,8 @@ class Readout(nnx.Module):
         self.linear = Linear((config.width, entries), ("D", "V"), init=init, role="output")
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        y = self.linear(x / self.multiplier).astype(jnp.float32)
-        return y.reshape(*y.shape[:-1], self.factors, -1)
+        y = self.linear(x / self.multiplier, dtype=jnp.float32)
+        return y.reshape(*y.shape[:-1], self.factors, y.shape[-1] // self.factors)
 
 
 class Condition(nnx.Module):

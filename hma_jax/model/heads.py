@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from hma_jax.config import ModelConfig
-from hma_jax.kernels.ops import normalise
+from hma_jax.config import ExecutionConfig, ModelConfig
+from hma_jax.kernels.dense import contract, from_actions, take_by_robot, to_actions
+from hma_jax.kernels.pointwise import layer_norm
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import readout_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear
@@ -60,8 +61,9 @@ class Denoiser(nnx.Module):
     the order of its constructors, and the actions' with a Xavier gain of 0.1.
     """
 
-    def __init__(self, config: ModelConfig, channels: int, axis: str = "C"):
+    def __init__(self, config: ModelConfig, channels: int, dtype: jnp.dtype, axis: str = "C"):
         width = config.diffusion.width
+        self.dtype, self.of_actions = dtype, axis == "U"
         small = normal(0.02)
         self.multiplier = config.mup_multiplier("readout")
         self.time_in = Linear((TIME_FEATURES, width), (None, "F"), init=small, role="vector")
@@ -75,15 +77,29 @@ class Denoiser(nnx.Module):
         self.out_bias = bias((2, channels), (None, axis))
 
     def __call__(self, x: jax.Array, time: jax.Array, z: jax.Array) -> jax.Array:
-        """x [..., C] noised at `time` [...] given z [..., D] -> [..., 2 C], noise first."""
-        y = self.time_out(jax.nn.silu(self.time_in(timestep_embedding(time))))
-        y = y + self.condition(z / self.multiplier)
-        x = self.into(x)
+        """x [..., C] noised at `time` given z [..., D] -> float32 [..., 2 C], noise first.
+
+        `time` [...] may have axes of size 1: what they share is computed once.
+        """
+        y = self.time_out(jax.nn.silu(self.time_in(timestep_embedding(time).astype(self.dtype))))
+        y = y + self.condition((z / self.multiplier).astype(self.dtype))
+        x = self._into(x.astype(self.dtype))
         for block in self.blocks:
             x = block(x, y)
         shift, scale = jnp.split(self.modulation(jax.nn.silu(y)), 2, axis=-1)
-        x = normalise(x, FINE_EPS) * (1 + scale) + shift
-        y = jnp.einsum("...f,fkc->...kc", x, self.out.get_value()) + self.out_bias.get_value()
+        x = layer_norm(x, FINE_EPS) * (1 + scale) + shift
+        return self._out(x).astype(jnp.float32)
+
+    def _into(self, x: jax.Array) -> jax.Array:
+        if not self.of_actions:
+            return self.into(x)
+        return from_actions(x, self.into.kernel.astype(x.dtype)) + self.into.bias.astype(x.dtype)
+
+    def _out(self, x: jax.Array) -> jax.Array:
+        """[..., F] -> [..., 2 C]."""
+        w = self.out.astype(x.dtype)
+        both = jnp.stack([to_actions(x, w[:, k]) for k in (0, 1)], -2) if self.of_actions else contract(x, w)
+        y = both + self.out_bias.astype(x.dtype)
         return y.reshape(*y.shape[:-2], -1)
 
 
@@ -96,28 +112,32 @@ class ActionRegression(nnx.Module):
         init = readout_init(config, table.action_width)
         self.linear = EmbodimentLinear(table.size, sizes, ("D", "U"), init=init, role="output")
 
-    def __call__(self, pooled_BTD: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+    def __call__(self, pooled_BTD: jax.Array, slice_B: jax.Array) -> jax.Array:
         """-> normalised actions, float32 [B, T, U]."""
-        return self.linear(pooled_BTD / self.multiplier, embodiment_B).astype(jnp.float32)
+        return self.linear(pooled_BTD / self.multiplier, slice_B).astype(jnp.float32)
 
 
 class ActionDenoiser(nnx.Module):
     """One denoiser per robot, over its chunk padded to U."""
 
-    def __init__(self, config: ModelConfig, table: EmbodimentTable):
-        self.robots = stack(lambda: Denoiser(config, table.action_width, "U"), table.size, axis="E")
+    def __init__(self, config: ModelConfig, table: EmbodimentTable, dtype: jnp.dtype):
+        self.dtype = dtype
+        self.robots = stack(lambda: Denoiser(config, table.action_width, dtype, "U"), table.size, axis="E")
 
-    def __call__(
-        self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, embodiment_B: jax.Array
-    ) -> jax.Array:
-        """Normalised, noised chunks -> [B, T, 2 U], noise first."""
+    def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, slice_B: jax.Array) -> jax.Array:
+        """Normalised, noised chunks -> float32 [B, T, 2 U], noise first."""
         graphdef, params = nnx.split(self.robots)
-        own = jax.tree.map(lambda p: jnp.take(p, embodiment_B, axis=0), params)
+        own = jax.tree.map(lambda p: take_by_robot(p.astype(self.dtype), slice_B), params)
         return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)
 
 
-def make_action_head(config: ModelConfig, table: EmbodimentTable) -> nnx.Module | None:
+def make_action_head(
+    config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig
+) -> nnx.Module | None:
     if not config.action_heads:
         return None
-    head = ActionDenoiser if config.diffusion else ActionRegression
-    return used("actions_predicted", head(config, table))
+    if config.diffusion:
+        head = ActionDenoiser(config, table, jnp.dtype(execution.dtype))
+    else:
+        head = ActionRegression(config, table)
+    return used("actions_predicted", head)

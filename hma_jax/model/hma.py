@@ -30,11 +30,11 @@ def causal(frames: int) -> jax.Array:
 
 
 class Outputs(NamedTuple):
-    """What a pass says of the frames it was given."""
+    """What a pass says of the frames it was given, or of those from `said_from` on."""
 
-    frames: jax.Array  # discrete: logits [B, T, S, Q, V]; continuous: conditions [B, T, S, D]; float32
+    said: jax.Array  # of tokens: logits [B, T, S, Q, V], or conditions of the denoiser [B, T, S, D]; float32
     actions: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
-    cache: TemporalCache | None
+    cache: TemporalCache | None  # of the frames that are to be remembered
 
 
 class HMA(nnx.Module):
@@ -53,11 +53,11 @@ class HMA(nnx.Module):
         self.trunk = Trunk(config, table.size, execution)
         self.frame_head = make_frame_head(config)
         self.denoiser = (
-            used("frames_predicted", Denoiser(config, config.diffusion.token_channels))
+            used("frames_predicted", Denoiser(config, config.diffusion.token_channels, self.dtype))
             if config.diffusion
             else None
         )
-        self.action_head = make_action_head(config, table)
+        self.action_head = make_action_head(config, table, execution)
 
     def __call__(
         self,
@@ -72,7 +72,9 @@ class HMA(nnx.Module):
         first: int | jax.Array = 0,
         positions: jax.Array | None = None,
         past: TemporalCache | None = None,
-        keep: int = 0,
+        remember: int = 0,
+        said_from: int = 0,
+        slice_B: jax.Array | None = None,
     ) -> Outputs:
         """One pass over ids [B, T, S] or latents [B, T, S, C], masked where bool `masked` says.
 
@@ -81,7 +83,9 @@ class HMA(nnx.Module):
         not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
         instead of actions runs without action tokens and conditioning. The frames stand at window
         positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T]
-        defaults to causal. The cache of the first `keep` frames is returned.
+        defaults to causal. The cache of the first `remember` frames is returned; of the frames before
+        `said_from` nothing is said. Where the parameters at hand are those of some robots only, `slice_B`
+        says which slice is each example's own.
         """
         config = self.config
         count = frames.shape[1]
@@ -89,10 +93,11 @@ class HMA(nnx.Module):
             positions = first + jnp.arange(count)
         if visible is None:
             visible = causal(count)
+        slice_B = embodiment_B if slice_B is None else slice_B
         x = self.embed(frames, masked, self.dtype)
         action = None
         if actions_BTU is not None:
-            feature = self.stem(actions_BTU, embodiment_B, self.dtype)
+            feature = self.stem(actions_BTU, embodiment_B, slice_B, self.dtype)
             shown = None if hidden_BT is None or leak != "none" else ~hidden_BT
             action = ActionFeature(feature, shown)
             if config.concat:
@@ -101,11 +106,11 @@ class HMA(nnx.Module):
         if self.norm is not None:
             x = self.norm(x)
         x = constrain(x, ("B", None, None, "D_act"))
-        x, cache = self.trunk(x, action, embodiment_B, visible, past, keep)
+        x, cache = self.trunk(x, action, slice_B, visible, past, remember)
         pooled = x[:, :, config.tokens :].mean(axis=2) if x.shape[2] > config.tokens else None
-        x = x[:, :, : config.tokens]
-        out = self.frame_head(x, positions) if config.diffusion else self.frame_head(x)
-        return Outputs(out, pooled, cache)
+        x = x[:, said_from:, : config.tokens]
+        said = self.frame_head(x, positions[said_from:]) if config.diffusion else self.frame_head(x)
+        return Outputs(said, pooled, cache)
 
     def _action_tokens(
         self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, leak: str, positions: jax.Array

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.kernels.ops import contract, normalise
+from hma_jax.kernels.dense import (
+    contract,
+    per_robot,
+    per_robot_from_actions,
+    per_robot_to_actions,
+    take_by_robot,
+)
+from hma_jax.kernels.pointwise import layer_norm
 from hma_jax.model.params import Initializer, Role, bias, ones, param
 
 BLOCK_EPS = 1e-5
@@ -22,7 +31,7 @@ class LayerNorm(nnx.Module):
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        return normalise(x, self.eps) * self.gain.astype(x.dtype) + self.bias.astype(x.dtype)
+        return layer_norm(x, self.eps) * self.gain.astype(x.dtype) + self.bias.astype(x.dtype)
 
 
 class Linear(nnx.Module):
@@ -40,13 +49,14 @@ class Linear(nnx.Module):
         self.kernel = param(sizes, axes, init, role=role)
         self.bias = bias((sizes[1],), (axes[1],)) if with_bias else None
 
-    def __call__(self, x: jax.Array) -> jax.Array:
-        y = contract(x, self.kernel.astype(x.dtype))
-        return y if self.bias is None else y + self.bias.astype(x.dtype)
+    def __call__(self, x: jax.Array, dtype: jnp.dtype | None = None) -> jax.Array:
+        """x [..., in] -> [..., out] in the type of x, or in `dtype`, which is then that of the sum."""
+        y = contract(x, self.kernel.astype(x.dtype), dtype=dtype)
+        return y if self.bias is None else y + self.bias.astype(y.dtype)
 
 
 class EmbodimentLinear(nnx.Module):
-    """One linear map per robot. Each example of a batch uses its own robot's slice."""
+    """One linear map per robot; `slice_B` says which is each example's own."""
 
     def __init__(
         self,
@@ -59,17 +69,22 @@ class EmbodimentLinear(nnx.Module):
     ):
         self.kernel = param((embodiments, *sizes), ("E", *axes), init, role=role)
         self.bias = bias((embodiments, sizes[1]), ("E", axes[1]))
+        self.map = find_map(axes)
 
-    def __call__(self, x: jax.Array, embodiment_B: jax.Array) -> jax.Array:
+    def __call__(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
-        y = per_example(x, self.kernel, embodiment_B)
-        offset = jnp.take(self.bias.get_value(), embodiment_B, axis=0).astype(x.dtype)
-        return y + offset.reshape(-1, *(1,) * (x.ndim - 2), y.shape[-1])
+        return self.map(x, self.kernel.astype(x.dtype), slice_B) + own(self.bias, slice_B, x)
 
 
-def per_example(x: jax.Array, kernel: nnx.Param, embodiment_B: jax.Array) -> jax.Array:
-    """x [B, ..., in] times each example's own slice of a kernel [E, in, out] -> [B, ..., out]."""
-    own = jnp.take(kernel.get_value(), embodiment_B, axis=0).astype(x.dtype)
-    rows = x.reshape(x.shape[0], -1, x.shape[-1])
-    y = jax.vmap(contract)(rows, own)
-    return y.reshape(*x.shape[:-1], y.shape[-1])
+def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
+    """What multiplies each example with its robot's matrix. What a robot gets must not depend on U, which
+    other robots decide."""
+    if axes[0] == "U":
+        return per_robot_from_actions
+    return per_robot_to_actions if axes[1] == "U" else per_robot
+
+
+def own(vectors: nnx.Param, slice_B: jax.Array, like: jax.Array) -> jax.Array:
+    """Each example's own vector [E, D] -> [B, 1, ..., D], to meet `like` [B, ..., D] in its type."""
+    taken = take_by_robot(vectors.astype(like.dtype), slice_B)
+    return taken.reshape(len(taken), *(1,) * (like.ndim - 2), -1)

@@ -13,10 +13,10 @@ import numpy as np
 from flax import nnx
 
 from hma_jax.config import ModelConfig
-from hma_jax.kernels.ops import normalise
+from hma_jax.kernels.pointwise import layer_norm
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import hidden_init, input_fan_out
-from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear
+from hma_jax.model.layers import BLOCK_EPS, EmbodimentLinear, own
 from hma_jax.model.params import bias, ones, param, uniform
 
 
@@ -43,10 +43,11 @@ class Stem(nnx.Module):
         init = hidden_init(config, width, width, config.stem_gain)
         self.out = EmbodimentLinear(size, (width, width), ("D", "D_out"), init=init, role="hidden")
 
-    def __call__(self, actions_BTU: jax.Array, embodiment_B: jax.Array, dtype: jnp.dtype) -> jax.Array:
+    def __call__(
+        self, actions_BTU: jax.Array, embodiment_B: jax.Array, slice_B: jax.Array, dtype: jnp.dtype
+    ) -> jax.Array:
         """Raw, zero-padded actions -> features a_BTD in `dtype`."""
         x = self.table.normalise(actions_BTU, embodiment_B).astype(dtype)
-        x = normalise(self.into(x, embodiment_B), BLOCK_EPS)
-        gain = jnp.take(self.gain.get_value(), embodiment_B, 0)[:, None].astype(dtype)
-        offset = jnp.take(self.bias.get_value(), embodiment_B, 0)[:, None].astype(dtype)
-        return self.out(jax.nn.relu(x * gain + offset), embodiment_B)
+        x = layer_norm(self.into(x, slice_B), BLOCK_EPS)
+        x = x * own(self.gain, slice_B, x) + own(self.bias, slice_B, x)
+        return self.out(jax.nn.relu(x), slice_B)

@@ -8,19 +8,24 @@ import jax
 from flax import nnx
 
 from hma_jax.config import ExecutionConfig, ModelConfig
-from hma_jax.kernels.ops import KEPT, gelu, kept
-from hma_jax.model.attention import Attention
+from hma_jax.kernels import remat
+from hma_jax.kernels.pointwise import gelu
+from hma_jax.model.attention import Attention, Past
 from hma_jax.model.conditioning import ActionFeature, make_conditioning
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm, Linear
 from hma_jax.model.params import stack
 from hma_jax.runtime.sharding import constrain
 
+UNROLLED = 4
+"""Trunks of up to so many layers are not scanned but written out: without slices of stacked arrays their steps
+are a seventh faster on CPU, and so few layers compile as fast."""
+
 
 class TemporalCache(NamedTuple):
     """What later frames need of finished ones; every array is [N, B, T_past, ...]."""
 
-    time: tuple[jax.Array, jax.Array]  # keys and values of temporal attention [N, B, T_past, P, H, I]
+    time: Past  # of temporal attention [N, B, T_past, P, H, I]
     actions: Any  # keys, values and shown of cross-attention to actions; otherwise None
 
 
@@ -47,21 +52,20 @@ class Block(nnx.Module):
         self,
         x_BTPD: jax.Array,
         action: ActionFeature | None,
-        embodiment_B: jax.Array,
+        slice_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None,
     ) -> tuple[jax.Array, TemporalCache]:
         """`past` and what is returned are this layer's part of the cache."""
         past_time, past_actions = past or (None, None)
-        new_actions = None
-        x = x_BTPD
-        x = kept(x + self.space.over_space(self.norm_space(x) if self.norm_space else x))
+        x, new_actions = x_BTPD, None
+        x = remat.product(x + self.space.over_space(self.norm_space(x) if self.norm_space else x))
         if action is not None and self.conditioning is not None:
-            y, new_actions = self.conditioning(x, action, embodiment_B, visible, past_actions)
-            x = kept(x + y)
+            y, new_actions = self.conditioning(x, action, slice_B, visible, past_actions)
+            x = remat.product(x + y)
         y, new_time = self.time.over_time(x, visible, past_time)
-        x = kept(x + y)
-        h = kept(self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x))
+        x = remat.product(x + y)
+        h = remat.attention(self.mlp_in(self.norm_mlp(x) if self.norm_mlp else x))
         x = x + self.mlp_out(gelu(h))
         return x, TemporalCache(new_time, new_actions)
 
@@ -72,30 +76,30 @@ class Trunk(nnx.Module):
     def __init__(self, config: ModelConfig, embodiments: int, execution: ExecutionConfig):
         self.blocks = stack(lambda: Block(config, embodiments, execution), config.layers)
         self.remat = execution.remat
+        self.unroll = config.layers if config.layers <= UNROLLED else 1
 
     def __call__(
         self,
         x_BTPD: jax.Array,
         action: ActionFeature | None,
-        embodiment_B: jax.Array,
+        slice_B: jax.Array,
         visible: jax.Array,
         past: TemporalCache | None = None,
-        keep: int = 0,
+        remember: int = 0,
     ) -> tuple[jax.Array, TemporalCache | None]:
         """Runs all blocks.
 
         `visible` [T, T_past + T] says which frames each frame's temporal attention may see.
-        The cache of the first `keep` new frames is returned, None of none.
+        The cache of the first `remember` new frames is returned, None of none.
         """
         block_def, layers = nnx.split(self.blocks)
 
         def body(x, xs):
             layer, layer_past = xs
-            x, new = nnx.merge(block_def, layer)(x, action, embodiment_B, visible, layer_past)
-            new = jax.tree.map(lambda y: y[:, :keep], new) if keep else None
+            x = remat.block_input(x)
+            x, new = nnx.merge(block_def, layer)(x, action, slice_B, visible, layer_past)
+            new = jax.tree.map(lambda y: y[:, :remember], new) if remember else None
             return constrain(x, ("B", None, None, "D_act")), new
 
-        keep_marked = jax.checkpoint_policies.save_only_these_names(KEPT)
-        body = jax.checkpoint(body, prevent_cse=False, policy=keep_marked if self.remat == "products" else None)
-        x, new = jax.lax.scan(body, x_BTPD, (layers, past))
-        return x, new
+        body = remat.checkpointed(body, self.remat, scanned=self.unroll == 1)
+        return jax.lax.scan(body, x_BTPD, (layers, past), unroll=self.unroll)

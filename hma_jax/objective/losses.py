@@ -17,6 +17,9 @@ from hma_jax.model.hma import HMA
 from hma_jax.objective.diffusion import diffusion_loss, make_process
 from hma_jax.objective.masking import Masked
 
+SAID_FROM = 1
+"""The first frame that can have targets: frame 0 is never masked."""
+
 
 class LossSums(NamedTuple):
     """Sums over a batch's targets; divide by their number in the whole batch."""
@@ -37,11 +40,21 @@ def count_targets(masked: Masked) -> TargetCounts:
     return TargetCounts(*(jnp.maximum(jnp.sum(x), 1) for x in (masked.targets_TS, masked.action_targets_T)))
 
 
-def smoothed_cross_entropy(logits: jax.Array, labels: jax.Array, smoothing: float) -> jax.Array:
-    """Per position, summed over factors: logits [..., Q, V], labels [..., Q] -> [...]."""
-    log_p = jax.nn.log_softmax(logits, axis=-1)
-    picked = jnp.take_along_axis(log_p, labels[..., None], axis=-1)[..., 0]
-    return -jnp.sum((1 - smoothing) * picked + smoothing * jnp.mean(log_p, axis=-1), axis=-1)
+def smoothed_cross_entropy(
+    logits: jax.Array, labels: jax.Array, smoothing: float
+) -> tuple[jax.Array, jax.Array]:
+    """Logits [..., Q, V], labels [..., Q] -> (the loss per position, summed over factors; bool, whether every
+    factor's label has its highest logit), both [...].
+
+    Written with the logarithm of the sum, so that no array of log-probabilities is made, and with a mask for
+    the label, whose gradient is no scatter.
+    """
+    total = jax.nn.logsumexp(logits, axis=-1)
+    is_label = jnp.arange(logits.shape[-1]) == labels[..., None]
+    picked = jnp.sum(jnp.where(is_label, logits, 0), axis=-1)
+    loss = total - (1 - smoothing) * picked - smoothing * jnp.mean(logits, axis=-1)
+    right = jax.lax.stop_gradient(picked) >= jax.lax.stop_gradient(jnp.max(logits, axis=-1))
+    return jnp.sum(loss, axis=-1), jnp.all(right, axis=-1)
 
 
 def masked_loss(
@@ -52,8 +65,11 @@ def masked_loss(
     embodiment_B: jax.Array,
     masking: MaskingConfig,
     key_B: jax.Array,
+    slice_B: jax.Array | None = None,
 ) -> LossSums:
-    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise."""
+    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise; `slice_B` as for the
+    model."""
+    slice_B = embodiment_B if slice_B is None else slice_B
     all_shown = masking.setting == "forward" and all(model.table.chunks)
     hidden = model.align_hidden(None if all_shown else masked.hidden_T, actions_BTU.shape[:2])
     frames = tokens.shape[1]
@@ -66,21 +82,22 @@ def masked_loss(
         hidden_BT=hidden,
         leak=masking.action_leak,
         visible=everything,
+        said_from=SAID_FROM,
+        slice_B=slice_B,
     )
     zero = jnp.zeros(())
     loss = correct = action_loss = zero
     if masking.predicts_frames:
-        weight = masked.targets_TS.astype(jnp.float32)
+        weight, tokens = masked.targets_TS[:, SAID_FROM:].astype(jnp.float32), tokens[:, SAID_FROM:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.frames, tokens, key_B)
+            per_token = frame_diffusion_loss(model, out.said, tokens, key_B)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
-            per_token = smoothed_cross_entropy(out.frames, labels, masking.label_smoothing)
-            right = jnp.all(jnp.argmax(out.frames, axis=-1) == labels, axis=-1)
+            per_token, right = smoothed_cross_entropy(out.said, labels, masking.label_smoothing)
             correct = jnp.sum(right * weight)
         loss = jnp.sum(per_token * weight)
     if masking.predicts_actions:
-        per_step = action_loss_per_step(model, out.actions, actions_BTU, embodiment_B, key_B)
+        per_step = action_loss_per_step(model, out.actions, actions_BTU, embodiment_B, slice_B, key_B)
         action_loss = jnp.sum(per_step * masked.action_targets_T)
     return LossSums(loss, correct, action_loss)
 
@@ -108,7 +125,12 @@ def draw_noise(key: jax.Array, shape: tuple[int, ...], config: DiffusionConfig) 
 
 
 def action_loss_per_step(
-    model: HMA, pooled_BTD: jax.Array, actions_BTU: jax.Array, embodiment_B: jax.Array, key_B: jax.Array
+    model: HMA,
+    pooled_BTD: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    slice_B: jax.Array,
+    key_B: jax.Array,
 ) -> jax.Array:
     """[B, T]: error of predicted, normalised actions, averaged over each robot's own live values.
 
@@ -120,10 +142,10 @@ def action_loss_per_step(
     if model.config.diffusion:
         keys = jax.vmap(lambda k: jax.random.fold_in(k, 2**20))(key_B)  # not one of the repeats'
         time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion))(keys)
-        network = lambda x, t: model.action_head(x, t, pooled_BTD, embodiment_B)  # noqa: E731
+        network = lambda x, t: model.action_head(x, t, pooled_BTD, slice_B)  # noqa: E731
         noise = jnp.where(alive_BTU, noise, 0)
         process = make_process(model.config.diffusion.steps)
         some_BTU = alive_BTU | ~alive_BTU.any(axis=-1, keepdims=True)  # a mean over nothing is no number
         return sum(diffusion_loss(network, target, time, noise, process, valid=some_BTU))
-    error = jnp.square(model.action_head(pooled_BTD, embodiment_B) - target)
+    error = jnp.square(model.action_head(pooled_BTD, slice_B) - target)
     return jnp.sum(error * alive_BTU, axis=-1) / jnp.maximum(jnp.sum(alive_BTU, axis=-1), 1)

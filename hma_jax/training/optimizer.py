@@ -16,6 +16,8 @@ import optax
 
 from hma_jax.config import ModelConfig, OptimizerConfig
 from hma_jax.model.params import Params, ParamSpec, Use, is_spec
+from hma_jax.training import robots
+from hma_jax.training.robots import Active
 
 
 class Presence(NamedTuple):
@@ -111,6 +113,20 @@ def apply_adamw(
     new = [update(*args) for args in zip(leaves, *others, *declared, strict=True)]
     params, first, second = (jax.tree.unflatten(treedef, column) for column in zip(*new, strict=True))
     return params, AdamState(first, second, count, count_E)
+
+
+def take_adam(state: AdamState, specs: Params, active: Active) -> AdamState:
+    """The moments and counts of a step's robots, and of what all share."""
+    first, second = (robots.take(moment, specs, active) for moment in (state.first, state.second))
+    return AdamState(first, second, state.count, {use: n[active.robots_G] for use, n in state.count_E.items()})
+
+
+def put_adam(state: AdamState, new: AdamState, specs: Params, active: Active) -> AdamState:
+    """`state` with those of `new` in their places."""
+    first = robots.put(state.first, new.first, specs, active)
+    second = robots.put(state.second, new.second, specs, active)
+    count_E = {use: n.at[active.robots_G].set(new.count_E[use]) for use, n in state.count_E.items()}
+    return AdamState(first, second, new.count, count_E)
 
 
 def keep_own(grads: Params, specs: Params, trained_E: jax.Array) -> Params:

@@ -15,6 +15,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Params, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, masked_loss
 from hma_jax.objective.masking import Masked, mask_batch
+from hma_jax.training import robots
 from hma_jax.training.optimizer import (
     Presence,
     apply_adamw,
@@ -23,6 +24,8 @@ from hma_jax.training.optimizer import (
     keep_own,
     learning_rate_multiplier,
     make_schedule,
+    put_adam,
+    take_adam,
 )
 from hma_jax.training.state import TrainState
 
@@ -74,6 +77,7 @@ def make_train_step(
     multipliers = jax.tree.map(
         lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
     )
+    specs = declared.specs
     trained_E = np.array([name in (config.only or table.names) for name in table.names])
     require(
         not set(config.only) - set(table.names),
@@ -83,7 +87,14 @@ def make_train_step(
     def sums(params: Any, batch: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
         model = declared.merge(params)
         result = masked_loss(
-            model, batch["masked"], batch["tokens"], batch["actions"], batch["embodiment"], masking, batch["key"]
+            model,
+            batch["masked"],
+            batch["tokens"],
+            batch["actions"],
+            batch["embodiment"],
+            masking,
+            batch["key"],
+            batch["slice"],
         )
         loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
         return loss, result
@@ -108,21 +119,27 @@ def make_train_step(
         noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
         keys = jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(config.batch))
         counts = count_targets(masked)
-        grads, total = accumulated(state.params, batch | {"masked": masked, "key": keys}, counts)
+        active = robots.choose(batch["embodiment"], table.size)
+        own = robots.take(state.params, specs, active)
+        rows = batch | {"masked": masked, "key": keys, "slice": active.slice_B}
+        grads, total = accumulated(own, rows, counts)
         if config.only:
-            grads = keep_own(grads, declared.specs, trained_E)
+            grads = keep_own(grads, specs, jnp.asarray(trained_E)[active.robots_G])
         grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
         rate = schedule(state.step)
-        params, opt_state = apply_adamw(
+        presence = find_presence(masked, batch["embodiment"], trained_E, model, everything=not config.only)
+        new, adam = apply_adamw(
             grads,
-            state.opt_state,
-            state.params,
-            declared.specs,
+            take_adam(state.opt_state, specs, active),
+            own,
+            specs,
             multipliers,
-            find_presence(masked, batch["embodiment"], trained_E, model, everything=not config.only),
+            presence._replace(robots={use: here[active.robots_G] for use, here in presence.robots.items()}),
             rate,
             config.optimizer,
         )
+        params = robots.put(state.params, new, specs, active)
+        opt_state = put_adam(state.opt_state, adam, specs, active)
         metrics = {"loss": total.tokens / counts.tokens}
         if masking.predicts_frames and not model.diffusion:
             metrics["accuracy"] = total.correct / counts.tokens

@@ -63,7 +63,7 @@ def check_logits(case: Case) -> None:
 
     def check(output, actions, robot, frames=None):
         out = apply(ids[:, :frames], masked[:, :frames], actions, case.robot(robot, batch))
-        check_channels_first(case, output, out.frames)
+        check_channels_first(case, output, out.said)
 
     for robot in case.domains:
         check(f"logits__{robot}", case.actions(robot), robot)
@@ -78,7 +78,7 @@ def check_logits(case: Case) -> None:
             replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries
         ]
         declared = declare_model(case.run.model, EmbodimentTable(tuple(plain)))
-        out = jax.jit(lambda p, *args: declared.merge(p)(*args).frames)(
+        out = jax.jit(lambda p, *args: declared.merge(p)(*args).said)(
             case.params, ids, masked, case.actions(robot), case.robot(robot, batch)
         )
         check_channels_first(case, "logits_skip_normalization", out)
@@ -119,7 +119,7 @@ def check_loss(case: Case) -> None:
         (loss, accuracy), grads = gradient(case.params, actions, robots)
         case.check(f"loss__{robot}", loss)
         case.check(f"acc__{robot}", accuracy)
-        logits = apply(ids, masked, actions, robots).frames
+        logits = apply(ids, masked, actions, robots).said
         check_channels_first(case, f"logits__{robot}", logits)
         check_channels_first(case, f"logits_last_frame__{robot}", logits)
         if index == 0:
@@ -129,10 +129,10 @@ def check_loss(case: Case) -> None:
             case.check_zero(named, case.info["unused_parameters"])
 
     if "loss__no_action" in case.outputs:
-        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).frames
+        logits = apply(ids, masked, None, case.robot(case.domains[0], batch)).said
         digits = factorise(labels, case.run.model.factors, case.run.model.factor_vocab)
         weight = recorded.targets_TS / recorded.targets_TS.sum()
-        per_token = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
+        per_token, _ = smoothed_cross_entropy(logits, digits, MASKING.label_smoothing)
         case.check("loss__no_action", (per_token * weight).sum())
         right = (logits.argmax(-1) == digits).all(-1)
         case.check("acc__no_action", (right * weight).sum())
@@ -168,7 +168,7 @@ class Decoder:
         for step, keep in enumerate(masked_counts(config, steps)):
             ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
             out = self.apply(ids, masked, self.actions, robots, self.hidden)
-            logits = out.frames[:, t]
+            logits = out.said[:, t]
             first = logits if first is None else first
             sampled, score = sample_tokens(logits, keys, 0.0)
             if keep and scores is not None:
@@ -253,7 +253,7 @@ def check_joint(case: Case) -> None:
     def read(params, actions, robots, hidden):
         model = case.declared.merge(params)
         out = model(ids, masked, actions, robots, hidden_BT=hidden)
-        return out.frames, model.action_head(out.actions, robots)
+        return out.said, model.action_head(out.actions, robots)
 
     for robot in case.domains:
         robots, chunk = case.robot(robot, batch), case.table.entries[case.table.index(robot)].chunk
@@ -300,7 +300,7 @@ def _check_joint_training(case: Case) -> None:
             action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(
                 hidden.astype(jnp.float32)
             )
-            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.frames)
+            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.said)
 
         return jax.grad(total, has_aux=True)(params)
 

@@ -33,10 +33,10 @@ def test_old_robots_answers_stay_bit_identical(diffusion, conditioning: str):
             hma = declared.merge(p)
             out = hma(batch["tokens"], None, actions, batch["embodiment"])
             if out.actions is None:
-                return out.frames, 0
+                return out.said, 0
             keys = jax.random.split(jax.random.key(0), 8)
             chunks = read_actions(hma, out, batch["embodiment"], keys, decode)
-            return out.frames, chunks[..., : TABLE.action_width]
+            return out.said, chunks[..., : TABLE.action_width]
 
         return jax.jit(run)(params)
 

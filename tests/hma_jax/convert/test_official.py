@@ -106,7 +106,7 @@ def test_a_model_that_never_was_official_becomes_one_that_computes_the_same(tmp_
 
     def logits(declared, params):
         def apply(p):
-            return declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).frames
+            return declared.merge(p)(batch["tokens"], None, batch["actions"], batch["embodiment"]).said
 
         return jax.jit(apply)(params)
 

@@ -1,0 +1,144 @@
+"""Passes over a window of T positions, with a cache of its finished frames.
+
+Spatial attention stays inside a frame and temporal attention is causal, so all that later frames need of a
+finished one is its keys and values. `extend` adds finished frames, `query` asks about a masked one, and
+`extend_and_query` does both in one pass: the newest finished frame, and the first look at the one after it.
+How a rollout puts these together is told in `steps`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.generation.decoding import Frame, blank_frame
+from hma_jax.model.hma import HMA, Outputs, causal
+from hma_jax.model.trunk import TemporalCache
+
+
+class FrameCache(NamedTuple):
+    """Room for the finished frames of a window."""
+
+    layers: TemporalCache  # keys and values [N, B, room, P, H, I], and what cross-attention needs
+    valid: jax.Array  # bool [room]: slots that hold a frame
+
+    @property
+    def room(self) -> int:
+        return self.valid.shape[0]
+
+    def write(self, layers: TemporalCache, slot: int | jax.Array) -> FrameCache:
+        """With the frames of `layers` in the slots from `slot` on."""
+
+        def put(old: jax.Array, new: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_update_slice_in_dim(old, new, slot, axis=2)
+
+        count = layers.time.keys.shape[2]
+        valid = jax.lax.dynamic_update_slice_in_dim(self.valid, jnp.ones(count, bool), slot, axis=0)
+        return FrameCache(jax.tree.map(put, self.layers, layers), valid)
+
+
+class Window(NamedTuple):
+    """What all passes over the positions of a window share."""
+
+    model: HMA
+    actions_BTU: jax.Array  # as `HMA.align` arranges them
+    hidden_BT: jax.Array | None  # frames that are shown no action
+    embodiment_B: jax.Array
+
+    @classmethod
+    def over(
+        cls, model: HMA, chunks_BTU: jax.Array, hidden_BT: jax.Array | None, embodiment_B: jax.Array
+    ) -> Window:
+        """From recorded chunks and which of them the model is not shown (None: it sees all)."""
+        shape = chunks_BTU.shape[:2]
+        return cls(model, model.align(chunks_BTU), model.align_hidden(hidden_BT, shape), embodiment_B)
+
+    def empty(self, batch: int, room: int) -> FrameCache:
+        """A cache without frames."""
+        blank = blank_frame(self.model.config, batch)
+
+        def one_frame() -> TemporalCache | None:
+            return self._pass(blank.values[:, None], blank.masked[:, None], 0, remember=1).cache
+
+        shapes = jax.eval_shape(one_frame)
+        layers = jax.tree.map(lambda x: jnp.zeros((*x.shape[:2], room, *x.shape[3:]), x.dtype), shapes)
+        return FrameCache(layers, jnp.zeros(room, bool))
+
+    def start(self, frames: jax.Array, room: int) -> FrameCache:
+        """The cache of finished frames [B, T', S (, C)] at the first positions, with `room` in all."""
+        batch, count = frames.shape[:2]
+        cache = self.empty(batch, room)
+        return cache.write(self._pass(frames, None, 0, remember=count, said_from=count).cache, 0) if count else cache
+
+    def query(self, cache: FrameCache, frame: Frame, at: int | jax.Array) -> jax.Array:
+        """What the model says [B, S, ...] of a partly masked frame at position `at`."""
+        visible = jnp.append(cache.valid, True)[None]
+        said = self._pass(frame.values[:, None], frame.masked[:, None], at, cache.layers, visible).said
+        return said[:, 0]
+
+    def extend_and_query(
+        self,
+        cache: FrameCache | None,
+        finished: jax.Array,
+        at: int | jax.Array,
+        slot: int | jax.Array,
+        positions: jax.Array | None = None,
+    ) -> tuple[FrameCache, jax.Array]:
+        """(the cache with frames `finished` [B, n, S (, C)] from `slot` on, what the model says of the wholly
+        masked frame after them), in one pass.
+
+        The frames take the actions from `at` on, and those positions unless `positions` [n + 1] are given.
+        Without a cache they are the first of the window.
+        """
+        count = finished.shape[1]
+        blank = blank_frame(self.model.config, len(finished))
+        values = jnp.concatenate([finished, blank.values[:, None].astype(finished.dtype)], axis=1)
+        masked = jnp.broadcast_to((jnp.arange(count + 1) == count)[None, :, None], values.shape[:3])
+        if cache is None:
+            out = self._pass(values, masked, at, remember=count, said_from=count)
+            return FrameCache(out.cache, jnp.ones(count, bool)), out.said[:, 0]
+        # What `finished` takes the place of was still before it, but is past the masked frame's window.
+        slots = jnp.arange(cache.room)
+        remaining = cache.valid & ~((slots >= slot) & (slots < slot + count))
+        earlier = jnp.stack([cache.valid] * count + [remaining])
+        visible = jnp.concatenate([earlier, causal(count + 1)], axis=1)
+        out = self._pass(
+            values, masked, at, cache.layers, visible, positions=positions, remember=count, said_from=count
+        )
+        return cache.write(out.cache, slot), out.said[:, 0]
+
+    def read(self, cache: FrameCache, frame: jax.Array, at: int | jax.Array) -> Outputs:
+        """A pass over one finished frame [B, S (, C)] at position `at`, which does not enter the cache."""
+        visible = jnp.append(cache.valid, True)[None]
+        return self._pass(frame[:, None], None, at, cache.layers, visible)
+
+    def _pass(
+        self,
+        values: jax.Array,
+        masked: jax.Array | None,
+        at: int | jax.Array,
+        past: TemporalCache | None = None,
+        visible: jax.Array | None = None,
+        **options: Any,
+    ) -> Outputs:
+        """One pass over frames that take the actions from `at` on; `options` are the model's."""
+        count = values.shape[1]
+        hidden = None if self.hidden_BT is None else cut(self.hidden_BT, at, count)
+        return self.model(
+            values,
+            masked,
+            cut(self.actions_BTU, at, count),
+            self.embodiment_B,
+            hidden_BT=hidden,
+            visible=visible,
+            first=at,
+            past=past,
+            **options,
+        )
+
+
+def cut(x: jax.Array, first: int | jax.Array, count: int) -> jax.Array:
+    """`count` frames of [B, T, ...] from `first` on."""
+    return jax.lax.dynamic_slice_in_dim(x, first, count, axis=1)

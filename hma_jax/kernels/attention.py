@@ -1,0 +1,50 @@
+"""Attention as the model calls it, and the table of what computes it.
+
+Queries, keys and values are [B, T, P, H, I]: T frames of P tokens with H heads of width I. All backends
+compute softmax(scale q.k) v, with logits and softmax in float32, and agree with `plain` up to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+
+from hma_jax.config import require
+from hma_jax.kernels import cpu, cudnn, plain, splash
+
+Within = Callable[[jax.Array, float], jax.Array]
+"""within(qkv, scale): qkv [B, T, P, 3, H, I] -> [B, T, P, H, I]; a token sees all tokens of its frame."""
+
+OverTime = Callable[[jax.Array, jax.Array, float], jax.Array]
+"""over_time(qkv, visible, scale): qkv [B, T, P, 3, H, I] -> [B, T, P, H, I]; a token sees its own position in
+the frames that `visible` (bool [T, T]) allows."""
+
+OverCache = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, float], jax.Array]
+"""over_cache(qkv, keys, values, visible, scale): as `over_time`, with keys and values [B, T_past, P, H, I] of
+earlier frames before those of `qkv`; `visible` is bool [T, T_past + T]."""
+
+
+class Backend(NamedTuple):
+    within: Within
+    over_time: OverTime
+    over_cache: OverCache
+
+
+BACKENDS = {
+    "plain": Backend(plain.within, plain.over_time, plain.over_cache),
+    "cpu": Backend(cpu.within, plain.over_time, cpu.over_cache),
+    "cudnn": Backend(cudnn.within, plain.over_time, plain.over_cache),
+    "splash": Backend(splash.within, plain.over_time, plain.over_cache),
+}
+
+OF_PLATFORM = {"cpu": "cpu", "gpu": "cudnn", "cuda": "cudnn", "tpu": "splash"}
+
+
+def find_backend(name: str) -> Backend:
+    """The backend called `name`; `auto` is the one of the default device's platform."""
+    if name == "auto":
+        name = OF_PLATFORM.get(jax.default_backend(), "plain")
+    require(name in BACKENDS, f"execution.attention {name!r} is unknown; known: auto, {', '.join(BACKENDS)}")
+    return BACKENDS[name]

@@ -1,0 +1,124 @@
+"""Attention for CPUs: one frame's weights at a time, which fit the cache that all frames' together do not.
+
+The weights of a frame are computed again in the backward pass, from the logarithm of their sum. Heads go in a
+few groups, each a chain of its own: XLA's thread pool runs chains side by side, but not the matrices of one
+batched product. A single query per position, as in generation, is no matrix: products and sums of arrays are
+faster there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.kernels import plain, remat
+from hma_jax.kernels.pointwise import sum_over
+from hma_jax.runtime.sharding import is_split
+
+CACHED_BYTES = 2**20
+"""Attention weights of a frame below this stay in the cache anyway."""
+
+CHAINS = 2
+"""Groups of heads. Measured on two cores; one chain used one of them."""
+
+FEW = 2
+"""Frames up to here that attend to a cache do so one by one."""
+
+
+def within(qkv: jax.Array, scale: float) -> jax.Array:
+    """As `plain.within`. Small frames, and what a mesh splits, are left to it."""
+    frame = qkv.shape[2] ** 2 * qkv.shape[4] * 4
+    if frame <= CACHED_BYTES or is_split():
+        return plain.within(qkv, scale)
+    return _by_frame(qkv, scale)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(1,))
+def _by_frame(qkv: jax.Array, scale: float) -> jax.Array:
+    return _forward(qkv, scale)[0]
+
+
+def _forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    frames = qkv.reshape(-1, *qkv.shape[2:])
+    y, log_sum = jax.lax.map(partial(_in_chains, partial(_attend, scale)), (frames,))
+    y, log_sum = remat.attention(y.reshape(*qkv.shape[:3], *qkv.shape[4:])), remat.attention(log_sum)
+    return y, (qkv, y, log_sum)
+
+
+def _backward(scale: float, saved: tuple[jax.Array, ...], dy: jax.Array) -> tuple[jax.Array]:
+    qkv, y, log_sum = saved
+    # The mean of a row of dweights under its weights: dy.y.
+    delta = jnp.einsum("btphi,btphi->bthp", dy, y, preferred_element_type=jnp.float32)
+    flat = (qkv, dy, delta)
+    frames, dy, delta = (x.reshape(-1, *x.shape[2:]) for x in flat)
+    dqkv = jax.lax.map(partial(_in_chains, partial(_attend_backward, scale)), (frames, dy, log_sum, delta))
+    return (dqkv.reshape(qkv.shape),)
+
+
+_by_frame.defvjp(_forward, _backward)
+
+
+def _in_chains(attend: Callable, frame: tuple[jax.Array, ...]):
+    """`attend` over groups of heads. Arrays [P, ..., H, I] are handed over as [H, ..., P, I], arrays [H, P] as
+    they are, and come back likewise."""
+    heads = frame[0].shape[-2]
+    size = -(-heads // CHAINS)
+    by_head = [x if x.ndim == 2 else jnp.moveaxis(x, (-2, 0), (0, -2)) for x in frame]
+    groups = [attend(*(x[first : first + size] for x in by_head)) for first in range(0, heads, size)]
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *groups)
+    return jax.tree.map(lambda x: x if x.ndim == 2 else jnp.moveaxis(x, (0, -2), (-2, 0)), joined)
+
+
+def _attend(scale: float, qkv: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """qkv [H, 3, P, I] -> what is attended to [H, P, I], and log sum exp of the logits [H, P]."""
+    q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
+    logits = scale * jnp.einsum("hpi,hsi->hps", q, k, preferred_element_type=jnp.float32)
+    highest = jnp.max(logits, axis=-1, keepdims=True)
+    weights = jnp.exp(logits - highest)
+    total = jnp.sum(weights, axis=-1, keepdims=True)
+    y = jnp.einsum("hps,hsi->hpi", weights.astype(v.dtype), v) / total
+    return y.astype(v.dtype), (highest + jnp.log(total))[..., 0]
+
+
+def _attend_backward(
+    scale: float, qkv: jax.Array, dy: jax.Array, log_sum: jax.Array, delta: jax.Array
+) -> jax.Array:
+    """dqkv [H, 3, P, I]. Rows of the weights are keys here: then one product of three is of a transposed
+    matrix, not two."""
+    q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
+    logits = scale * jnp.einsum("hsi,hpi->hsp", k, q, preferred_element_type=jnp.float32)
+    weights = jnp.exp(logits - log_sum[:, None])
+    dweights = jnp.einsum("hsi,hpi->hsp", v, dy, preferred_element_type=jnp.float32)
+    dlogits = (scale * weights * (dweights - delta[:, None])).astype(q.dtype)
+    dq = jnp.einsum("hsp,hsi->hpi", dlogits, k)
+    dk = jnp.einsum("hsp,hpi->hsi", dlogits, q)
+    dv = jnp.einsum("hsp,hpi->hsi", weights.astype(dy.dtype), dy)
+    return jnp.stack([dq, dk, dv], axis=1)
+
+
+def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
+    """As `plain.over_cache`."""
+    if qkv.shape[1] > FEW:
+        return plain.over_cache(qkv, keys, values, visible, scale)
+    q, k, v = plain.split(qkv)
+    each = [
+        _one_frame(q[:, t], (keys, k), (values, v), visible[t], scale) for t in range(qkv.shape[1])
+    ]
+    return jnp.stack(each, axis=1)
+
+
+def _one_frame(
+    q: jax.Array, keys: tuple[jax.Array, ...], values: tuple[jax.Array, ...], visible: jax.Array, scale: float
+) -> jax.Array:
+    """q [B, P, H, I] over frames [B, T, P, H, I] in pieces that are not joined: no copy of a cache is made.
+
+    Sums are in float32, as those inside a product of matrices are.
+    """
+    q32 = q.astype(jnp.float32)[:, None]
+    logits = jnp.concatenate([sum_over(q32 * k.astype(jnp.float32), -1)[..., 0] for k in keys], axis=1)
+    weights = plain.softmax(scale * jnp.moveaxis(logits, 1, -1), visible)
+    frames = [v[:, t].astype(jnp.float32) for v in values for t in range(v.shape[1])]
+    return sum(weights[..., t, None] * frame for t, frame in enumerate(frames)).astype(q.dtype)

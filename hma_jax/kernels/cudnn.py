@@ -1,0 +1,26 @@
+"""Attention on NVIDIA GPUs by cuDNN's fused kernel, which never writes the weights to memory.
+
+It takes 16-bit numbers and heads whose width is a multiple of 8; everything else is left to `plain`. Over
+time, sequences of a dozen frames are too short for it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.kernels import plain
+
+
+def suits(qkv: jax.Array) -> bool:
+    """Whether the kernel takes these queries, keys and values."""
+    return qkv.dtype in (jnp.bfloat16, jnp.float16) and qkv.shape[-1] % 8 == 0 and qkv.shape[-1] <= 128
+
+
+def within(qkv: jax.Array, scale: float) -> jax.Array:
+    """As `plain.within`."""
+    if not suits(qkv):
+        return plain.within(qkv, scale)
+    q, k, v = (x.reshape(-1, *x.shape[2:]) for x in plain.split(qkv))
+    y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn")
+    return y.reshape(*qkv.shape[:3], *qkv.shape[4:])

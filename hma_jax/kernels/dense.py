@@ -1,0 +1,179 @@
+"""Products with a weight, with one weight per robot, and look-ups in tables; gradients are written out.
+
+On CPU the gradient of a weight is a product whose narrower factor is turned first, in a copy of its own:
+XLA's products are slow at factors that lie the other way round. A robot's gradient is summed over its
+examples by a product with their one-hot assignment: no scatter, and the same sum on every run.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def contract(x: jax.Array, w: jax.Array, axes: int = 1, dtype: jnp.dtype | None = None) -> jax.Array:
+    """x [..., in] times w [in, ...]; with `axes` 2 both have two axes for `in`. The result is of the type of x,
+    or of `dtype`, in which it is then summed."""
+    return jnp.tensordot(x, w, axes, preferred_element_type=dtype)
+
+
+def _contract_forward(
+    x: jax.Array, w: jax.Array, axes: int, dtype: jnp.dtype | None
+) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return contract(x, w, axes, dtype), (x, w)
+
+
+def _contract_backward(
+    axes: int, dtype: jnp.dtype | None, saved: tuple[jax.Array, jax.Array], dy: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    x, w = saved
+    dy = dy.astype(x.dtype)
+    outs = w.ndim - axes
+    dx = jnp.tensordot(dy, w, (tuple(range(dy.ndim - outs, dy.ndim)), tuple(range(axes, w.ndim))))
+    wide, narrow = math.prod(w.shape[:axes]), math.prod(w.shape[axes:])
+    dw = _product_over_rows(x.reshape(-1, wide), dy.reshape(-1, narrow))
+    return dx, dw.reshape(w.shape)
+
+
+contract.defvjp(_contract_forward, _contract_backward)
+
+
+def _product_over_rows(x: jax.Array, dy: jax.Array) -> jax.Array:
+    """x [R, in], dy [R, out] -> [in, out], summed over rows."""
+
+    def turned(x: jax.Array, dy: jax.Array) -> jax.Array:
+        if x.shape[1] <= dy.shape[1]:
+            return _copied(x.T) @ dy
+        return _copied(_copied(dy.T) @ x).T
+
+    return jax.lax.platform_dependent(x, dy, cpu=turned, default=lambda x, dy: jnp.tensordot(x, dy, (0, 0)))
+
+
+def _copied(x: jax.Array) -> jax.Array:
+    """x as an array of its own: XLA may not merge what follows with what made it."""
+    return jax.lax.optimization_barrier(x)
+
+
+# --- One weight per robot ------------------------------------------------------------------------
+
+
+def per_robot(x: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+    """x [B, ..., in] times each example's own slice of w [E, in, out], slice_B [B] -> [B, ..., out].
+
+    The slices are copied to their examples in the type of w. A copy is small beside the example's
+    activations: D^2 numbers where those are T P D.
+    """
+    y = _per_robot(x.reshape(x.shape[0], -1, x.shape[-1]), w, slice_B)
+    return y.reshape(*x.shape[:-1], y.shape[-1])
+
+
+@jax.custom_vjp
+def _per_robot(x_BRi: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+    return jnp.einsum("bri,bio->bro", x_BRi, jnp.take(w, slice_B, axis=0))
+
+
+def _per_robot_backward(saved: tuple[jax.Array, ...], dy: jax.Array) -> tuple[jax.Array, jax.Array, None]:
+    x, w, slice_B = saved
+    dx = jnp.einsum("bro,bio->bri", dy, jnp.take(w, slice_B, axis=0))
+    each = jax.vmap(_product_over_rows)(x, dy)
+    return dx, sum_by_robot(each, slice_B, len(w)), None
+
+
+_per_robot.defvjp(lambda *args: (_per_robot(*args), args), _per_robot_backward)
+
+
+@jax.custom_vjp
+def take_by_robot(w: jax.Array, slice_B: jax.Array) -> jax.Array:
+    """w [E, ...] -> [B, ...]: each example's own slice."""
+    return jnp.take(w, slice_B, axis=0)
+
+
+take_by_robot.defvjp(
+    lambda w, slice_B: (take_by_robot(w, slice_B), (w, slice_B)),
+    lambda saved, dy: (sum_by_robot(dy, saved[1], len(saved[0])), None),
+)
+
+
+CHUNK = 32
+"""Action values that are multiplied at a time."""
+
+
+def from_actions(x: jax.Array, w: jax.Array) -> jax.Array:
+    """x [..., U] times w [U, out] -> [..., out]; padding both with zeros does not change a bit of the result.
+
+    Chunks of a fixed size are summed one after the other, so that padding adds zeros to a finished sum. One
+    product over all of U would not do: kernels split a sum by its length.
+    """
+    chunks = jnp.moveaxis(_in_chunks(x, x.ndim - 1), -2, 0), _in_chunks(w, 0)
+
+    def add(y: jax.Array, chunk: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        return y + jnp.matmul(*chunk), None
+
+    return jax.lax.scan(add, jnp.zeros((*x.shape[:-1], w.shape[-1]), x.dtype), chunks)[0]
+
+
+def to_actions(x: jax.Array, w: jax.Array) -> jax.Array:
+    """x [..., in] times w [in, U] -> [..., U]; more columns do not change a bit of the others."""
+    columns = jnp.moveaxis(_in_chunks(w, 1), 1, 0)
+    y = jnp.moveaxis(jax.lax.map(lambda chunk: jnp.matmul(x, chunk), columns), 0, -2)
+    return y.reshape(*x.shape[:-1], -1)[..., : w.shape[1]]
+
+
+def _in_chunks(x: jax.Array, axis: int) -> jax.Array:
+    """`axis` as two, (chunks, CHUNK); padded with zeros, and at least two chunks: a loop of one would become
+    another program."""
+    count = max(2, -(-x.shape[axis] // CHUNK))
+    padding = [(0, 0)] * x.ndim
+    padding[axis] = (0, count * CHUNK - x.shape[axis])
+    return jnp.pad(x, padding).reshape(*x.shape[:axis], count, CHUNK, *x.shape[axis + 1 :])
+
+
+def per_robot_from_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+    """`per_robot` for w [E, U, out], by `from_actions`."""
+    return jax.vmap(from_actions)(x, take_by_robot(w, slice_B))
+
+
+def per_robot_to_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+    """`per_robot` for w [E, in, U], by `to_actions`."""
+    return jax.vmap(to_actions)(x, take_by_robot(w, slice_B))
+
+
+def sum_by_robot(x: jax.Array, slice_B: jax.Array, robots: int) -> jax.Array:
+    """x [B, ...] -> [E, ...]: the sum over each robot's examples."""
+    if robots == 1:
+        return jnp.sum(x, axis=0, keepdims=True)
+    mine = (jnp.arange(robots)[:, None] == slice_B).astype(x.dtype)
+    return (mine @ x.reshape(len(x), -1)).reshape(robots, *x.shape[1:])
+
+
+# --- Tables ------------------------------------------------------------------------------------
+
+WIDE = 2048
+"""Entries of a table above which its gradient is scattered instead of multiplied."""
+
+
+@jax.custom_vjp
+def look_up(table: jax.Array, ids: jax.Array) -> jax.Array:
+    """Rows [..., D] of a table [V, D] for ids [...].
+
+    The gradient is summed in float32 whatever the type of the rows: a token that a batch holds a thousand
+    times would lose most of its sum in bfloat16. It is a product with the ids' one-hot form, which is the same
+    on every run; only large tables are scattered into.
+    """
+    return jnp.take(table, ids, axis=0)
+
+
+def _look_up_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array) -> tuple[jax.Array, None]:
+    table, ids = saved
+    rows, ids = dy.reshape(-1, dy.shape[-1]), ids.ravel()
+    if len(table) > WIDE:
+        return jnp.zeros(table.shape, jnp.float32).at[ids].add(rows.astype(jnp.float32)), None
+    hot = (jnp.arange(len(table))[:, None] == ids).astype(rows.dtype)
+    return jnp.matmul(hot, rows, preferred_element_type=jnp.float32), None
+
+
+look_up.defvjp(lambda table, ids: (look_up(table, ids), (table, ids)), _look_up_backward)

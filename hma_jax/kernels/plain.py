@@ -1,0 +1,54 @@
+"""Attention as its formula says, for XLA to compile: the reference of every other backend."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.kernels import remat
+
+NEVER = -1e30
+"""A logit that no softmax notices; finite, so that a row without anything visible has no NaN."""
+
+
+def softmax(logits: jax.Array, visible: jax.Array | None = None) -> jax.Array:
+    """float32 softmax over the last axis, over what is `visible` (bool, which broadcasts)."""
+    if visible is not None:
+        logits = jnp.where(visible, logits, NEVER)
+    return jax.nn.softmax(logits, axis=-1)
+
+
+def within(qkv: jax.Array, scale: float) -> jax.Array:
+    q, k, v = split(qkv)
+    logits = jnp.einsum("btphi,btshi->bthps", q, k, preferred_element_type=jnp.float32)
+    weights = _kept_if_small(softmax(scale * logits).astype(v.dtype), qkv)
+    return remat.attention(jnp.einsum("bthps,btshi->btphi", weights, v))
+
+
+def over_time(qkv: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
+    q, k, v = split(qkv)
+    weights = _kept_if_small(_weights(q, k, visible, scale).astype(v.dtype), qkv)
+    return remat.attention(jnp.einsum("bphts,bsphi->btphi", weights, v))
+
+
+def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
+    q, k, v = split(qkv)
+    k, v = jnp.concatenate([keys, k], axis=1), jnp.concatenate([values, v], axis=1)
+    weights = _weights(q, k, visible, scale).astype(v.dtype)
+    return jnp.einsum("bphts,bsphi->btphi", weights, v)
+
+
+def _weights(q: jax.Array, k: jax.Array, visible: jax.Array, scale: float) -> jax.Array:
+    """Of every position's frames, float32 [B, P, H, T, T_past + T]."""
+    logits = jnp.einsum("btphi,bsphi->bphts", q, k, preferred_element_type=jnp.float32)
+    return softmax(scale * logits, visible)
+
+
+def _kept_if_small(weights: jax.Array, qkv: jax.Array) -> jax.Array:
+    """Attention weights are worth keeping for the backward pass where they are smaller than what they came from."""
+    return remat.product(weights) if weights.size <= qkv.size else weights
+
+
+def split(qkv: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Queries, keys and values [..., H, I] of [..., 3, H, I]."""
+    return qkv[..., 0, :, :], qkv[..., 1, :, :], qkv[..., 2, :, :]

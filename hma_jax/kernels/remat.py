@@ -1,0 +1,59 @@
+"""What a block keeps for its backward pass.
+
+Values worth keeping are marked where they are made, by what they are; `ExecutionConfig.remat` decides which
+marks count. What is not kept is computed again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.ad_checkpoint import checkpoint_name
+
+from hma_jax.config.execution import Remat
+
+PRODUCT, ATTENTION, INPUT = "product", "attention", "input"
+
+
+def product(x: jax.Array) -> jax.Array:
+    """Marks a product of matrices, or a sum with one: dear to compute, and the backward pass reads it."""
+    return checkpoint_name(x, PRODUCT)
+
+
+def attention(x: jax.Array) -> jax.Array:
+    """Marks a result of attention, or the first product of the MLP: dearest for its size."""
+    return checkpoint_name(x, ATTENTION)
+
+
+def block_input(x: jax.Array) -> jax.Array:
+    """Marks what a block starts from."""
+    return checkpoint_name(x, INPUT)
+
+
+def checkpointed(block: Callable[..., Any], remat: Remat, scanned: bool) -> Callable[..., Any]:
+    """`block` (carry, xs) -> (carry, ys), one of many, keeping what `remat` says.
+
+    `scanned`: it is the body of a loop, in which XLA cannot merge a second computation with the first.
+    """
+    if remat == "none":
+        return block
+    policies = jax.checkpoint_policies
+    policy = {
+        "products": policies.save_from_both_policies(_fused, policies.save_only_these_names(PRODUCT, ATTENTION)),
+        "attention": policies.save_from_both_policies(_fused, policies.save_only_these_names(ATTENTION)),
+        "everything": policies.nothing_saveable,
+        "offload": policies.save_and_offload_only_these_names(
+            names_which_can_be_saved=[],
+            names_which_can_be_offloaded=[INPUT],
+            offload_src="device",
+            offload_dst="pinned_host",
+        ),
+    }[remat]
+    return jax.checkpoint(block, prevent_cse=not scanned, policy=policy)
+
+
+def _fused(primitive: Any, *_: Any, **__: Any) -> bool:
+    """What cuDNN's kernel leaves for its gradient, which bears no mark."""
+    return primitive.name == "dot_product_attention_fwd"

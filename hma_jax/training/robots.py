@@ -1,0 +1,61 @@
+"""Which robots' parameters a step computes with.
+
+A batch of B examples has at most B robots, of a model that may know hundreds. Their slices are taken out
+before gradients are computed and put back after the update: no gradient, no moment and no transfer of the
+others' parameters is made, which stand still in such a step anyway.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.model.params import Params, ParamSpec, is_spec
+
+
+class Active(NamedTuple):
+    """The robots of one step: G = min(B, E) different ones, those of the batch among them."""
+
+    robots_G: jax.Array  # int32: their places on the embodiment axis
+    slice_B: jax.Array  # int32: each example's robot, as a place in `robots_G`
+
+
+def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
+    """The robots of a batch, then as many others as make a fixed number."""
+    count = min(len(embodiment_B), embodiments)
+    if count == embodiments:
+        return Active(jnp.arange(embodiments), embodiment_B)
+    here_E = jnp.zeros(embodiments, bool).at[embodiment_B].set(True)
+    order = jnp.argsort(~here_E, stable=True)
+    place_E = jnp.zeros(embodiments, jnp.int32).at[order].set(jnp.arange(embodiments, dtype=jnp.int32))
+    return Active(order[:count], place_E[embodiment_B])
+
+
+def take(tree: Params, specs: Params, active: Active) -> Params:
+    """Parameters, or anything with an array per parameter, with the active robots' slices only."""
+
+    def slices(spec: ParamSpec, x: jax.Array) -> jax.Array:
+        if _whole(spec, active):
+            return x
+        return jnp.take(x, active.robots_G, axis=spec.embodiment_axis, indices_are_sorted=False)
+
+    return jax.tree.map(slices, specs, tree, is_leaf=is_spec)
+
+
+def put(tree: Params, new: Params, specs: Params, active: Active) -> Params:
+    """`tree` with the active robots' slices, and whatever all robots share, from `new`."""
+
+    def written(spec: ParamSpec, x: jax.Array, slices: jax.Array) -> jax.Array:
+        if _whole(spec, active):
+            return slices
+        index: tuple[Any, ...] = (slice(None),) * spec.embodiment_axis + (active.robots_G,)
+        return x.at[index].set(slices, unique_indices=True)
+
+    return jax.tree.map(written, specs, tree, new, is_leaf=is_spec)
+
+
+def _whole(spec: ParamSpec, active: Active) -> bool:
+    axis = spec.embodiment_axis
+    return axis is None or spec.shape[axis] == len(active.robots_G)

@@ -1,0 +1,74 @@
+"""What a block keeps for its backward pass, under every policy."""
+
+from typing import get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ExecutionConfig
+from hma_jax.config.execution import Remat
+from hma_jax.model.hma import declare_model
+from tests.tiny import TABLE, lively_params, model_config, random_batch
+
+CONFIG = model_config(width=16, layers=5, tokens=12, action_tokens=4)
+BATCH = random_batch(0, CONFIG, 2)
+
+
+def loss_of(remat: str, config=CONFIG):
+    declared = declare_model(config, TABLE, ExecutionConfig(remat=remat))
+
+    def loss(params):
+        out = declared.merge(params)(BATCH["tokens"], None, BATCH["actions"], BATCH["embodiment"])
+        return jnp.sum(jnp.sin(out.said))
+
+    return loss
+
+
+def widths_kept(remat: str) -> float:
+    """Per layer and token, in units of D."""
+    _, params = lively_params(CONFIG)
+    _, backward = jax.vjp(loss_of(remat), params)
+    kept = sum(x.size for x in jax.tree.leaves(backward) if x.shape[:2] == (CONFIG.layers, 2))
+    return kept / (CONFIG.layers * 2 * CONFIG.frames * CONFIG.frame_tokens * CONFIG.width)
+
+
+INPUT, QUERIES_KEYS_VALUES, ATTENDED, SUM, MLP = 1, 3, 1, 1, 4
+WEIGHTS_OVER_TIME = CONFIG.frames * CONFIG.heads / CONFIG.width
+
+
+@pytest.mark.parametrize(
+    "remat, widths",
+    [
+        ("everything", INPUT),
+        ("attention", INPUT + 2 * ATTENDED + MLP),
+        ("products", INPUT + 2 * (QUERIES_KEYS_VALUES + ATTENDED) + 3 * SUM + MLP + WEIGHTS_OVER_TIME),
+    ],
+)
+def test_a_block_keeps_what_its_policy_says(remat: str, widths: float):
+    assert widths_kept(remat) == pytest.approx(widths, rel=0.02)
+
+
+@pytest.mark.parametrize("layers", [2, 5], ids=["written out", "scanned"])
+def test_gradients_are_the_same_under_every_policy_and_the_more_is_kept_the_more_memory(layers: int):
+    config = model_config(width=16, layers=layers, tokens=64, action_tokens=4)
+    batch = random_batch(0, config, 2)
+    _, params = lively_params(config)
+    gradients, memory = {}, {}
+    for remat in get_args(Remat):
+        declared = declare_model(config, TABLE, ExecutionConfig(remat=remat))
+
+        def loss(params, declared=declared):
+            out = declared.merge(params)(batch["tokens"], None, batch["actions"], batch["embodiment"])
+            return jnp.sum(jnp.sin(out.said))
+
+        compiled = jax.jit(jax.grad(loss)).lower(params).compile()
+        gradients[remat] = compiled(params)
+        memory[remat] = compiled.memory_analysis().temp_size_in_bytes
+    for remat, found in gradients.items():
+        for got, want in zip(jax.tree.leaves(found), jax.tree.leaves(gradients["none"]), strict=True):
+            np.testing.assert_allclose(got, want, atol=2e-5 * np.abs(want).max(), err_msg=remat)
+    if layers > 2:
+        assert memory["none"] > 1.2 * memory["products"]
+        assert memory["products"] > 1.2 * memory["attention"] > 1.2 * memory["everything"]
