@@ -1,0 +1,82 @@
+"""Our stages beside the official release's: two processes that take turns, so that a slow spell hits both."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from experiments.bench.record import Stage
+from experiments.bench.timing import summarise
+from hma_jax.config import require
+
+RELEASED = {
+    "forward": "forward",
+    "fill": "frame",
+    "slide": "frame",
+    "step": "step",
+    "continuous fill": "continuous frame",
+    "continuous slide": "continuous frame",
+    "continuous few": "continuous frame",
+}
+"""Our stage -> the release's that gives the same."""
+
+OURS, THEIRS = "ours: ", "release: "
+
+
+class Worker:
+    """A process that runs stages when asked."""
+
+    def __init__(self, command: Sequence[str], **environment: str):
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ | environment
+        )
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.stdin.close()
+        self.process.wait()
+
+    def run(self, stage: str) -> float:
+        """Seconds. Raises ConfigError if the process ended instead of answering."""
+        self.process.stdin.write(f"{stage}\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        require(
+            bool(answer),
+            f"the process that times {stage!r} ended with code {self.process.wait()}; what it printed is above",
+        )
+        return float(answer)
+
+
+def time_beside(
+    release: Path, python: Path, names: Sequence[str], turns: int, progress: Callable[[str, int], None]
+) -> tuple[list[Stage], dict[str, float]]:
+    """(stages of both, how many times faster ours are). `release` is a checkout, `python` an interpreter that
+    has what it imports. Raises ConfigError."""
+    unknown = sorted(set(names) - set(RELEASED))
+    require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASED)}")
+    require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
+    script = Path(__file__).with_name("released.py")
+    order = list(dict.fromkeys(turn for name in names for turn in ((THEIRS, RELEASED[name]), (OURS, name))))
+    seconds: dict[tuple[str, str], list[float]] = {turn: [] for turn in order}
+    with ExitStack() as stack:
+        workers = {
+            THEIRS: stack.enter_context(Worker([str(python), str(script)], PYTHONPATH=str(release.absolute()))),
+            OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"])),
+        }
+        for turn in range(-1, turns):  # the first one compiles and warms up
+            for whose, stage in order:
+                progress(f"{whose}{stage}", max(turn, 0))
+                took = workers[whose].run(stage)
+                if turn >= 0:
+                    seconds[whose, stage].append(took)
+    stages = [Stage(f"{whose}{stage}", 1, summarise(taken)) for (whose, stage), taken in seconds.items()]
+    median = {stage.name: stage.timing.median for stage in stages}
+    ratios = {f"{n}, times faster": median[THEIRS + RELEASED[n]] / median[OURS + n] for n in names}
+    return stages, ratios
