@@ -93,7 +93,7 @@ ACCELERATOR = Study(
 )
 
 PAPER = Study(
-    name="paper",  # section 4 of the paper, as stated; bring the forty datasets with --data
+    name="paper",  # paper section 4, as stated; bring the forty datasets with --data
     datasets=FORTY,
     tokenizer=TokenizerConfig(image_size=256, downsample=16, bits=18, channels=1024,
                               encoder_blocks=3, decoder_blocks=6),

@@ -2,7 +2,7 @@
 
 Question: held-out loss over a grid of learning rates at several widths, with muP and without. What
     is lost at each width by taking the best rate of the base width?
-Paper figure: none (section 3.5 uses muP; this tests it).
+Paper figure: none (paper section 3.5 uses muP; this tests it).
 Command: python -m experiments.transfer_lr --preset cpu
 Cost: rates x widths x 2 training runs per seed, less those that both ways share at the base width,
     each as small as `transfer` in the study says; `--dry-run` prints it.

@@ -102,7 +102,7 @@ def train_trial(
     initial: Params | None = None,
     origin: dict[str, Any] | None = None,
 ) -> FitResult:
-    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train_model`.
+    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
 
     A model that is not new has a `table` of its own (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.

@@ -97,7 +97,7 @@ def freeze_manifest(
 
     Starts within an episode lie `spacing` model frames apart; the default, `frames`, makes
     windows disjoint, so that standard errors do not count the same pixels twice.
-    DIFFERS: the release evaluates the first windows of each dataset (reference section 5.6).
+    DIFFERS: the release evaluates the first windows of each dataset (reference section 6.1).
 
     Raises DataError if no dataset has a window.
     """

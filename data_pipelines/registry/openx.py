@@ -4,7 +4,7 @@ Sources: keys, dimensions, versions and what the values mean are those of the pu
 (the tfds catalog's pages, features.json of the published directories); rates are the control
 frequencies of the Open X-Embodiment dataset sheet. What neither confirms is `unverified`.
 
-The official release (reference section 5.4) takes the first camera by name, all action fields
+The official release (reference sections 5.1 and 5.4) takes the first camera by name, all action fields
 in sorted order, and a rate from a table of its own; where that goes wrong, `DIFFERS:` says how.
 Flags that end an episode are no action: in the release they are part of it wherever they exist.
 """

@@ -85,7 +85,7 @@ class Latents(Square):
 class Magvit2Config(Ids):
     """The 1X / Open-MAGVIT2 image tokenizer; defaults are the published one (2^18 codes).
 
-    Reference, appendix A. Every level but the last halves the image.
+    Reference appendix A. Every level but the last halves the image.
     """
 
     kind: Literal["magvit2"] = "magvit2"

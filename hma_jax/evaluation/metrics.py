@@ -8,7 +8,7 @@ float32 (inside a jit, say), numpy arrays in float64. The evaluation gives them 
 one float32 step at 29 dB is already 2e-6 dB, and delta PSNR is a small difference of such
 numbers.
 
-Reference: HMA, section 4 (Metrics); Wang et al. 2004 for SSIM, with the choices of
+Reference: paper section 4 (Metrics); Wang et al. 2004 for SSIM, with the choices of
 scikit-image (uniform window, sample covariance, borders cropped).
 """
 

@@ -18,7 +18,7 @@ A model trained on passive video is shown no action anywhere.
 With `eval.context` "recorded" every frame is predicted from recorded ones and random actions
 replace all of a window's, as the release does: for comparison with published figures.
 DIFFERS: random and true actions share their random numbers (reference section 6.3). The
-release's own autoregressive mode replaces one context frame only (section 6.2); ours is a rollout.
+release's own autoregressive mode replaces one context frame only (reference section 6.2); ours is a rollout.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How frames enter the trunk and leave it, for both variants.
 
 Discrete: ids with one table per vocabulary factor in, logits out. Continuous: latent patches
-in, out the vectors that condition the diffusion head (`diffusion_head`). Masked tokens enter
+in, out the vectors that condition the diffusion head (`heads.Denoiser`). Masked tokens enter
 as one learned vector in both.
 """
 
@@ -30,7 +30,7 @@ def compose(factor_ids: jax.Array, vocab: int) -> jax.Array:
 
 
 def patchify(latents: jax.Array, patch: int) -> jax.Array:
-    """Latent cells [..., h, w, c] -> tokens [..., S, patch^2 c], row by row (reference 2.1)."""
+    """Latent cells [..., h, w, c] -> tokens [..., S, patch^2 c], row by row (reference section 2.1)."""
     *batch, h, w, c = latents.shape
     x = latents.reshape(*batch, h // patch, patch, w // patch, patch, c)
     return jnp.moveaxis(x, -4, -3).reshape(*batch, (h // patch) * (w // patch), patch * patch * c)

@@ -53,7 +53,7 @@ class ResBlock(nnx.Module):
 
 
 class Denoiser(nnx.Module):
-    """A residual MLP modulated by time and condition: noise and a variance fraction (section 2.4).
+    """A residual MLP modulated by time and condition: noise and a variance fraction (reference section 2.4).
 
     Its width does not follow the trunk's: only the condition's input scales under muP, as a
     read-out's. DIFFERS: in every head modulation and last layer start at zero, time and condition

@@ -2,7 +2,7 @@
 
 A declaration says shape, logical axes (in the dimension letters), initialiser, muP role and
 whether weight decay applies. From it come the arrays (`Declared.init`), their sharding
-(`training.sharding`), the optimiser's multipliers, decay mask and embodiment axis
+(`runtime.sharding`), the optimiser's multipliers, decay mask and embodiment axis
 (`training.optimizer`), and the counts. Flax NNX modules hold declarations; what is jitted
 are pure functions of the plain nested dict of arrays that `Declared.init` returns.
 """

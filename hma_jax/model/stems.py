@@ -2,7 +2,7 @@
 
 Reference section 1.3. What the trunk does with a feature is in `conditioning`. The paper's text
 gives one Xavier gain, 0.1, for "action projectors"; the release has it for the modulation and
-0.01 for the stems (section 1.10).
+0.01 for the stems (reference section 1.10).
 """
 
 from __future__ import annotations

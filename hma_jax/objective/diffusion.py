@@ -119,7 +119,7 @@ class Prediction(NamedTuple):
 
 def _predict(network: Network, x_t: jax.Array, t: jax.Array, process: Process) -> Prediction:
     """Runs the network; its second half, nominally in [-1, 1], places the log-variance between
-    the posterior's and log beta (appendix B, item 8)."""
+    the posterior's and log beta (reference appendix B.8)."""
     out = network(x_t, jnp.asarray(process.timestep_map, jnp.int32)[t]).astype(jnp.float32)
     eps, variance = jnp.split(out, 2, axis=-1)
     fraction = (variance + 1) / 2

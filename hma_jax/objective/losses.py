@@ -1,6 +1,6 @@
 """What is learnt: the losses of masked tokens and hidden actions, for both variants.
 
-Discrete tokens cost their cross-entropy and actions their squared error (paper, equation 2);
+Discrete tokens cost their cross-entropy and actions their squared error (paper section 3.3, equation 2);
 continuous ones cost what diffusion costs (equation 3).
 """
 
@@ -103,7 +103,7 @@ def masked_loss(
 
 
 def frame_diffusion_loss(model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array) -> jax.Array:
-    """Per token [B, T, S]: squared error of the noise plus the bound's variance term (section 2.4)."""
+    """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4)."""
     config = model.config.diffusion
     process = make_process(config.steps)
 
@@ -135,7 +135,7 @@ def action_loss_per_step(
     """[B, T]: error of predicted, normalised actions, averaged over each robot's own live values.
 
     DIFFERS: the release compares with raw actions and averages over everything times the mean
-    of the mask (reference section 9.1).
+    of the mask (reference section 1.8).
     """
     target = model.table.normalise(actions_BTU, embodiment_B)
     alive_BTU = jnp.broadcast_to(jnp.asarray(model.table.alive())[embodiment_B][:, None], target.shape)

@@ -1,7 +1,7 @@
 """What is hidden from the model in training: one mechanism for both variants and every setting.
 
 Random numbers (`draw`) are kept apart from what is done with them, so that masking can be
-checked against recorded numbers. The settings of the paper's section 3.1 differ only in which
+checked against recorded numbers. The settings of paper section 3.1 differ only in which
 frames' tokens are masked and which actions are hidden:
 
     setting   tokens          actions hidden            predicted
@@ -92,7 +92,7 @@ def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> Masking
 def corrupt(
     tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig
 ) -> jax.Array:
-    """Random-token corruption, and degradation of late frames in prompt mode (reference 1.9).
+    """Random-token corruption, and degradation of late frames in prompt mode (reference section 1.9).
 
     In prompt mode (first_masked > 1) frames from there on are degraded, later ones more.
     """
@@ -111,7 +111,7 @@ def mask_tokens(
 ) -> jax.Array:
     """bool like `u_mask` [T, ...]: a frame's rate is cos(pi/2 u), its mean 2 / pi for u over [0, 1).
 
-    Frames before `first_masked`, at least frame 0, are never masked (reference 1.9 and 2.3).
+    Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3).
     """
     angle = masking.mask_angle_min + (1 - masking.mask_angle_min) * u_rate_T
     late_T = jnp.arange(len(u_rate_T)) >= first_masked

@@ -2,7 +2,7 @@
 
 Channels come last: images [B, H, W, C], clips [B, T, H, W, C]. Everything is computed in the type of
 its input, normalisation and softmax in float32. Attributes are named as in the files the
-weights come from, so that names on both sides differ by a rule (`convert.pretrained_names`).
+weights come from, so that names on both sides differ by a rule (`convert.pretrained`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The networks of the 1X / Open-MAGVIT2 tokenizer: images to latents whose signs are the bits, and back.
 
-Reference, appendix A. NHWC throughout.
+Reference appendix A. NHWC throughout.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Multipliers, decay mask, embodiment axes and uses are read off the parameter declarations. A
 robot without an example in the global batch keeps its slices, moments and bias-correction
 count as they were, and so does a head without a target; a dense AdamW would go on decaying
-them (reference, appendix B.1).
+them (reference appendix B.1).
 """
 
 from __future__ import annotations

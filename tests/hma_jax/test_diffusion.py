@@ -57,7 +57,7 @@ def drawn(sampler: SamplerConfig, rows: int = 20_000, seed: int = 0) -> np.ndarr
 
 
 def test_numbers_of_the_reference():
-    """Section 11."""
+    """Reference section 11."""
     np.testing.assert_allclose(FULL.betas[[0, 500, 999]], [4.12842e-5, 3.15569e-3, 0.999], rtol=2e-6)
     want = [0.9999587, 0.845888, 0.492285, 0.143179, 2.42877e-9]
     np.testing.assert_allclose(FULL.alphas_cumprod[[0, 250, 500, 750, 999]], want, rtol=3e-6)
