@@ -23,12 +23,11 @@ class Provenance:
 
 
 @cache
-def source_hash(packages: tuple[str, ...] = ("hma_jax", "data_pipelines")) -> str:
-    """Hash of the sources that a trial runs: `packages` and `trial`.
+def source_hash(paths: tuple[str, ...] = ("hma_jax", "data_pipelines", "experiments/trial.py")) -> str:
+    """Hash of the sources under `paths`, folders or files; by default those that a trial runs.
 
-    Plots, reports and the command line are left out: changing them re-runs nothing.
+    Plots, reports and the command line are left out of these: changing them re-runs nothing.
     """
     root = Path(__file__).resolve().parent.parent
-    files = [p for package in packages for p in sorted((root / package).rglob("*.py"))]
-    files.append(root / "experiments" / "trial.py")
+    files = [p for path in paths for p in (sorted((root / path).rglob("*.py")) or [root / path])]
     return stable_hash([[p.relative_to(root).as_posix(), p.read_text()] for p in files])

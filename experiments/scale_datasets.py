@@ -16,11 +16,17 @@ from dataclasses import replace
 from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweep import Sweep, make_sweep
+from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
     """Points are nested: each takes the first x datasets. All are judged on the smallest set."""
     names = study.dataset_names()
+    require(
+        study.dataset_counts[-1] == len(names),
+        f"the last of dataset_counts {study.dataset_counts} must be the number of datasets, "
+        f"{len(names)}; add --set dataset_counts=...,{len(names)}",
+    )
     judged = names[: study.dataset_counts[0]]
     return make_sweep(
         study,

@@ -19,13 +19,16 @@ from experiments.sweep import Sweep, make_sweep
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories at every point, judged on all datasets."""
+    """All datasets and trajectories at every point, judged on all datasets.
+
+    The reference trial's own width is a point, whether or not `widths` names it: other axes run it anyway.
+    """
     return make_sweep(
         study,
         name="width",
         axis="model width",
         scope=study.dataset_names(),
-        values=study.widths,
+        values=sorted({*study.widths, study.model.width}),
         change=lambda trial, x: replace(trial, model=replace(trial.model, width=x)),
         reference_x=study.model.width,
     )

@@ -89,7 +89,7 @@ class Study:
     eval: EvalConfig
     dataset_counts: tuple[int, ...]
     trajectory_counts: tuple[int, ...]  # per dataset
-    widths: tuple[int, ...]
+    widths: tuple[int, ...]  # of the width axis, which has the reference trial's as well
     tokenizer: AnyTokenizerConfig = field(default_factory=TokenizerConfig)
     tokenizer_train: TokenizerTrainConfig = field(default_factory=TokenizerTrainConfig)
     suite: SuiteConfig = field(default_factory=SuiteConfig)
@@ -107,21 +107,11 @@ class Study:
             points = getattr(self, axis)
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
             require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
-        require(
-            self.model.width in self.widths,
-            f"widths {self.widths} must contain model.width {self.model.width}, the width of the "
-            "reference trial",
-        )
         self._check_tokens()
         require(
             self.eval.prompt_frames < self.model.frames,
             f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of "
             f"model.frames {self.model.frames}",
-        )
-        require(
-            not self.datasets or self.dataset_counts[-1] == len(self.datasets),
-            f"the last of dataset_counts {self.dataset_counts} must be the number of datasets, "
-            f"{len(self.datasets)}",
         )
         require(len(set(self.datasets)) == len(self.datasets), f"datasets repeat: {self.datasets}")
 
@@ -218,14 +208,52 @@ def _assign(values: dict[str, Any], path: str, text: str) -> None:
     """Puts the parsed `text` at `path`, in place."""
     known = _leaves(values)
     if path not in known:
-        close = difflib.get_close_matches(path, known, n=3)
-        hint = f"; did you mean {' or '.join(close)}?" if close else f"; known: {', '.join(known)}"
-        raise ConfigError(f"--set {path}: no such setting{hint}")
+        raise ConfigError(f"--set {path}: {_instead(values, path, known)}")
     node = values
     *parents, last = path.split(".")
     for parent in parents:
         node = node[parent]
     node[last] = _parse(path, text, node[last])
+
+
+def _instead(values: dict[str, Any], path: str, known: Sequence[str]) -> str:
+    """What there is in place of a setting that there is not: a name that was meant, or the names around it."""
+    node, at, rest = values, [], path.split(".")
+    while rest and isinstance(node, dict) and rest[0] in node:
+        node = node[rest[0]]
+        at.append(rest.pop(0))
+    group = ".".join(at)
+    if not isinstance(node, dict):  # the path goes on where a value is
+        if node is None and group == "model.diffusion":
+            return f"{group} is null in this study, which takes ids; start from a preset that ends in -continuous"
+        return f"no such setting; {group} is a value, {json.dumps(node)}"
+    names = [f"{name}.*" if isinstance(value, dict) else name for name, value in node.items()]
+    inside = f"{group or 'a study'} has {', '.join(names)}"
+    if not rest:
+        return f"that is a group of settings, set one of them; {inside}"
+    meant = _meant(node, group, rest, known)
+    return f"no such setting; did you mean {' or '.join(meant[:4])}?" if meant else f"no such setting; {inside}"
+
+
+def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequence[str]) -> list[str]:
+    """Settings that may be meant by what is left of a path below `group`, the first reason that finds some."""
+    last, leaves = rest[-1], {k.split(".")[-1] for k in known}
+
+    def beside(cutoff: float) -> list[str]:
+        near = difflib.get_close_matches(last, node, n=3, cutoff=cutoff) if len(rest) == 1 else []
+        return [k for k in (f"{group}.{n}" if group else n for n in near) if k in known]
+
+    def named(leaf: str) -> list[str]:
+        found = [k for k in known if k.split(".")[-1] == leaf]
+        return [k for k in found if group and k.startswith(f"{group}.")] or found
+
+    return (
+        [k for k in known if k.endswith("." + ".".join(rest)) and len(rest) > 1]  # the end of a path
+        or list(dict.fromkeys(beside(0.85) + named(last)))  # a typing error, or the right name in the wrong place
+        or (beside(0.6) if group else [])
+        or difflib.get_close_matches(".".join([group, *rest]).strip("."), known, n=3, cutoff=0.8)
+        or [k for leaf in difflib.get_close_matches(last, leaves, n=1, cutoff=0.8) for k in named(leaf)]
+    )
 
 
 def _parse(path: str, text: str, old: Any) -> Any:

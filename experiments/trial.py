@@ -25,12 +25,13 @@ from hma_jax.config.json import stable_hash, to_dict
 
 if TYPE_CHECKING:
     from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.loading.loader import LoaderConfig
     from data_pipelines.tokens.store import TokenStore
     from hma_jax.evaluation.protocol import Evaluation
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
     from hma_jax.tokenizers.base import Tokenizer
-    from hma_jax.training.loop import FitResult
+    from hma_jax.training.loop import FitResult, LoopOptions
 
 CHECKPOINTS = 5
 """Saved per training run, evenly spread: what an interrupted trial resumes from."""
@@ -91,6 +92,21 @@ def open_materials(workspace: Workspace) -> Materials:
     )
 
 
+def loader_of(trial: Trial) -> LoaderConfig:
+    """Which windows a trial draws, and in what order."""
+    from data_pipelines.loading.loader import LoaderConfig
+
+    return LoaderConfig(
+        frames=trial.model.frames,
+        batch=trial.train.batch,
+        tau=trial.tau,
+        seed=trial.train.seed,
+        max_trajectories=trial.max_trajectories,
+        datasets=trial.datasets,
+        shuffle_actions=trial.shuffle_actions,
+    )
+
+
 def train_trial(
     trial: Trial,
     materials: Materials,
@@ -101,29 +117,23 @@ def train_trial(
     table: EmbodimentTable | None = None,
     initial: Params | None = None,
     origin: dict[str, Any] | None = None,
+    options: LoopOptions | None = None,
 ) -> FitResult:
     """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
+
+    `options` say how often it is saved; CHECKPOINTS times unless given.
 
     A model that is not new has a `table` of its own (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.
     """
     import jax
 
-    from data_pipelines.loading.loader import LoaderConfig, make_loader
+    from data_pipelines.loading.loader import make_loader
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
 
-    store = materials.store
+    store, loader = materials.store, loader_of(trial)
     table = table or store.embodiment_table(trial.datasets)
-    loader = LoaderConfig(
-        frames=trial.model.frames,
-        batch=trial.train.batch,
-        tau=trial.tau,
-        seed=trial.train.seed,
-        max_trajectories=trial.max_trajectories,
-        datasets=trial.datasets,
-        shuffle_actions=trial.shuffle_actions,
-    )
     return train_model(
         trial.model,
         table,
@@ -141,7 +151,7 @@ def train_trial(
             **({"origin": origin} if origin else {}),
         },
         initial=initial,
-        options=LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
+        options=options or LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
         progress=lambda step, steps, _: progress("training", step, steps),
     )
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import fcntl
 import json
-from collections.abc import Iterator, Sequence
+import shlex
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.atomic import write_atomically
+from experiments.program import PROGRAM
 from experiments.provenance import Provenance
 from experiments.study import Study
 from hma_jax.config import ConfigError
@@ -75,6 +77,11 @@ class Workspace:
     def report(self) -> Path:
         return self.root / "report.html"
 
+    @property
+    def record(self) -> Path:
+        """Which study lives here."""
+        return self.root / "study.json"
+
     @contextmanager
     def claimed(self) -> Iterator[None]:
         """Makes the directory and holds the right to write in it; a lock that dies with its process.
@@ -85,8 +92,11 @@ class Workspace:
             self.root.mkdir(parents=True, exist_ok=True)
             lock = open(self.root / ".lock", "a+")
         except OSError as error:
+            there = next(p for p in (self.root, *self.root.parents) if p.exists())
+            what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
             raise ConfigError(
-                f"cannot write to {self.root}: {error.strerror}; choose another --out or fix its permissions"
+                f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, or make {there} a "
+                "directory where you may write"
             ) from error
         with lock:
             try:
@@ -110,27 +120,28 @@ class Record:
 
 
 def save_record(workspace: Workspace, record: Record) -> None:
-    write_atomically(workspace.root / "study.json", json.dumps(to_dict(record), indent=1))
+    write_atomically(workspace.record, json.dumps(to_dict(record), indent=1))
+
+
+def find_record(workspace: Workspace) -> Record | None:
+    """The study that lives there; None without any. Raises ConfigError if its file cannot be read."""
+    path = workspace.record
+    try:
+        return from_dict(Record, json.loads(path.read_text()))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise ConfigError(
+            f"{path} is damaged or of another version ({error}); delete it and run the study's command again"
+        ) from error
 
 
 def load_record(workspace: Workspace) -> Record:
     """Raises ConfigError if no study lives there."""
-    path = workspace.root / "study.json"
-    try:
-        return from_dict(Record, json.loads(path.read_text()))
-    except FileNotFoundError:
+    record = find_record(workspace)
+    if record is None:
         raise ConfigError(
-            f"no study in {workspace.root} (it has no study.json); start one with "
-            f"`hma study --out {workspace.root}`"
-        ) from None
-    except ValueError as error:
-        raise ConfigError(f"{path} is damaged ({error}); delete it and run the study's command again") from error
-
-
-def merge_axes(workspace: Workspace, study: Study, axes: Sequence[str]) -> tuple[str, ...]:
-    """`axes` and those that the same study has run before in this workspace."""
-    try:
-        earlier = load_record(workspace)
-    except ConfigError:
-        return tuple(axes)
-    return tuple(dict.fromkeys([*(earlier.axes if earlier.study == study else ()), *axes]))
+            f"no study in {workspace.root} (it has no {workspace.record.name}); start one with "
+            f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
+        )
+    return record

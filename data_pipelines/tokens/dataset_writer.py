@@ -90,6 +90,15 @@ def write_dataset(
         ) from error
 
 
+def differences(store_root: str | Path, plan: Manifest) -> list[str]:
+    """How the dataset of this name that is in the store was made otherwise than planned, one line per field.
+
+    Empty if it is as planned, or not there. Raises DataError if it cannot be read, as one of an older format.
+    """
+    final = Path(store_root) / plan.spec.name
+    return _changes(load_manifest(final / FILE), plan) if final.exists() else []
+
+
 def missing_parts(store_root: str | Path, plan: Manifest, parts: Sequence[Part]) -> int:
     """How many parts of a dataset that is not published are still to be made."""
     work = _work_directory(Path(store_root), plan, parts)

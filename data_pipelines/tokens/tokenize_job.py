@@ -72,24 +72,11 @@ def tokenize_dataset(
     dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
     (see `RldsDataset`).
     """
-    frame_step = spec.stride if frame_step is None else frame_step
-    require(
-        frame_step >= 1 and spec.stride % frame_step == 0,
-        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {spec.stride}",
-    )
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-    plan = Manifest(
-        spec=spec.facts(),
-        tokenizer=tokenizer_facts(tokenizer),
-        settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
-        source=source.fingerprint(),
-        source_version=source.version,
-        action_mean=(),
-        action_std=(),
-        train=SplitFacts(),
-        val=SplitFacts(),
+    plan = plan_dataset(
+        spec, source, tokenizer, val_fraction, min_val, max_val, keep_frames=keep_frames, frame_step=frame_step
     )
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
@@ -106,6 +93,36 @@ def tokenize_dataset(
         max_lost=max_skipped if corrupt == "skip" else 0,
         overwrite=overwrite,
         progress=progress,
+    )
+
+
+def plan_dataset(
+    spec: DatasetSpec,
+    source: RldsDataset,
+    tokenizer: Tokenizer,
+    val_fraction: float,
+    min_val: int,
+    max_val: int,
+    *,
+    keep_frames: Literal["none", "val", "all"] = "val",
+    frame_step: int | None = None,
+) -> Manifest:
+    """The manifest of a dataset before it is made. Raises ConfigError for settings that cannot work."""
+    frame_step = spec.stride if frame_step is None else frame_step
+    require(
+        frame_step >= 1 and spec.stride % frame_step == 0,
+        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {spec.stride}",
+    )
+    return Manifest(
+        spec=spec.facts(),
+        tokenizer=tokenizer_facts(tokenizer),
+        settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
+        source=source.fingerprint(),
+        source_version=source.version,
+        action_mean=(),
+        action_std=(),
+        train=SplitFacts(),
+        val=SplitFacts(),
     )
 
 

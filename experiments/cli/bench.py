@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 from tyro.extras import SubcommandApp
 
-from experiments.cli.where import Where
 from experiments.commands import bench as commands
+from experiments.setting import Where, make_setting
 from hma_jax.config.execution import Dtype, Remat
 
 bench_app = SubcommandApp()
@@ -131,7 +131,7 @@ def quality(
         windows: Held-out windows per dataset.
         repeats: Timed rollouts of every decoding.
     """
-    commands.quality(where.setting(), run, frames, windows, repeats)
+    commands.quality(make_setting(where), run, frames, windows, repeats)
 
 
 @bench_app.command(name="tokenize")

@@ -16,11 +16,12 @@ from data_pipelines.convert.settings import (
     LeRobotSettings,
     RobomimicSettings,
 )
+from experiments.cli.how import Remake
 from experiments.cli.sim import data_sim, data_sim_table
-from experiments.cli.where import Where
 from experiments.commands import data as commands
 from experiments.commands import registry as registry_commands
 from experiments.commands import study as study_commands
+from experiments.setting import Where, make_setting
 
 data_app = SubcommandApp()
 convert_app = SubcommandApp()
@@ -81,9 +82,9 @@ def data_inspect(
 
 
 @data_app.command(name="suite")
-def data_suite(where: OmitArgPrefixes[Where]) -> None:
+def data_suite(where: OmitArgPrefixes[Where], remake: OmitArgPrefixes[Remake]) -> None:
     """Write the study's simulated datasets as RLDS directories."""
-    study_commands.write_suite(where.setting())
+    study_commands.write_suite(make_setting(where), remake.replace)
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,20 @@
 """The program `hma`: its commands, and what an error becomes.
 
 Exit codes: 0 done; 1 the work failed (data, a trial, a full disk); 2 wrong arguments or
-configuration; 130 interrupted. `--debug` or HMA_DEBUG=1 shows the traceback of an error.
+configuration; 130 interrupted; 143 asked to stop by SIGTERM. `--debug` or HMA_DEBUG=1 shows the traceback of an
+error.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from tyro.extras import SubcommandApp
 
@@ -50,21 +54,44 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own_process and not debug:
         _silence_background()
     try:
-        app.cli(
-            prog=PROGRAM,
-            description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
-            args=arguments or ["--help"],
-        )
+        with _terminated_like_interrupted():
+            app.cli(
+                prog=PROGRAM,
+                description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
+                args=arguments or ["--help"],
+            )
         return 0
-    except KeyboardInterrupt:
-        _say("interrupted; the same command goes on from here")
-        return 130
+    except KeyboardInterrupt as request:
+        stopped = isinstance(request, Terminated)
+        _say(f"{'stopped by SIGTERM' if stopped else 'interrupted'}; the same command goes on from here")
+        return 143 if stopped else 130
     except Exception as error:  # the boundary of the program
         code = _exit_code(error)
         if debug or code is None:
             raise
         _say(f"error: {_words(error)}")
         return code
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as schedulers and `kill` send it: the program ends as it does on Ctrl-C."""
+
+
+@contextmanager
+def _terminated_like_interrupted() -> Iterator[None]:
+    """Trials save their state, and the last line says how to go on; by default the process would just be gone."""
+
+    def stop(number: int, frame: object) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may install handlers
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _silence_background() -> None:
@@ -101,7 +128,8 @@ def _words(error: Exception) -> str:
         return f"{error} (Here: --set store.corrupt=skip.)"
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
-        return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
+        what = "cannot be read or written" if place else "a file cannot be read or written"
+        return f"{place}{what} ({error.strerror}); check the path, its permissions and the space on its disk"
     return str(error)
 
 

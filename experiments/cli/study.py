@@ -3,54 +3,74 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
-from experiments.cli.where import How, Where
+from experiments.cli.how import How, OneModel, Remake
 from experiments.commands import model as model_commands
 from experiments.commands import study as commands
 from experiments.commands import tokenize as tokenize_commands
+from experiments.setting import UNSET, Where, make_setting
 from hma_jax.config import ConfigError
 
 Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]
 
 
-def study(where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
+def study(where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How], remake: OmitArgPrefixes[Remake]) -> None:
     """Run a whole scaling study: data, tokenizer, the three sweeps, CSV, figures and a report page.
 
     Run the same command again after an interruption: only what is missing is done.
     """
-    _run(where, how, commands.SCALING)
+    _run("study", where, how, remake, commands.SCALING)
 
 
-def sweep(axis: Positional[Axis], where: OmitArgPrefixes[Where], how: OmitArgPrefixes[How]) -> None:
+def sweep(
+    axis: Positional[Axis],
+    where: OmitArgPrefixes[Where],
+    how: OmitArgPrefixes[How],
+    remake: OmitArgPrefixes[Remake],
+) -> None:
     """Run one axis: datasets, trajectories, width; settings, conditioning; or lr.
 
     The first three are those of `hma study`, the next two its ablations; lr is the transfer of
     learning rates between widths. Shares data and trials with other axes of the same --out.
+
+    Args:
+        axis: What varies.
+        where: Which study, on which data, in which directory, on which devices.
+        how: How trials are run; none of it changes a result.
+        remake: What was made with other settings or data is never replaced without being asked for.
     """
-    _run(where, how, (axis,))
+    _run(f"sweep {axis}", where, how, remake, (axis,))
 
 
-def _run(where: Where, how: How, axes: tuple[str, ...]) -> None:
-    setting = where.setting()
+def _run(command: str, where: Where, how: How, remake: Remake, axes: tuple[str, ...]) -> None:
+    setting = make_setting(where)
     if how.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {how.workers}")
     if how.dry_run:
         commands.dry_run(setting.study, axes)
         return
     commands.run_study(
-        commands.on_mesh(setting, how.mesh), axes, workers=how.workers, retry_failed=how.retry_failed
+        setting,
+        axes,
+        again=setting.command(command, "--workers", str(how.workers), "--retry-failed"),
+        workers=how.workers,
+        retry_failed=how.retry_failed,
+        replace=remake.replace,
     )
 
 
 def tokenize(
     where: OmitArgPrefixes[Where],
-    process: int | None = None,
-    processes: int | None = None,
-    batch: int | None = None,
-    threads: int | None = None,
+    remake: OmitArgPrefixes[Remake],
+    process: Annotated[int | None, arg(metavar="I"), UNSET] = None,
+    processes: Annotated[int | None, arg(metavar="N"), UNSET] = None,
+    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
+    threads: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")
+    ] = None,
 ) -> None:
     """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
 
@@ -59,37 +79,43 @@ def tokenize(
     understood by themselves. The tokenizer must be there then: --tokenizer, or `hma tokenizer train` before.
 
     Args:
-        where: Study, data, output directory and settings. The output must be shared by all processes.
+        where: Study, data, output directory and settings. Several processes must share the directory.
+        remake: What was made with other settings or data is never replaced without being asked for.
         process: Number of this process, from 0 on.
         processes: How many processes share the work; 1 for all of it, whatever SLURM says.
-        batch: Frames encoded at a time; 256 if not given. Changes no token.
-        threads: Threads that decode frames; one per core up to 8 if not given.
+        batch: Frames encoded at a time. Changes no token.
+        threads: Threads that decode frames.
     """
-    tokenize_commands.tokenize(where.setting(), process, processes, batch, threads)
+    tokenize_commands.tokenize(make_setting(where), process, processes, batch, threads, remake.replace)
 
 
 def train(
-    where: OmitArgPrefixes[Where],
-    run: Path | None = None,
-    mesh: tuple[int, int, int] | None = None,
+    where: OmitArgPrefixes[Where], one: OmitArgPrefixes[OneModel], remake: OmitArgPrefixes[Remake]
 ) -> None:
-    """Train one model, the study's reference trial; change it with --set.
+    """Train one model: the study's reference trial, on all trajectories unless told otherwise.
+
+    Change it with --set. Says what it trains on, and resumes a run that was interrupted.
 
     Args:
         where: Study, data, output directory and settings.
-        run: Directory of the training run; OUT/model if not given. Resumed if it exists.
-        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left. Short for --set
-            execution.mesh.data=... and so on.
+        one: How this model is trained; no sweep reads it.
+        remake: What was made with other settings or data is never replaced without being asked for.
     """
-    model_commands.train(commands.on_mesh(where.setting(), mesh), run)
+    model_commands.train(
+        make_setting(where),
+        one.run,
+        trajectories=one.trajectories,
+        checkpoint_every=one.checkpoint_every,
+        replace=remake.replace,
+    )
 
 
 def adapt(
-    source: Positional[Path],
+    source: Annotated[Positional[Path], arg(metavar="RUN")],
     where: OmitArgPrefixes[Where],
-    run: Path | None = None,
-    everything: bool = False,
-    mesh: tuple[int, int, int] | None = None,
+    one: OmitArgPrefixes[OneModel],
+    remake: OmitArgPrefixes[Remake],
+    everything: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
     """Add new robots to a trained model and train them on the study's datasets.
 
@@ -99,22 +125,29 @@ def adapt(
     Args:
         source: Directory of the training run that knows the other robots.
         where: The study with the new datasets. Give --tokenizer: the one of the trained model.
-        run: Directory of the new training run; OUT/model if not given. Resumed if it exists.
+        one: How the new robots are trained.
+        remake: What was made with other settings or data is never replaced without being asked for.
         everything: Train the whole model, not the new robots' own parameters alone.
-        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left. Short for --set
-            execution.mesh.data=... and so on.
     """
-    model_commands.adapt(commands.on_mesh(where.setting(), mesh), source, run, everything)
+    model_commands.adapt(
+        make_setting(where),
+        source,
+        one.run,
+        everything,
+        trajectories=one.trajectories,
+        checkpoint_every=one.checkpoint_every,
+        replace=remake.replace,
+    )
 
 
-def evaluate(run: Positional[Path], where: OmitArgPrefixes[Where]) -> None:
+def evaluate(run: Annotated[Positional[Path], arg(metavar="RUN")], where: OmitArgPrefixes[Where]) -> None:
     """Evaluate a trained model on the frozen windows of a study.
 
     Args:
         run: Directory of the training run.
         where: The study whose windows, tokenizer and protocol are used.
     """
-    model_commands.evaluate(where.setting(), run)
+    model_commands.evaluate(make_setting(where), run)
 
 
 def report(out: Path) -> None:

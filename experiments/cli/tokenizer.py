@@ -8,9 +8,10 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 from tyro.extras import SubcommandApp
 
-from experiments.cli.where import Where
+from experiments.cli.how import Remake
 from experiments.commands import study as study_commands
 from experiments.commands import tokenizer as commands
+from experiments.setting import Where, make_setting
 
 tokenizer_app = SubcommandApp()
 
@@ -18,9 +19,9 @@ HELP = "The image tokenizer: trained here, made of published weights, or none."
 
 
 @tokenizer_app.command(name="train")
-def tokenizer_train(where: OmitArgPrefixes[Where]) -> None:
+def tokenizer_train(where: OmitArgPrefixes[Where], remake: OmitArgPrefixes[Remake]) -> None:
     """Train the study's image tokenizer on its datasets."""
-    study_commands.train_tokenizer(where.setting())
+    study_commands.train_tokenizer(make_setting(where), remake.replace)
 
 
 @tokenizer_app.command(name="import")

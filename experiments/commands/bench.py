@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from experiments.program import command_line
+from rich.text import Text
+
+from experiments.program import PROGRAM, command_line
 from experiments.progress import console, step, tidy_table
 from hma_jax.config import ConfigError, require
 
@@ -14,7 +17,7 @@ if TYPE_CHECKING:
     from experiments.bench.models import Subject
     from experiments.bench.record import BenchRecord, Stage
     from experiments.cli.bench import Bench, Decode
-    from experiments.commands.study import Setting
+    from experiments.setting import Setting
     from hma_jax.config import DecodeConfig
     from hma_jax.config.execution import Remat
 
@@ -78,12 +81,14 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
 
     from data_pipelines.loading.evalset import eval_batches, freeze_manifest
     from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
-    from experiments.commands.model import check_fits
+    from experiments.commands.model import check_fits, require_prepared
     from experiments.rows import write_csv
     from experiments.trial import open_materials
     from hma_jax.training.train import load_run
 
-    trained, materials = load_run(run), open_materials(setting.workspace)
+    trained = load_run(run)
+    require_prepared(setting)
+    materials = open_materials(setting.workspace)
     check_fits(trained, materials)
     subject, config = subject_of(trained), setting.study.eval
     config = replace(config, batch=min(config.batch, windows))  # no rows of padding
@@ -155,7 +160,7 @@ def load(
             drained = [time_windows(opened, windows, batch, frames, n) for n in threads]
     if data:
         from data_pipelines.registry import get_spec
-        from experiments.pipeline import name_datasets
+        from experiments.preparing.sources import name_datasets
 
         sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
         with step(f"draw frames of {len(sources)} RLDS directories"):
@@ -260,7 +265,7 @@ def _write(
     )
     show(record)
     path = write_record(record, out)
-    console.print(f"wrote {path}; tables: hma bench report {out}", soft_wrap=True)
+    console.print(Text(f"wrote {path}; tables: {shlex.join([PROGRAM, 'bench', 'report', str(out)])}"), soft_wrap=True)
 
 
 def show(record: BenchRecord) -> None:

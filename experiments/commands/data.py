@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from experiments.commands.study import wrote
 from experiments.progress import console, step
+from experiments.setting import command
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def _convert(source: Source, to: To, default_name: str) -> None:
         _say(f"left out {count:,} x: {reason}")
     _say("to read it, add this entry to data_pipelines/registry/own.py, unless one of this name is known:")
     _say(f"    {entry(done.spec)}")
-    wrote(done.directory, then=f"hma data inspect {shlex.quote(str(done.directory))} --hz {done.spec.hz:g}")
+    wrote(done.directory, then=command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}"))
 
 
 def entry(spec: DatasetSpec) -> str:

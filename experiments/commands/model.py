@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from experiments.atomic import write_atomically
-from experiments.commands.study import Setting, next_command, short, wrote
+from experiments.commands.study import wrote
+from experiments.preparing.made_from import Step
 from experiments.progress import console, step, tidy_table
+from experiments.setting import Setting, short
 from experiments.sweep import reference_trial
 from hma_jax.config import ConfigError, require
 
@@ -26,20 +27,38 @@ SHOWN = (
 """Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all."""
 
 
-def train(setting: Setting, run: Path | None) -> None:
-    """Trains the study's reference trial by itself."""
-    _prepare(setting)
-    trial = reference_trial(setting.study, setting.study.seeds[0])
-    _train(setting, trial, run or setting.workspace.root / "model")
+def train(
+    setting: Setting,
+    run: Path | None,
+    *,
+    trajectories: int | None = None,
+    checkpoint_every: int | None = None,
+    replace: Step | None = None,
+) -> None:
+    """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot."""
+    _check(trajectories, checkpoint_every)
+    _prepare(setting, replace)
+    trial = _single_trial(setting, trajectories)
+    _train(setting, trial, run or setting.workspace.root / "model", checkpoint_every)
 
 
-def adapt(setting: Setting, source: Path, run: Path | None, everything: bool) -> None:
+def adapt(
+    setting: Setting,
+    source: Path,
+    run: Path | None,
+    everything: bool,
+    *,
+    trajectories: int | None = None,
+    checkpoint_every: int | None = None,
+    replace: Step | None = None,
+) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.trial import open_materials
     from hma_jax.training.adapt import add_embodiments
     from hma_jax.training.train import load_run
 
-    _prepare(setting)
+    _check(trajectories, checkpoint_every)
+    _prepare(setting, replace)
     study, materials = setting.study, open_materials(setting.workspace)
     trained = load_run(source)
     _check_tokenizer(trained, materials, f"; add --tokenizer with the one that {short(source)} was trained with")
@@ -49,37 +68,75 @@ def adapt(setting: Setting, source: Path, run: Path | None, everything: bool) ->
     robots = [materials.store.manifest(name).embodiment() for name in new]
     params, table = add_embodiments(trained.params, trained.model, trained.table, robots, seed)
     only = () if everything else tuple(new)
-    trial = replace(
-        reference_trial(study, seed),
+    trial = dataclasses.replace(
+        _single_trial(setting, trajectories),
         model=trained.model,
-        train=replace(study.train, seed=seed, only=only),
+        train=dataclasses.replace(study.train, seed=seed, only=only),
     )
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
-    origin = {"step": trained.step, "provenance": trained.provenance}
-    _train(setting, trial, run or setting.workspace.root / "model", table=table, initial=params, origin=origin)
+    start = {"table": table, "initial": params, "origin": {"step": trained.step, "provenance": trained.provenance}}
+    _train(setting, trial, run or setting.workspace.root / "model", checkpoint_every, **start)
 
 
-def _prepare(setting: Setting) -> None:
+def _check(trajectories: int | None, checkpoint_every: int | None) -> None:
+    require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
+    require(
+        checkpoint_every is None or checkpoint_every >= 0,
+        f"--checkpoint-every must not be negative, got {checkpoint_every}; 0 saves at the end and when interrupted",
+    )
+
+
+def _prepare(setting: Setting, replace: Step | None) -> None:
     from experiments.pipeline import prepare
 
     with setting.workspace.claimed():
-        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer)
+        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
 
 
-def _train(setting: Setting, trial: Trial, run: Path, **start: Any) -> None:
-    from experiments.trial import open_materials, train_trial
+def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
+    """The reference trial, but that the largest number of trajectories in a sweep does not bound it."""
+    study = setting.study
+    return dataclasses.replace(reference_trial(study, study.seeds[0]), max_trajectories=trajectories)
 
-    with step(f"train: {trial.title}") as update:
+
+def _train(setting: Setting, trial: Trial, run: Path, checkpoint_every: int | None, **start: Any) -> None:
+    from experiments.trial import CHECKPOINTS, open_materials, train_trial
+    from hma_jax.training.loop import LoopOptions
+
+    materials, steps = open_materials(setting.workspace), trial.train.steps
+    say_data(trial, materials)
+    if checkpoint_every is None:
+        checkpoint_every = max(steps // CHECKPOINTS, 1)
+    with step(f"train width {trial.model.width} for {steps:,} steps of {trial.train.batch} windows") as update:
         result = train_trial(
             trial,
-            open_materials(setting.workspace),
+            materials,
             run,
             execution=setting.study.execution,
+            options=LoopOptions(checkpoint_every=checkpoint_every),
             progress=lambda phase, done, total: update(done, total, phase),
             **start,
         )
     console.print(f"loss {result.losses[-1]:.4f} after {len(result.losses):,} steps")
-    wrote(run, then=next_command(f"evaluate {shlex.quote(short(run))}", setting))
+    wrote(run, then=setting.command("evaluate", run.absolute()))
+
+
+def say_data(trial: Trial, materials: Materials) -> None:
+    """What a model is trained on. Raises DataError if it is nothing."""
+    from data_pipelines.loading.loader import select_windows
+    from experiments.trial import loader_of
+
+    chosen = select_windows(materials.store, loader_of(trial))
+    used = [chosen.sets[name] for name in chosen.mixture.names]
+    there = sum(len(materials.store.manifest(name).train.episodes) for name in trial.datasets)
+    limit = "" if trial.max_trajectories is None else f" (at most {trial.max_trajectories:,} of each robot)"
+    console.print(
+        f"training on {len(used)} of {len(trial.datasets)} robots: {sum(len(s.episodes) for s in used):,} of {there:,} "
+        f"trajectories{limit}, {sum(map(len, used)):,} windows of {trial.model.frames} frames",
+        soft_wrap=True,
+    )
+    for name, reason in chosen.mixture.dropped.items():
+        console.print(f"note: not trained on {name}: {reason}", markup=False, soft_wrap=True)
 
 
 def evaluate(setting: Setting, run: Path) -> None:
@@ -87,6 +144,7 @@ def evaluate(setting: Setting, run: Path) -> None:
     from hma_jax.training.train import load_run
 
     trained = load_run(run)
+    require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)
     frozen = {d.dataset for d in materials.manifest.datasets}
@@ -113,6 +171,13 @@ def evaluate(setting: Setting, run: Path) -> None:
     write_atomically(run / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1))
     write_samples(run / "samples.npz", evaluation.samples)
     wrote(run / "evaluation.json", run / "samples.npz")
+
+
+def require_prepared(setting: Setting) -> None:
+    """Raises ConfigError, with the command that makes it, unless everything is there that evaluation reads."""
+    there = setting.workspace
+    missing = [str(p) for p in (there.store, there.tokenizer, there.manifest) if not p.exists()]
+    require(not missing, f"{', '.join(missing)}: not made yet; run `{setting.command('tokenize')}`")
 
 
 def check_fits(trained: Run, materials: Materials) -> None:

@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.markup import escape
+from rich.text import Text
 
 from experiments.atomic import write_atomically
-from experiments.commands.study import use_entries, wrote
+from experiments.commands.study import wrote
+from experiments.presets import get_preset
 from experiments.progress import console, step, tidy_table
+from experiments.setting import Where, command, use_entries
 from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts
-    from data_pipelines.inspection.suggest import Suggestion
+    from data_pipelines.inspection.suggest import Suggestion, WindowFacts
     from data_pipelines.registry import DatasetSpec
 
 SHEET = "contact_sheet.png"
@@ -96,7 +99,7 @@ def inspect(
     if entry is not None and (suggestion is None or not suggestion.hz):
         raise ConfigError("--entry needs the native rate, which is not in the files: add --hz")
     print_facts(facts)
-    rate = hz or (known.hz if known else None)
+    rate, windows = hz or (known.hz if known else None), None
     if rate:
         stride = stride_of(rate)
         windows = window_facts(facts, stride, frames)
@@ -122,6 +125,8 @@ def inspect(
         wrote(as_json)
     if entry is not None:
         _write_entry(entry, suggestion)
+    if known is not None or entry is not None:
+        _say_next(facts, windows, entry or registry)
 
 
 def print_facts(facts: Facts) -> None:
@@ -200,4 +205,28 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
     others = [e for e in load_entries(path) if e.name != suggestion.name] if path.exists() else []
     write_atomically(path, "\n".join(to_toml(e) for e in (*others, suggestion.spec())))
-    wrote(path, then=f"hma tokenize --registry {path} --data ...")
+    wrote(path)
+
+
+def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -> None:
+    """The command that reads the dataset as it was counted here, or why there is none."""
+    if windows is None:
+        return
+    if not windows.total:
+        fits = facts.lengths.longest // windows.stride
+        advice = f"frames={fits} would fit" if fits > 1 else "they are too short for any window"
+        console.print(
+            f"next: nothing yet. No episode that was read is as long as a window of {windows.frames} frames; {advice}. "
+            "Is the rate another one (--hz)?",
+            soft_wrap=True,
+        )
+        return
+    preset = get_preset(Where.preset)
+    changes = {}
+    if windows.frames != preset.model.frames:
+        changes["model.frames"] = windows.frames
+    if windows.frames <= preset.eval.prompt_frames:
+        changes["eval.prompt_frames"] = max(windows.frames // 2, 1)
+    settings = tuple(f"{name}={value}" for name, value in changes.items())
+    asked = Where(data=(facts.directory,), registry=entries, set=settings).anywhere()
+    console.print(Text(f"next: {command('tokenize', *asked.words())}"), soft_wrap=True)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.commands.study import short, wrote
+from experiments.commands.study import wrote
 from experiments.progress import console, step
+from experiments.setting import command
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ def write_sim(
         for path in paths:
             draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
         draw_sheet(paths, out / SHEET)
-    where = shlex.quote(short(out))
-    wrote(*paths, out / SHEET, then=f"hma study --preset {chosen.study} --data {where}/*/1.0.0 --out runs/sim")
+    study = command("study", "--preset", chosen.study, "--out", "runs/sim", "--data", *paths)
+    wrote(*paths, out / SHEET, then=study)
 
 
 def print_table(directory: Path) -> None:

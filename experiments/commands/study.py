@@ -5,12 +5,10 @@ Every command ends by saying what it wrote and what to run next.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rich.markup import escape
+from rich.text import Text
 
 from experiments import (
     ablate_conditioning,
@@ -21,15 +19,16 @@ from experiments import (
     transfer_lr,
 )
 from experiments.ledger import FINISHED, Ledger
-from experiments.presets import get_preset
+from experiments.preparing.made_from import Step, require_same
 from experiments.program import command_line
 from experiments.progress import SweepMonitor, console
 from experiments.runner import Job, State, read_states, run_missing
-from experiments.study import Study, on_tokenizer, on_user_data, override
+from experiments.setting import Setting, short
+from experiments.study import Study
 from experiments.sweep import titles, unique_trials
-from experiments.workspace import Record, Workspace, load_record, merge_axes, save_record
+from experiments.workspace import Record, Workspace, find_record, load_record, save_record
 from hma_jax.config import ConfigError
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import diff, to_dict
 
 AXES = {
     "datasets": scale_datasets.plan,
@@ -47,103 +46,38 @@ class TrialsFailed(Exception):
     """The sweep went on to its end, but some trials have no result."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """A study, its data and where it lives: what every command works on."""
-
-    study: Study
-    data: tuple[str, ...]
-    workspace: Workspace
-    tokenizer: Path | None = None  # a trained one to use; None: train one on the data
-    registry: Path | None = None  # a file of entries besides those of the project
-
-
-def make_setting(
-    preset: str,
-    out: Path | None,
-    data: Sequence[str],
-    settings: Sequence[str],
-    tokenizer: Path | None = None,
-    registry: Path | None = None,
-    mixture: str | None = None,
-) -> Setting:
-    """The preset, on the user's data and tokenizer if given, with overrides. Touches no other file.
-
-    A `mixture` names the datasets, which are then looked for in the directories of `data`.
-    """
-    from data_pipelines.rlds.location import absolute
-
-    study = get_preset(preset)
-    use_entries(registry)
-    if mixture is not None:
-        from data_pipelines.registry.mixtures import get_mixture
-
-        names = get_mixture(mixture)
-        study = on_user_data(study, names)
-        data = find_directories(names, data) if data else ()
-    elif data:
-        from experiments.pipeline import name_datasets
-
-        study = on_user_data(study, name_datasets(data))
-    if tokenizer is not None:
-        from hma_jax.tokenizers.io import load_config
-
-        study = on_tokenizer(study, load_config(tokenizer))
-    study = override(study, settings)
-    directories = tuple(map(absolute, data))
-    workspace = Workspace((out or Path("runs") / study.name).absolute())
-    return Setting(study, directories, workspace, tokenizer and tokenizer.absolute(), registry and registry.absolute())
-
-
-def on_mesh(setting: Setting, mesh: tuple[int, int, int] | None) -> Setting:
-    """The same, its trials on devices for (data, fsdp, tensor) parallelism; None: as the study says."""
-    if mesh is None:
-        return setting
-    study = setting.study
-    sizes = replace(study.execution.mesh, data=mesh[0], fsdp=mesh[1], tensor=mesh[2])
-    return replace(setting, study=replace(study, execution=replace(study.execution, mesh=sizes)))
-
-
-def use_entries(registry: Path | None) -> None:
-    """Adds the entries of a TOML file to the registry, for the rest of this process."""
-    if registry is not None:
-        from data_pipelines.registry import register
-        from data_pipelines.registry.toml_file import load_entries
-
-        register(load_entries(registry))
-
-
-def find_directories(names: Sequence[str], roots: Sequence[str]) -> list[str]:
-    """`<root>/<name>` for every name, in the first root that has it. ConfigError for those missing."""
-    from data_pipelines.rlds.location import locate
-
-    found = {n: locate(r) / n for r in reversed(roots) for n in names if (locate(r) / n).is_dir()}
-    missing = [n for n in names if n not in found]
-    if missing:
-        raise ConfigError(
-            f"no directory for {', '.join(missing)} in {', '.join(roots)}; with a mixture, --data takes the "
-            "directories that hold <name>/<version>"
-        )
-    return [str(found[n]) for n in names]
-
-
 def dry_run(study: Study, axes: Sequence[str]) -> None:
     from experiments.cost import plan_table
 
     console.print(plan_table(study, [AXES[axis](study) for axis in axes]))
 
 
-def run_study(setting: Setting, axes: Sequence[str], *, workers: int, retry_failed: bool) -> None:
-    """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end."""
-    from experiments.pipeline import prepare, require_simulated
+def run_study(
+    setting: Setting, axes: Sequence[str], *, again: str, workers: int, retry_failed: bool, replace: Step | None
+) -> None:
+    """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end.
+
+    `again` is the command that tries failed trials once more. Raises ConfigError, before anything is done, if the
+    directory holds another study, unless `replace` allows it.
+    """
+    from experiments.pipeline import prepare
+    from experiments.preparing.suite import require_simulated
+    from experiments.preparing.windows import require_judged, require_same_windows
 
     study, workspace = setting.study, setting.workspace
     if not setting.data:
-        require_simulated(study.dataset_names())
+        require_simulated(study.dataset_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps = [AXES[axis](study) for axis in axes]
     with workspace.claimed():
-        all_axes = merge_axes(workspace, study, axes)
-        provenance = prepare(study, workspace, setting.data, setting.tokenizer)
+        require_same_windows(study, workspace, replace)
+        earlier = find_earlier(workspace, study, replace)
+        provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
+        if "datasets" in axes:
+            require_judged(study, workspace)
+        if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
+            changed = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and are run again"
+            console.print(changed, markup=False, soft_wrap=True)
+        all_axes = tuple(dict.fromkeys([*(earlier.axes if earlier else ()), *axes]))
         record = Record(study, setting.data, all_axes, command_line(), provenance)
         save_record(workspace, record)
         trials = unique_trials(sweeps, provenance)
@@ -154,7 +88,23 @@ def run_study(setting: Setting, axes: Sequence[str], *, workers: int, retry_fail
         jobs = [Job(id, names[id], {"trial": to_dict(trial), **common}) for id, trial in ordered]
         states = run_jobs(jobs, workspace, workers, retry_failed)
         draw(workspace, record)
-    complain(jobs, states)
+    complain(jobs, states, again)
+
+
+def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Record | None:
+    """What was run here before, if `study` goes on with it: its axes then have the same trials under both.
+
+    Raises ConfigError for a study of other settings, unless `replace` allows it: its report would be drawn over.
+    """
+    try:
+        earlier = find_record(workspace)
+        lines = []
+        if earlier and any(AXES[axis](earlier.study) != AXES[axis](study) for axis in earlier.axes):
+            lines = diff(earlier.study, study)
+    except ConfigError as error:  # it cannot be read
+        earlier, lines = None, [str(error)]
+    require_same("study", workspace.record, lines, replace)
+    return None if lines else earlier
 
 
 def run_jobs(
@@ -181,7 +131,7 @@ def draw(workspace: Workspace, record: Record) -> None:
 
     provenance = record.provenance
     if provenance is None:
-        raise ConfigError(f"the study in {workspace.root} has not run yet; run `hma study --out {workspace.root}`")
+        raise ConfigError(f"the study in {workspace.root} has not run yet; run `{record.command}`")
     sweeps = [AXES[axis](record.study) for axis in record.axes]
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
     write_csv(workspace.results, Row, collect(sweeps, provenance, workspace.trials, states))
@@ -199,61 +149,46 @@ def draw(workspace: Workspace, record: Record) -> None:
     wrote(*tables, workspace.figures, workspace.report)
 
 
-def complain(jobs: Sequence[Job], states: dict[str, State]) -> None:
-    """Raises TrialsFailed, naming every trial without a result."""
+def complain(jobs: Sequence[Job], states: dict[str, State], again: str) -> None:
+    """Raises TrialsFailed, naming every trial without a result, and the command that tries them again."""
     bad = [(job, states[job.id]) for job in jobs if states[job.id].event != FINISHED]
     if bad:
         lines = "\n".join(f"  {s.event}: {job.title}: {s.message}" for job, s in bad)
-        raise TrialsFailed(
-            f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\nAdd --retry-failed to try them again."
-        )
+        raise TrialsFailed(f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\nTo try them again: {again}")
 
 
 def wrote(*paths: Path, then: str = "") -> None:
+    """Says what was written, and the whole command that comes `then`."""
     for path in paths:
-        console.print(f"wrote [bold]{escape(short(path))}[/]", soft_wrap=True)
+        console.print("wrote", Text(short(path), "bold"), soft_wrap=True)
     if then:
-        console.print(f"next: {escape(then)}", soft_wrap=True)
-
-
-def short(path: Path) -> str:
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+        console.print(Text(f"next: {then}"), soft_wrap=True)
 
 
 # --- Single steps ----------------------------------------------------------------------------
 
 
-def write_suite(setting: Setting) -> None:
-    from experiments.pipeline import make_suite
+def write_suite(setting: Setting, replace: Step | None) -> None:
+    from experiments.preparing.suite import make_suite
 
     with setting.workspace.claimed():
-        make_suite(setting.study, setting.workspace)
-    wrote(setting.workspace.suite, then=next_command("tokenizer train", setting))
+        make_suite(setting.study, setting.workspace, replace)
+    wrote(setting.workspace.suite, then=setting.command("tokenizer train"))
 
 
-def train_tokenizer(setting: Setting) -> None:
-    from experiments.pipeline import find_sources, make_suite, make_tokenizer
+def train_tokenizer(setting: Setting, replace: Step | None) -> None:
+    from experiments.preparing.sources import find_sources
+    from experiments.preparing.suite import make_suite
+    from experiments.preparing.tokenizer import make_tokenizer
 
     study, workspace = setting.study, setting.workspace
     with workspace.claimed():
-        sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace)
-        make_tokenizer(study, workspace, sources)
-    wrote(workspace.tokenizer, then=next_command("tokenize", setting))
+        sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace, replace)
+        make_tokenizer(study, workspace, sources, replace)
+    wrote(workspace.tokenizer, then=setting.command("tokenize"))
 
 
 def draw_again(out: Path) -> None:
     """Report of a study that ran before, without touching its data or trials."""
     workspace = Workspace(out.absolute())
     draw(workspace, load_record(workspace))
-
-
-def next_command(command: str, setting: Setting) -> str:
-    """A command line for the same study, data and directory."""
-    out = short(setting.workspace.root)
-    data = " --data " + " ".join(map(shlex.quote, setting.data)) if setting.data else ""
-    tokenizer = f" --tokenizer {shlex.quote(short(setting.tokenizer))}" if setting.tokenizer else ""
-    registry = f" --registry {shlex.quote(short(setting.registry))}" if setting.registry else ""
-    return f"hma {command} --preset {setting.study.name} --out {shlex.quote(out)}{data}{registry}{tokenizer}"

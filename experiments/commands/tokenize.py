@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
-from experiments.commands.study import Setting, next_command, wrote
+from experiments.commands.study import wrote
+from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
+from experiments.setting import Setting
 from experiments.workspace import Busy, Workspace
 from hma_jax.config import require
 
@@ -22,6 +24,7 @@ def tokenize(
     processes: int | None = None,
     batch: int | None = None,
     threads: int | None = None,
+    replace: Step | None = None,
 ) -> None:
     """Everything up to training, or this process's share of the tokens."""
     from data_pipelines.tokens.share import find_share
@@ -29,28 +32,39 @@ def tokenize(
 
     share = find_share(process, processes, os.environ)
     if share.processes > 1:
-        _tokenize_share(setting, share, batch, threads)
+        _tokenize_share(setting, share, batch, threads, replace)
         return
     with setting.workspace.claimed():
         prepare(
-            setting.study, setting.workspace, setting.data, setting.tokenizer, batch=batch, threads=threads
-        )
+            setting.study, setting.workspace, setting.data, setting.tokenizer,
+            replace=replace, batch=batch, threads=threads,
+        )  # fmt: skip
     _finish(setting)
 
 
-def _tokenize_share(setting: Setting, share: Share, batch: int | None, threads: int | None) -> None:
+def _tokenize_share(
+    setting: Setting, share: Share, batch: int | None, threads: int | None, replace: Step | None
+) -> None:
     """Makes no tokenizer and removes nothing: other processes rely on what is there."""
-    from experiments.pipeline import adopt_tokenizer, find_sources, find_suite, freeze_windows, make_store
+    from experiments.preparing.sources import find_sources, find_suite
+    from experiments.preparing.store import make_store
+    from experiments.preparing.tokenizer import adopt_tokenizer
+    from experiments.preparing.windows import freeze_windows, require_same_windows
 
     study, workspace = setting.study, setting.workspace
     if share.told_by:
         console.print(f"process {share.process} of {share.processes}, says {share.told_by}")
     tokenizer = setting.tokenizer or workspace.tokenizer
-    advice = f"Make it before the work is shared: {next_command('tokenizer train', setting)}"
+    advice = f"Make it before the work is shared: {setting.command('tokenizer train')}"
     require(tokenizer.is_dir(), f"{tokenizer}: no tokenizer. {advice}")
-    sources = find_sources(study, setting.data) if setting.data else find_suite(study, workspace)
+    require_same_windows(study, workspace, None)
+    if setting.data:
+        sources = find_sources(study, setting.data)
+    else:
+        advice = f"Make them before the work is shared: {setting.command('data suite')}; or give --data"
+        sources = find_suite(study, workspace, advice)
     unfinished = make_store(
-        study, workspace, sources, tokenizer=tokenizer, share=share, batch=batch, threads=threads
+        study, workspace, sources, tokenizer=tokenizer, share=share, batch=batch, threads=threads, replace=replace
     )
     if unfinished:
         console.print(
@@ -73,7 +87,7 @@ def _tokenize_share(setting: Setting, share: Share, batch: int | None, threads: 
 def _finish(setting: Setting) -> None:
     workspace = setting.workspace
     show_store(workspace)
-    wrote(workspace.store, workspace.manifest, then=next_command("train", setting))
+    wrote(workspace.store, workspace.manifest, then=setting.command("train"))
 
 
 def show_store(workspace: Workspace) -> None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from experiments.commands.study import short, wrote
+from experiments.commands.study import wrote
 from experiments.progress import console, step
+from experiments.setting import command, short
 
 if TYPE_CHECKING:
     from hma_jax.tokenizers.shared import BaseTokenizer
@@ -52,5 +52,6 @@ def _write(tokenizer: BaseTokenizer, out: Path) -> None:
         f"{tokenizer.kind} {tokenizer.identity}: {side} x {side} pixels to {tokenizer.tokens} tokens, {what}",
         soft_wrap=True,
     )
-    then = f"hma tokenize --tokenizer {shlex.quote(short(out))} with the --preset and --data of a study"
-    wrote(out, then=then)
+    preset = "cpu-continuous" if tokenizer.channels else "cpu"
+    wrote(out, then=command("tokenize", "--preset", preset, "--tokenizer", out))
+    console.print("that takes the simulated suite; with --data DIR ... your own, with --preset another study")

@@ -157,7 +157,7 @@ def instant_trials(monkeypatch):
         finished_study(trials.parent, record.study, broken={"width 8 ": "failed"}, axes=record.axes)
         return read_states([job.id for job in jobs], trials, Ledger(ledger.path))
 
-    monkeypatch.setattr(pipeline, "prepare", lambda *_: PROVENANCE)
+    monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: PROVENANCE)
     monkeypatch.setattr(commands, "run_missing", run_missing)
 
 

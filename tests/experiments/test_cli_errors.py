@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
-from experiments import pipeline
+from experiments.preparing import tokenizer, windows
 from experiments.cli.main import main
 from experiments.commands import registry as registry_commands
 from hma_jax.tokenizers import train as tokenizer_training
@@ -47,7 +47,7 @@ def idle_training():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tokenizer_training, "make_train_step", idle_step)
         patch.setattr(model_training, "make_train_step", idle_step)
-        patch.setattr(pipeline, "QUALITY_FRAMES", 8)
+        patch.setattr(tokenizer, "QUALITY_FRAMES", 8)
         yield
 
 
@@ -264,7 +264,7 @@ def test_disk_that_fills_up_later(study, tmp_path, refused, monkeypatch):
         raise OSError(28, "No space left on device", str(path))
 
     out, data = study
-    monkeypatch.setattr(pipeline, "write_atomically", full)
+    monkeypatch.setattr(windows, "write_atomically", full)
     message = refused(1, "tokenize", *SMOKE, "--out", out, *data)
     assert f"{out / 'data.json'}: No space left on device" in message and "the space on its disk" in message
 

@@ -11,7 +11,7 @@ from PIL import Image
 from data_pipelines.inspection.inspect import Shown
 from data_pipelines.registry import table as registry_table
 from experiments.cli.main import main
-from experiments.commands.study import find_directories, make_setting
+from experiments.setting import Where, find_directories, make_setting
 from experiments.contact_sheet import TILE, draw_sheet
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
@@ -98,7 +98,7 @@ def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path):
 
 
 def test_mixture_names_the_datasets_of_a_study(tmp_path, capsys):
-    assert make_setting("paper", tmp_path, (), (), mixture="dataset10").study.dataset_counts == (5, 10)
+    assert make_setting(Where("paper", tmp_path, mixture="dataset10")).study.dataset_counts == (5, 10)
     assert main(["study", "--preset", "smoke", "--mixture", "dataset5", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "bridge_data_v2, fractal20220817_data, language_table and others: not simulated" in said
@@ -108,7 +108,7 @@ def test_mixture_is_looked_for_in_the_given_directories(tmp_path):
     for root, name in (("a", "x"), ("b", "x"), ("b", "y")):
         (tmp_path / root / name).mkdir(parents=True)
     roots = [str(tmp_path / "a"), str(tmp_path / "b")]
-    assert find_directories(["x", "y"], roots) == [f"{roots[0]}/x", f"{roots[1]}/y"]
+    assert find_directories(["x", "y"], roots) == (f"{roots[0]}/x", f"{roots[1]}/y")
     with pytest.raises(ConfigError, match="no directory for z in"):
         find_directories(["x", "z"], roots)
 

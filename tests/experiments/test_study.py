@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from experiments import scale_datasets, scale_trajectories, scale_width
-from experiments.cli.where import Preset
+from experiments.setting import Preset
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.provenance import Provenance

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments import pipeline
+from experiments.preparing import sources
 from experiments.cli.main import main
-from experiments.commands.study import make_setting
+from experiments.setting import Where, make_setting
 from experiments.progress import Pace
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.tokens.job_process import contents
@@ -54,9 +54,9 @@ def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
             copy = root / "1.0.0" / path.name
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(path.read_bytes())
-        setting = make_setting("smoke", tmp_path, [str(root)], [])
+        setting = make_setting(Where("smoke", tmp_path, (str(root),)))
         assert setting.data == (f"memory://bucket/{ARM.name}",)
-        ((spec, directory),) = pipeline.find_sources(setting.study, setting.data)
+        ((spec, directory),) = sources.find_sources(setting.study, setting.data)
         assert spec == ARM and directory == root
         assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), "--data", str(root)]) == 0
         assert f"--data memory://bucket/{ARM.name}" in capsys.readouterr().out.replace("\n", " ")

@@ -1,0 +1,47 @@
+"""What several commands ask besides `Where`; it holds for one command and is not handed on to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from experiments.preparing.made_from import Step
+from experiments.setting import UNSET
+
+
+@dataclass(frozen=True)
+class How:
+    """How trials are run; none of it changes a result."""
+
+    workers: Annotated[int, arg(metavar="N")] = 1
+    """Trials at a time, each in its own process with its share of the cores."""
+    retry_failed: Annotated[FlagCreatePairsOff[bool], arg(name="retry-failed"), UNSET] = False
+    """Run trials again that failed or diverged; otherwise they stay as they are, and visible."""
+    dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False
+    """Print trials, parameters, FLOPs and expected time, and stop."""
+
+
+@dataclass(frozen=True)
+class Remake:
+    """What was made with other settings or data is never replaced without being asked for."""
+
+    replace: Annotated[Step | None, arg(metavar="STEP"), UNSET] = None
+    """Make this step, and those that follow from it, again in place of what differs there.
+    In order: suite, tokenizer, tokens, windows, study."""
+
+
+@dataclass(frozen=True)
+class OneModel:
+    """How one model is trained."""
+
+    run: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: OUT/model)")] = None
+    """Directory of the training run. Resumed if it exists."""
+    trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
+    """Trajectories of each robot, chosen by hash: the same as in a sweep over trajectories."""
+    checkpoint_every: Annotated[
+        int | None, arg(name="checkpoint-every", metavar="STEPS", help_behavior_hint="(default: a fifth of all)")
+    ] = None
+    """Steps from one checkpoint to the next; 0: only at the end and when interrupted."""

@@ -1,0 +1,127 @@
+"""What a prepared thing was made from, and who may make it again in its place.
+
+Two kinds of facts are written beside what is made. *Inputs* are settings and data. A thing that is there and
+was made from other inputs is refused, never replaced, unless the user asked for that. What is only *recorded*
+(the hash of the sources, the temperature of the mixture) changes with every edit of the code or with settings
+that are meant for something else: a difference is said, and the thing that is there stays in use. Otherwise
+a corrected comment would destroy a tokenizer of hours. To have it made by the new sources, remove it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from experiments.atomic import write_atomically
+from experiments.progress import console
+from hma_jax.config import ConfigError
+from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
+
+Step = Literal["suite", "tokenizer", "tokens", "windows", "study"]
+"""In the order in which one is made of the other."""
+
+IN_WORDS: dict[Step, str] = {
+    "suite": "the simulated datasets",
+    "tokenizer": "the tokenizer",
+    "tokens": "the tokens",
+    "windows": "the evaluation windows",
+    "study": "the study's record and report",
+}
+
+STAMP = "made_from.json"
+OLD_STAMP = "made_from.txt"
+"""Of earlier versions: a hash, from which nobody can tell what differs."""
+
+ORIGIN = "origin"
+"""The input that decides which others there are."""
+
+
+@dataclass(frozen=True)
+class MadeFrom:
+    """JSON values by name."""
+
+    inputs: dict[str, Any]
+    recorded: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def id(self) -> str:
+        """Equal for things that are made in the same way by the same sources."""
+        return stable_hash(self)
+
+    def save(self, directory: Path) -> None:
+        write_atomically(directory / STAMP, json.dumps(to_dict(self), indent=1))
+
+
+def read_stamp(directory: Path) -> MadeFrom | None:
+    """What the thing in `directory` was made from; None if it is not written down there."""
+    try:
+        return from_dict(MadeFrom, json.loads((directory / STAMP).read_text()))
+    except (OSError, ValueError):  # ConfigError is a ValueError
+        return None
+
+
+def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
+    """Lines 'setting: old -> new' for inputs that differ."""
+    if there.get(ORIGIN) != wanted.get(ORIGIN):
+        return [f"{ORIGIN}: {there.get(ORIGIN)} -> {wanted.get(ORIGIN)}"]
+    old, new = dict(there), dict(wanted)
+    names = old.pop("datasets", []), new.pop("datasets", [])
+    lines = dataset_differences(*names)
+    data = old.pop("data", {}), new.pop("data", {})
+    for name in [n for n in data[0] if n in data[1]]:
+        lines += diff(data[0][name], data[1][name], f"data of {name}")
+    return diff(old, new) + lines
+
+
+def dataset_differences(there: Sequence[str], wanted: Sequence[str]) -> list[str]:
+    """One line at most, which names what came and what went."""
+    if list(there) == list(wanted):
+        return []
+    gone = [n for n in there if n not in wanted]
+    new = [n for n in wanted if n not in there]
+    parts = [f"without {few(gone)}"] * bool(gone) + [f"with {few(new)}"] * bool(new)
+    return [f"datasets: {len(there)} -> {len(wanted)}, {' and '.join(parts) or 'in another order'}"]
+
+
+def few(names: Sequence[str]) -> str:
+    """The first names of a list that may be long."""
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def may_replace(step: Step, asked: Step | None) -> bool:
+    """Whether the user asked for `step`, or something that it is made of, to be replaced."""
+    order = get_args(Step)
+    return asked is not None and order.index(asked) <= order.index(step)
+
+
+def require_same(step: Step, place: Path, lines: Sequence[str], asked: Step | None, otherwise: str = "") -> None:
+    """Raises ConfigError if `lines` say how the inputs differ and the user did not ask for a replacement.
+
+    `otherwise`: one more way to go on.
+    """
+    if not lines or may_replace(step, asked):
+        return
+    after = [IN_WORDS[s] for s in get_args(Step) if may_replace(s, step) and s != step]
+    follows = f", and {', '.join(after)} where they depend on it" if after else ""
+    raise ConfigError(
+        f"{place}: {IN_WORDS[step]} there were made from other inputs (there -> asked for):\n  "
+        + "\n  ".join(lines)
+        + "\nNothing was changed. Choose another --out, or give the settings that it was made with"
+        + (f", or {otherwise}" if otherwise else "")
+        + f"; or add --replace {step}, which makes {IN_WORDS[step]} again in place of what is there{follows}."
+    )
+
+
+def say_recorded(what: str, place: Path, there: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Tells that something stays in use although other sources would make it now."""
+    lines = diff(dict(there), dict(now))
+    if lines:
+        console.print(
+            f"note: {what} in {place} was made with other {'; '.join(lines)}. It stays in use; remove it to have "
+            "it made again",
+            markup=False,
+            soft_wrap=True,
+        )

@@ -1,0 +1,54 @@
+"""The datasets that a study reads: directories of the user, or the simulated suite."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from experiments.study import StoreConfig, Study
+from experiments.workspace import Workspace
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
+    from data_pipelines.rlds.dataset import RldsDataset
+    from data_pipelines.rlds.location import Location
+
+Source = tuple["DatasetSpec", "Location"]
+"""A dataset: how it is read, and its RLDS directory."""
+
+
+def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
+    """The names that RLDS directories give themselves. Raises DataError for one that is none."""
+    from data_pipelines.rlds.schema import dataset_name
+
+    return tuple(map(dataset_name, data))
+
+
+def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
+    """User directories with their registry entries. Raises ConfigError for unknown names."""
+    from data_pipelines.registry import get_spec
+    from data_pipelines.rlds.location import locate
+
+    named = dict(zip(name_datasets(data), map(locate, data), strict=True))
+    missing = [n for n in study.dataset_names() if n not in named]
+    require(not missing, f"no --data directory for {', '.join(missing)}; given: {', '.join(named)}")
+    return [(get_spec(name), named[name]) for name in study.dataset_names()]
+
+
+def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
+    """The simulated datasets, which must be there. Raises ConfigError with `advice` otherwise."""
+    from data_pipelines.registry import get_spec
+
+    sources = [(get_spec(name), workspace.suite / name) for name in study.dataset_names()]
+    missing = [spec.name for spec, path in sources if not path.is_dir()]
+    require(not missing, f"{workspace.suite}: {', '.join(missing)} not simulated yet. {advice}")
+    return sources
+
+
+def open_source(source: Source, settings: StoreConfig) -> RldsDataset:
+    """Indexes a dataset's shards. Raises DataError for damage that `settings` do not allow."""
+    from data_pipelines.rlds.dataset import RldsDataset
+
+    spec, path = source
+    return RldsDataset(path, spec.split, corrupt=settings.corrupt, max_skipped=settings.max_skipped)

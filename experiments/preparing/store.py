@@ -1,0 +1,93 @@
+"""The token store of a study: every dataset's episodes as tokens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.preparing.made_from import Step, few, may_replace, require_same
+from experiments.preparing.sources import Source, open_source
+from experiments.progress import Pace, step
+from experiments.study import Study
+from experiments.workspace import Workspace
+from hma_jax.config import require
+from hma_jax.config.json import to_dict
+
+if TYPE_CHECKING:
+    from data_pipelines.tokens.share import Share
+    from hma_jax.tokenizers.base import Tokenizer
+
+
+def make_store(
+    study: Study,
+    workspace: Workspace,
+    sources: Sequence[Source],
+    *,
+    tokenizer: Path | None = None,
+    share: Share | None = None,
+    batch: int | None = None,
+    threads: int | None = None,
+    replace: Step | None = None,
+) -> list[str]:
+    """Tokens of every source, or of a `share` of their parts; those made in the same way are kept.
+
+    Raises ConfigError, before anything is done, if other tokens are in the place of some, unless `replace` allows
+    it. Returns the datasets that still lack parts of other processes. `tokenizer`: a directory, if it is not the
+    workspace's. `batch` and `threads` as in `tokenize_dataset`.
+    """
+    from data_pipelines.tokens.share import Share
+    from data_pipelines.tokens.tokenize_job import tokenize_dataset
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    made_with = load_tokenizer(tokenizer or workspace.tokenizer)
+    settings, share = to_dict(study.store), share or Share()
+    require(
+        replace is None or share.processes == 1,
+        "processes that share the work replace nothing, since none knows what the others rely on; run the command "
+        "with --replace in one process (--processes 1), or choose another --out",
+    )
+    require_same("tokens", workspace.store, _differences(study, workspace, sources, made_with), replace)
+    how = {k: v for k, v in (("batch", batch), ("threads", threads)) if v is not None}
+    workspace.store.mkdir(parents=True, exist_ok=True)
+    unfinished = []
+    mine = f", share {share.process + 1} of {share.processes}" if share.processes > 1 else ""
+    with step(f"tokenise {len(sources)} dataset(s){mine}") as update:
+        for i, (spec, path) in enumerate(sources):
+            pace, note = Pace(), f"{spec.name} ({i + 1} of {len(sources)})"
+            manifest = tokenize_dataset(
+                spec, path, made_with, workspace.store, **settings, **how,
+                share=share, overwrite=may_replace("tokens", replace),
+                progress=lambda done, total, note=note, pace=pace: update(
+                    done, total, f"{note}{pace(done, total)}"
+                ),
+            )  # fmt: skip
+            if manifest is None:
+                unfinished.append(spec.name)
+    return unfinished
+
+
+def _differences(
+    study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer
+) -> list[str]:
+    """How the datasets that are in the store were made otherwise; a line that holds for several is said once."""
+    from data_pipelines.errors import DataError
+    from data_pipelines.tokens.dataset_writer import differences
+    from data_pipelines.tokens.tokenize_job import plan_dataset
+
+    s = study.store
+    found: dict[str, list[str]] = {}
+    for spec, path in sources:
+        if not (workspace.store / spec.name).exists():
+            continue
+        source = open_source((spec, path), s)
+        plan = plan_dataset(
+            spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val, frame_step=s.frame_step
+        )
+        try:
+            lines = differences(workspace.store, plan)
+        except DataError as error:  # damaged, or of an older format
+            lines = [str(error)]
+        for line in lines:
+            found.setdefault(line, []).append(spec.name)
+    return [f"{line} ({few(names)})" for line, names in found.items()]

@@ -1,0 +1,93 @@
+"""The simulated datasets of a study, each made once."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.preparing.made_from import Step, few, may_replace, require_same
+from experiments.preparing.sources import Source
+from experiments.progress import console, step
+from experiments.study import Study, SuiteConfig
+from experiments.workspace import Workspace
+from hma_jax.config import require
+
+
+def require_simulated(names: Sequence[str], advice: str = "Give RLDS directories with --data") -> None:
+    """Raises ConfigError unless every dataset is one of the suite, which needs no --data."""
+    from data_pipelines.suite.embodiments import EMBODIMENTS
+
+    simulated = {e.name for e in EMBODIMENTS}
+    real = [name for name in names if name not in simulated]
+    require(
+        not real,
+        f"{', '.join(real[:3])}{' and others' if len(real) > 3 else ''}: not simulated. {advice}",
+    )
+
+
+def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) -> list[Source]:
+    """The simulated datasets of the study, written once.
+
+    Raises ConfigError where some are there with another seed or size, unless `replace` allows it. Those made by
+    an earlier version of the simulator stay in use, which is said.
+    """
+    from data_pipelines.registry import get_spec
+    from data_pipelines.rlds.writer import VERSION
+    from data_pipelines.suite.generate import generate_suite
+
+    names = study.dataset_names()
+    specs = [get_spec(name) for name in names]  # a mistyped name is refused before any work
+    require_simulated(names)
+    found = {name: _differences(name, workspace.suite / name / VERSION, study.suite) for name in names}
+    lines = [f"{name}: {line}" for name in names for line in found[name] or ()]
+    require_same("suite", workspace.suite, _shortened(lines), replace)
+    kept = [] if may_replace("suite", replace) else [name for name in names if found[name] == []]
+    with step(f"simulate {len(names)} datasets") as update:
+        generate_suite(
+            workspace.suite,
+            scale=study.suite.scale,
+            seed=study.suite.seed,
+            names=[name for name in names if name not in kept],
+            workers=_cores(),
+            progress=lambda name, done, total: update(done, total, name),
+        )
+    if kept:
+        console.print(
+            f"note: {few(kept)} in {workspace.suite}: made by an earlier version of the simulator, and still used; "
+            "--replace suite makes them again, and what follows from them",
+            markup=False,
+            soft_wrap=True,
+        )
+    return [(spec, workspace.suite / spec.name / VERSION) for spec in specs]
+
+
+def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | None:
+    """How the inputs of a dataset that is there differ from `suite`; [] if only the simulator does; None if it
+    is as it should be, is not there, or lacks shards and is to be made in any case."""
+    from data_pipelines.suite.generate import episode_count, fingerprint, is_complete, select
+
+    (spec,) = select([name])
+    mark = fingerprint(spec, suite.scale, suite.seed)
+    if not directory.exists() or is_complete(directory, mark):
+        return None
+    try:
+        metadata = json.loads((directory / "metadata.json").read_text())
+        info = json.loads((directory / "dataset_info.json").read_text())
+        made_as, seed, lengths = metadata["fingerprint"], metadata["seed"], info["splits"][0]["shardLengths"]
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        return ["what is there says nothing of what it was made from"]
+    episodes, wanted = sum(map(int, lengths)), episode_count(spec, suite.scale)
+    lines = [f"suite.seed: {seed} -> {suite.seed}"] if seed != suite.seed else []
+    lines += [f"suite.scale: {episodes} -> {wanted} episodes"] if episodes != wanted else []
+    return lines if lines or is_complete(directory, made_as) else None
+
+
+def _shortened(lines: Sequence[str], most: int = 8) -> list[str]:
+    more = len(lines) - most
+    return [*lines[:most], f"... and {more} more"] if more > 0 else list(lines)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,178 @@
+"""The tokenizer of a study: trained on its datasets, or one that is given."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.atomic import write_atomically
+from experiments.preparing.made_from import (
+    OLD_STAMP,
+    ORIGIN,
+    MadeFrom,
+    Step,
+    differences,
+    read_stamp,
+    require_same,
+    say_recorded,
+)
+from experiments.preparing.sources import Source, open_source
+from experiments.progress import console, step
+from experiments.provenance import source_hash
+from experiments.study import Study
+from experiments.trial import CHECKPOINTS
+from experiments.workspace import Workspace
+from hma_jax.config import ConfigError, TokenizerConfig, require
+from hma_jax.config.json import to_dict
+
+if TYPE_CHECKING:
+    from hma_jax.tokenizers.base import Tokenizer
+
+QUALITY = "quality.json"
+QUALITY_FRAMES = 1024
+"""Held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
+
+TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
+
+
+def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
+    """What the tokenizer of a study is trained from, under the names that --set has for it.
+
+    Steps, batch or objective of the model are no part of it. Of the mixture's temperature, which is set for the
+    model's sake, the frames depend a little: it is recorded only.
+    """
+    settings = study.store
+    data = {
+        spec.name: {
+            "shards": open_source((spec, path), settings).fingerprint(),
+            "split": spec.split,
+            "image_key": spec.image_key,
+        }
+        for spec, path in sources
+    }
+    inputs = {
+        ORIGIN: TRAINED,
+        "tokenizer": to_dict(study.tokenizer),
+        "tokenizer_train": to_dict(study.tokenizer_train),
+        "store": {name: getattr(settings, name) for name in ("val_fraction", "min_val", "max_val")},
+        "datasets": list(data),
+        "data": data,
+    }
+    return MadeFrom(inputs, {"tau": study.tau, "sources": source_hash(("hma_jax/tokenizers",))})
+
+
+def make_tokenizer(
+    study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
+) -> None:
+    """A tokenizer trained on frames of all sources; nothing is done if it is there.
+
+    Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there
+    that was made from other inputs, unless `replace` allows it.
+    """
+    from data_pipelines.loading.frames import make_frame_loader
+    from hma_jax.tokenizers.train import train_tokenizer
+    from hma_jax.training.loop import LoopOptions
+
+    config, train, settings = study.tokenizer, study.tokenizer_train, study.store
+    require(
+        isinstance(config, TokenizerConfig),
+        "the study's tokenizer is not one that is trained here; give its directory with --tokenizer",
+    )
+    made_from = tokenizer_made_from(study, sources)
+    if _in_place(workspace.tokenizer, made_from, replace):
+        return
+
+    def frames(start: int, split: str = "train") -> Iterator[np.ndarray]:
+        return make_frame_loader(
+            sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
+            val_fraction=settings.val_fraction, min_val=settings.min_val, max_val=settings.max_val,
+            corrupt=settings.corrupt, max_skipped=settings.max_skipped,
+        )  # fmt: skip
+
+    aside = workspace.root / f"tokenizer.{made_from.id}"  # never resumed with other inputs
+    with step("train the tokenizer") as update:
+        tokenizer = train_tokenizer(
+            config, train, frames, aside, provenance=to_dict(made_from),
+            options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
+            progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
+        )  # fmt: skip
+        quality = reconstruction_psnr(tokenizer, frames(0, "val"))
+    console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
+    write_atomically(aside / QUALITY, json.dumps(quality))
+    _publish(aside, workspace.tokenizer, made_from)
+
+
+def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
+    """Whether the tokenizer that is to be trained is there. ConfigError if another one is, unless allowed."""
+    if not place.exists():
+        return False
+    there = read_stamp(place)
+    if there is None:
+        lines = ["it is not written down there" + (", as of earlier versions" if (place / OLD_STAMP).exists() else "")]
+    else:
+        lines = differences(there.inputs, made_from.inputs)
+    require_same("tokenizer", place, lines, replace, f"use it as it is with --tokenizer {place}")
+    if lines:
+        return False
+    say_recorded("the tokenizer", place, there.recorded, made_from.recorded)
+    console.print("[green]done[/] train the tokenizer [dim](before)[/]")
+    return True
+
+
+def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: Step | None = None) -> None:
+    """A copy of a tokenizer that was trained elsewhere; nothing is done if the same one is there already.
+
+    Raises ConfigError if it is not the kind that the study is made for, or if another one is there, unless
+    `replace` allows it.
+    """
+    from hma_jax.tokenizers.io import load_tokenizer, save_tokenizer
+
+    tokenizer = load_tokenizer(source, expect=study.tokenizer)
+    place, made_from = workspace.tokenizer, MadeFrom({ORIGIN: f"{GIVEN} {tokenizer.identity}"})
+    if place.exists():
+        there = read_stamp(place)
+        if there == made_from:
+            return
+        try:
+            identity = load_tokenizer(place).identity
+        except ConfigError as error:
+            lines = [str(error)]
+        else:
+            if identity == tokenizer.identity:  # trained here, or the very directory that is given
+                return
+            origin = there.inputs[ORIGIN] if there else "not written down"
+            lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
+        require_same("tokenizer", place, lines, replace)
+    aside = workspace.root / "tokenizer.adopted"
+    shutil.rmtree(aside, ignore_errors=True)
+    save_tokenizer(tokenizer, aside)
+    _publish(aside, place, made_from)
+
+
+def _publish(aside: Path, place: Path, made_from: MadeFrom) -> None:
+    """Puts a finished directory in place of whatever is there."""
+    made_from.save(aside)
+    gone = place.with_name(f".{place.name}.removed")
+    shutil.rmtree(gone, ignore_errors=True)
+    if place.exists():
+        os.replace(place, gone)
+    os.replace(aside, place)
+    shutil.rmtree(gone, ignore_errors=True)
+
+
+def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> dict[str, float]:
+    """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames: mean, sem, n."""
+    from hma_jax.evaluation.metrics import mean_and_sem, psnr
+
+    values: list[float] = []
+    while len(values) < QUALITY_FRAMES:
+        images = next(batches)
+        values += np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)).tolist()
+    return dataclasses.asdict(mean_and_sem(values))

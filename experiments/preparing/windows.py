@@ -1,0 +1,154 @@
+"""The evaluation windows that all trials of a study share, and the summary of its data."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from experiments.atomic import write_atomically
+from experiments.preparing.made_from import Step, dataset_differences, few, require_same
+from experiments.progress import console
+from experiments.provenance import Provenance, source_hash
+from experiments.study import StoreConfig, Study
+from experiments.workspace import Workspace
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.tokens.store import TokenStore
+
+HELD_OUT = 0.25
+"""Share of a dataset's episodes: if more are held out, it is said how many and why."""
+
+
+def require_same_windows(study: Study, workspace: Workspace, replace: Step | None) -> None:
+    """Raises ConfigError, before anything is made, if what is known by then differs from the frozen windows."""
+    there = _frozen(workspace, replace)
+    if there is not None:
+        lines = _setting_differences(there, study.model.frames, study.eval.seed, study.dataset_names())
+        require_same("windows", workspace.manifest, lines, replace)
+
+
+def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = None) -> Provenance:
+    """The validation windows that all trials share, and a summary of the data.
+
+    Raises ConfigError if others are there, unless `replace` allows it.
+    """
+    from data_pipelines.loading.evalset import freeze_manifest
+    from data_pipelines.tokens.store import TokenStore
+
+    store = TokenStore(workspace.store)
+    names, frames = study.dataset_names(), study.model.frames
+    manifest = freeze_manifest(store, names, frames, study.eval.windows_per_dataset, study.eval.seed)
+    there = _frozen(workspace, replace)
+    if there is None or there.hash() != manifest.hash():
+        if there is not None:
+            require_same("windows", workspace.manifest, _differences(there, manifest), replace)
+        manifest.save(workspace.manifest)
+    summary = summarise(store, names, frames)
+    write_atomically(workspace.data_summary, json.dumps(summary, indent=1))
+    for name, facts in summary.items():
+        _remark(name, facts, manifest.empty.get(name, ""), frames)
+    _say_held_out(summary, study.store)
+    without = [name for name, facts in summary.items() if not facts["windows"]]
+    if without:
+        console.print(
+            f"{len(names) - len(without)} of {len(names)} datasets can be trained on; {few(without)} "
+            f"{'has' if len(without) == 1 else 'have'} no training window",
+            soft_wrap=True,
+        )
+    (identity,) = {store.manifest(name).tokenizer.identity for name in names}
+    return Provenance(store.hash(names), manifest.hash(), identity, source_hash())
+
+
+def require_judged(study: Study, workspace: Workspace) -> None:
+    """Raises ConfigError if no dataset by which the datasets axis is judged has an evaluation window."""
+    from data_pipelines.loading.evalset import EvalManifest
+
+    judged = study.dataset_names()[: study.dataset_counts[0]]
+    manifest = EvalManifest.load(workspace.manifest)
+    require(
+        bool(set(judged) & set(manifest.names)),
+        f"none of {', '.join(judged)}, by which the datasets axis is judged, has a held-out window of "
+        f"{manifest.frames} frames; choose fewer with --set model.frames=... or put other datasets first",
+    )
+
+
+def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
+    """The windows that are there. ConfigError if they cannot be read, unless they may be replaced."""
+    from data_pipelines.errors import DataError
+    from data_pipelines.loading.evalset import EvalManifest
+
+    if not workspace.manifest.exists():
+        return None
+    try:
+        return EvalManifest.load(workspace.manifest)
+    except DataError as error:
+        require_same("windows", workspace.manifest, [str(error)], replace)
+        return None
+
+
+def _setting_differences(there: EvalManifest, frames: int, seed: int, names: Sequence[str]) -> list[str]:
+    lines = [f"model.frames: {there.frames} -> {frames}"] if there.frames != frames else []
+    lines += [f"eval.seed: {there.seed} -> {seed}"] if there.seed != seed else []
+    return lines + dataset_differences([d.dataset for d in there.datasets], sorted(names))
+
+
+def _differences(there: EvalManifest, wanted: EvalManifest) -> list[str]:
+    """In the words of --set."""
+    lines = _setting_differences(there, wanted.frames, wanted.seed, [d.dataset for d in wanted.datasets])
+    if there.store != wanted.store and not lines:
+        lines.append(f"tokens: {there.store} -> {wanted.store}")
+    old, new = (max(len(d.windows) for d in m.datasets) for m in (there, wanted))
+    if old != new:
+        lines.append(f"eval.windows_per_dataset: {old} -> {new} in the dataset with the most")
+    return lines or [f"windows: {there.hash()} -> {wanted.hash()}"]
+
+
+def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str, dict[str, int]]:
+    """Per dataset: training episodes, those too short for a window, windows, episodes held out and skipped."""
+    from data_pipelines.loading.windows import train_windows
+
+    summary = {}
+    for name in names:
+        manifest, windows = store.manifest(name), train_windows(store, name, frames)
+        summary[name] = {
+            "episodes": len(manifest.train.episodes),
+            "too_short": windows.too_short,
+            "windows": len(windows),
+            "held_out": len(manifest.val.episodes),
+            "skipped": manifest.lost,
+        }
+    return summary
+
+
+def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> None:
+    """Names the datasets that lose many episodes to evaluation because they have few."""
+    many = []
+    for name, facts in summary.items():
+        held_out, episodes = facts["held_out"], facts["held_out"] + facts["episodes"]
+        if held_out > HELD_OUT * episodes and held_out > round(settings.val_fraction * episodes):
+            many.append(f"{held_out} of {episodes} episodes of {name}")
+    if many:
+        console.print(
+            f"note: held out, not trained on: {few(many)}. At least store.min_val={settings.min_val} are, but no more "
+            "than half of a dataset",
+            markup=False,
+            soft_wrap=True,
+        )
+
+
+def _remark(name: str, facts: dict[str, int], no_evaluation: str, frames: int) -> None:
+    """Says what of a dataset is not used."""
+    remarks = []
+    if facts["too_short"]:
+        remarks.append(
+            f"{facts['too_short']} of {facts['episodes']} training episodes are too short for {frames} frames"
+        )
+    if facts["skipped"]:
+        remarks.append(f"{facts['skipped']} damaged episodes are left out")
+    if no_evaluation:
+        remarks.append(f"it is not evaluated: {no_evaluation}")
+    if remarks:
+        console.print(f"note: {name}: {'; '.join(remarks)}", markup=False, soft_wrap=True)

@@ -1,0 +1,172 @@
+"""What the user asked for, the study that follows from it, and the commands that ask for the same again.
+
+A command that is printed is made of every field of `Where`, so nothing that the user gave is lost on the way
+from one command to the next. What holds for one command only (--workers, --replace) is not part of it.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction, arg
+
+from experiments.presets import get_preset
+from experiments.program import PROGRAM
+from experiments.study import Study, on_tokenizer, on_user_data, override
+from experiments.workspace import Workspace
+from hma_jax.config import ConfigError
+
+Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous"]
+
+UNSET = arg(help_behavior_hint="")
+"""For an option whose text says what happens without it."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """Which study, on which data, in which directory, on which devices."""
+
+    preset: Preset = "cpu"
+    """Named study: smoke (seconds), cpu (minutes), accelerator (one GPU), paper (as published).
+    With -continuous: on latents instead of ids."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/PRESET)")] = None
+    """Directory for everything that is written."""
+    data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]", help_behavior_hint="(default: the simulated suite)")] = ()
+    """Your RLDS directories, paths or URLs such as gs://... Their names must be in the registry."""
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None
+    """TOML file with registry entries of your own, as `hma data inspect --entry` writes it."""
+    mixture: Annotated[str | None, arg(metavar="NAME"), UNSET] = None
+    """Named list of datasets, such as dataset10; --data then takes the directories that hold them."""
+    tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None
+    """Directory of a tokenizer to use, instead of training one on the data.
+    The model's tokens follow it."""
+    set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
+    """Change one setting, such as --set model.frames=4 --set train.steps=100."""
+    mesh: Annotated[tuple[int, int, int] | None, arg(metavar="DATA FSDP TENSOR"), UNSET] = None
+    """Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
+    Short for --set execution.mesh.data=... and so on. No result depends on it."""
+
+    def anywhere(self) -> Where:
+        """The same, meant in the same way from any working directory."""
+        from data_pipelines.rlds.location import absolute
+
+        def whole(path: Path | None) -> Path | None:
+            return path and path.absolute()
+
+        return replace(
+            self,
+            out=(self.out or Path("runs") / self.preset).absolute(),
+            data=tuple(map(absolute, self.data)),
+            registry=whole(self.registry),
+            tokenizer=whole(self.tokenizer),
+        )
+
+    def words(self) -> list[str]:
+        """The arguments that give this."""
+        said = []
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value == field.default and field.name != "preset":
+                continue
+            flag = f"--{field.name}"
+            if field.name == "set":
+                said += [word for one in value for word in (flag, one)]
+            else:
+                said += [flag, *map(_word, value if isinstance(value, tuple) else (value,))]
+        return said
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A study, its data and where it lives: what every command works on."""
+
+    asked: Where
+    study: Study
+    data: tuple[str, ...]  # RLDS directories, in the study's order; () for the suite
+    workspace: Workspace
+
+    @property
+    def tokenizer(self) -> Path | None:
+        """A tokenizer to use; None: one is trained on the data."""
+        return self.asked.tokenizer
+
+    def command(self, name: str, *arguments: str | Path) -> str:
+        """The command line `hma NAME ARGUMENTS` for the same study, data, directory and devices."""
+        return command(name, *arguments, *self.asked.words())
+
+
+def command(name: str, *arguments: str | Path) -> str:
+    """The command line `hma NAME ARGUMENTS`, quoted for a shell."""
+    return shlex.join([PROGRAM, *name.split(), *map(_word, arguments)])
+
+
+def make_setting(where: Where) -> Setting:
+    """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing.
+
+    Raises ConfigError, and DataError for directories that are no datasets.
+    """
+    asked = where.anywhere()
+    study, data = get_preset(asked.preset), asked.data
+    use_entries(asked.registry)
+    if asked.mixture is not None:
+        from data_pipelines.registry.mixtures import get_mixture
+
+        names = get_mixture(asked.mixture)
+        study = on_user_data(study, names)
+        data = find_directories(names, data) if data else ()
+    elif data:
+        from experiments.preparing.sources import name_datasets
+
+        study = on_user_data(study, name_datasets(data))
+    if asked.tokenizer is not None:
+        from hma_jax.tokenizers.io import load_config
+
+        study = on_tokenizer(study, load_config(asked.tokenizer))
+    study = override(study, asked.set)
+    if asked.mesh is not None:
+        sizes = dict(zip(("data", "fsdp", "tensor"), asked.mesh, strict=True))
+        mesh = replace(study.execution.mesh, **sizes)
+        study = replace(study, execution=replace(study.execution, mesh=mesh))
+    return Setting(asked, study, data, Workspace(asked.out))
+
+
+def use_entries(registry: Path | None) -> None:
+    """Adds the entries of a TOML file to the registry, for the rest of this process."""
+    if registry is not None:
+        from data_pipelines.registry import register
+        from data_pipelines.registry.toml_file import load_entries
+
+        register(load_entries(registry))
+
+
+def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:
+    """`<root>/<name>` for every name, in the first root that has it. ConfigError for those missing."""
+    from data_pipelines.rlds.location import locate
+
+    found = {n: locate(r) / n for r in reversed(roots) for n in names if (locate(r) / n).is_dir()}
+    missing = [n for n in names if n not in found]
+    if missing:
+        raise ConfigError(
+            f"no directory for {', '.join(missing)} in {', '.join(roots)}; with a mixture, --data takes the "
+            "directories that hold <name>/<version>"
+        )
+    return tuple(str(found[n]) for n in names)
+
+
+def short(path: Path) -> str:
+    """A path as a user would write it here."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def _word(value: Any) -> str:
+    if not isinstance(value, Path):
+        return str(value)
+    text = short(value)
+    return f"./{text}" if text.startswith("-") else text  # otherwise it reads as an option
