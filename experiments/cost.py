@@ -1,7 +1,8 @@
 """What a study will cost, before it runs: parameters, FLOPs and a time estimate per trial.
 
 Needs no data and no device: action sizes come from the registry, parameter counts from the declared
-model without making an array.
+model without making an array. Rates and times are those of the preset's machine (`Study.flops_per_second`,
+`Study.trial_seconds`); what is made before the first trial is not estimated.
 """
 
 from __future__ import annotations
@@ -56,24 +57,43 @@ ONE_ROBOT = EmbodimentTable((Embodiment("one_robot", 2, 1, mean=(0.0, 0.0), std=
 
 
 def estimate(trial: Trial) -> Cost:
-    """The cost of one trial, by formula (`hma_jax.model.flops`).
-
-    Evaluation of a window: one pass for the likelihood and, with the temporal cache, about
-    `unmask_steps` passes for each of the 1 + random_actions rollouts.
-    """
-    from hma_jax.model.flops import forward_flops_per_window, train_flops_per_window
+    """The cost of one trial, by formula (`hma_jax.model.flops`, `hma_jax.generation.flops`)."""
+    from hma_jax.model.flops import train_flops_per_window
     from hma_jax.model.hma import declare_model
 
-    table = declared_table(trial.datasets)
-    forward = forward_flops_per_window(trial.model, table)
-    rollouts = (1 + trial.eval.random_actions) * trial.eval.decode.unmask_steps
-    windows = len(trial.evaluated) * trial.eval.windows_per_dataset
+    table, config = declared_table(trial.datasets), trial.eval
+    rows = -(-config.windows_per_dataset // config.batch) * config.batch  # the last batch is filled up
+    if trial.measure_untrained:
+        rows += config.batch
     return Cost(
         parameters=declare_model(trial.model, table).count(),
         parameters_one_robot=declare_model(trial.model, ONE_ROBOT).count(),
         train_flops=train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
-        evaluation_flops=forward * windows * (1 + rollouts),
+        evaluation_flops=len(trial.evaluated) * rows * evaluation_flops_per_window(trial, table),
     )
+
+
+def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
+    """The protocol on one window: likelihood, predicted frames, those under random actions, and the policy."""
+    from hma_jax.evaluation.protocol import predicts_actions
+    from hma_jax.generation.flops import rollout_flops, sampler_flops
+    from hma_jax.model.flops import denoiser_flops, pass_flops
+
+    model, config, decode = trial.model, trial.eval, trial.eval.decode
+    frames, draws = model.frames, config.random_actions
+    beside = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, true or masked
+    flops = 2 * beside
+    if model.diffusion:
+        flops += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
+    if config.context == "recorded":
+        flops += (decode.unmask_steps - 1) * beside + (frames - 1) * sampler_flops(model, decode)
+        flops += draws * rollout_flops(model, table, decode, frames, frames - 1)
+    else:
+        flops += rollout_flops(model, table, decode, frames, config.prompt_frames, sequences=1 + draws)
+    if predicts_actions(model, trial.train.masking.setting):
+        copies = 1 if model.action_alignment == "causal" else 2
+        flops += copies * pass_flops(model, table, frames, frames / 2)
+    return flops
 
 
 def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
@@ -86,12 +106,13 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
         f"Study '{study.name}': {len(trials)} trials of {budget}",
         "trial", "sets", "videos", "width", "params", "one robot", "FLOPs", "time",
     )  # fmt: skip
+    seconds = {id: c.flops / study.flops_per_second + study.trial_seconds for id, c in costs.items()}
     table.caption = (
-        f"Total {_flops(total)} for training and evaluation, about "
-        f"{_duration(total / study.flops_per_second)} of computing at {_flops(study.flops_per_second)}/s "
-        "sustained (flops_per_second; compilation and data not counted). 'One robot': parameters with a "
-        "single embodiment of 2 action dimensions. 'Videos' are per dataset. 'Control': trained on shuffled "
-        "actions."
+        f"About {_duration(sum(seconds.values()))} for the trials, one after the other: {_flops(total)} at "
+        f"{_flops(study.flops_per_second)}/s (flops_per_second), and {study.trial_seconds:g} s for each to start, "
+        "compile and write (trial_seconds). Not counted: simulating, tokenizer and tokens, before the first of them. "
+        "'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are per dataset. "
+        "'Control': trained on shuffled actions."
     )
     seeds = {trial.train.seed for trial in trials.values()}
     shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in seeds}
@@ -106,7 +127,7 @@ def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
             _flops(cost.flops).removesuffix("FLOP"),
-            _duration(cost.flops / study.flops_per_second),
+            _duration(seconds[id]),
         )
     return table
 

@@ -40,6 +40,7 @@ SMOKE = Study(
     ablation_seeds=(0, 1),
     transfer=TransferConfig(rates=3, widths=(8, 16, 32), datasets=1),
     flops_per_second=2e9,
+    trial_seconds=15.0,
 )
 
 CPU = Study(
@@ -67,6 +68,7 @@ CPU = Study(
     widths=(24, 32, 64, 96),
     transfer=TransferConfig(datasets=10, steps=400),
     flops_per_second=2.5e10,
+    trial_seconds=60.0,
 )
 
 ACCELERATOR = Study(

@@ -100,7 +100,8 @@ class Study:
     ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
     transfer: TransferConfig = field(default_factory=TransferConfig)
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)  # how trials are computed; names none
-    flops_per_second: float = 1e13  # sustained; only for the cost estimates of --dry-run
+    flops_per_second: float = 1e13  # sustained; as the next only for the estimates of --dry-run
+    trial_seconds: float = 120.0  # of a trial, besides computing: start, compilation, decoding, files
 
     def __post_init__(self):
         for axis in ("dataset_counts", "trajectory_counts", "widths", "seeds", "ablation_seeds"):
@@ -247,11 +248,13 @@ def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequenc
         found = [k for k in known if k.split(".")[-1] == leaf]
         return [k for k in found if group and k.startswith(f"{group}.")] or found
 
+    whole = ".".join([group, *rest]).strip(".")
     return (
         [k for k in known if k.endswith("." + ".".join(rest)) and len(rest) > 1]  # the end of a path
+        or (difflib.get_close_matches(whole, known, n=1, cutoff=0.9) if len(rest) > 1 else [])
         or list(dict.fromkeys(beside(0.85) + named(last)))  # a typing error, or the right name in the wrong place
         or (beside(0.6) if group else [])
-        or difflib.get_close_matches(".".join([group, *rest]).strip("."), known, n=3, cutoff=0.8)
+        or difflib.get_close_matches(whole, known, n=3, cutoff=0.8)
         or [k for leaf in difflib.get_close_matches(last, leaves, n=1, cutoff=0.8) for k in named(leaf)]
     )
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,8 @@ from experiments.bench.timing import Compiled, compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
 from hma_jax.generation import rollout_naive, steps
 from hma_jax.generation.cache import Window
-from hma_jax.model.flops import forward_flops_per_window
+from hma_jax.generation.flops import Way, frame_flops
+from hma_jax.model.flops import pass_flops
 from hma_jax.model.hma import HMA, declare_model
 
 
@@ -72,15 +73,9 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
         calls[function.__name__] = _with_own_cache(call, weights, cache)
     timings = time_by_turns(calls, repeats)
 
-    one_pass = rows * forward_flops_per_window(config, subject.table)
-    looks, per_frame = decode.unmask_steps, one_pass / size
-    flops = {
-        "whole": one_pass,
-        "plain": one_pass,
-        "recompute": looks * one_pass,
-        "slide": one_pass + (looks - 1) * per_frame,
-        "fill": (looks + 1) * per_frame,
-        "stream": (looks + 1) * per_frame,
+    one_pass = rows * pass_flops(config, subject.table, size, size / 2)
+    flops = {"whole": one_pass, "plain": one_pass} | {
+        way: rows * frame_flops(config, subject.table, decode, way) for way in get_args(Way)
     }
     frames = dict.fromkeys(calls, rows) | {"whole": 0, "plain": 0}
     return make_stages(rows, compiled, timings, frames=frames, flops=flops)

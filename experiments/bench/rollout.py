@@ -12,7 +12,7 @@ from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import Compiled, compile_call, time_by_turns
 from hma_jax.config import DecodeConfig
 from hma_jax.generation import rollout, rollout_naive
-from hma_jax.model.flops import forward_flops_per_window
+from hma_jax.generation.flops import rollout_flops
 
 
 def time_rollouts(
@@ -26,10 +26,9 @@ def time_rollouts(
         name: compile_rollout(subject, rows, frames, prompt, decode, naive=way) for name, way in ways.items()
     }
     timings = time_by_turns({n: lambda c=c: c(weights) for n, c in compiled.items()}, repeats)
-    per_window = rows * forward_flops_per_window(subject.config, subject.table)
     flops = {
-        "rollout": _passes(frames, prompt, subject.config.frames, decode) * per_window,
-        "recompute": (frames - prompt) * decode.unmask_steps * per_window,
+        name: rows * rollout_flops(subject.config, subject.table, decode, frames, prompt, naive=way)
+        for name, way in ways.items()
     }
     frames_made = dict.fromkeys(compiled, rows * (frames - prompt))
     return make_stages(rows, compiled, timings, frames=frames_made, flops=flops)
@@ -50,15 +49,6 @@ def compile_rollout(
         return rollout_naive(declared.merge(params), start, batch["actions"], *rest)
 
     return compile_call(recompute if naive else cached, subject.inference_params)
-
-
-def _passes(frames: int, prompt: int, window: int, decode: DecodeConfig) -> float:
-    """Window passes that `rollout` amounts to."""
-    looks = decode.unmask_steps
-    filled = min(frames, window) - prompt
-    slid = max(frames - window, 0)
-    one = (1 + (looks - 1) / window) if decode.slide == "exact" else (looks + 1) / window
-    return ((prompt - 1) + filled * (looks + 1)) / window + slid * one
 
 
 def agreement(subject: Subject, rows: int, frames: int, prompt: int, decode: DecodeConfig) -> float:

@@ -12,7 +12,7 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import TrainConfig
-from hma_jax.model.flops import forward_flops_per_window, train_flops_per_window
+from hma_jax.model.flops import pass_flops, train_flops_per_window
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.masking import mask_batch
@@ -37,10 +37,11 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
 
         return forward
 
+    plain = declare_model(config, table, replace(subject.execution, attention="plain"))
     state = init_state(declared, table, subject.seed)
     compiled = {
         "forward": compile_call(passes(declared), state.params, batch),
-        "plain": compile_call(passes(declare_model(config, table, replace(subject.execution, attention="plain"))), state.params, batch),
+        "plain": compile_call(passes(plain), state.params, batch),
         "step": compile_call(make_train_step(declared, table, config, settings), state, batch, donate=(0,)),
     }
     kept = [state]
@@ -53,6 +54,6 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
         name: lambda c=compiled[name]: c(kept[0].params, batch) for name in ("forward", "plain")
     }
     timings = time_by_turns(calls | {"step": one_step}, repeats)
-    one_pass = rows * forward_flops_per_window(config, table)
+    one_pass = rows * pass_flops(config, table, config.frames, config.frames / 2)
     flops = {"forward": one_pass, "plain": one_pass, "step": rows * train_flops_per_window(config, table)}
     return make_stages(rows, compiled, timings, frames=dict.fromkeys(flops, rows * config.frames), flops=flops)

@@ -15,32 +15,41 @@ from hma_jax.model.heads import TIME_FEATURES
 
 
 def forward_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float:
-    """One forward pass over one window of T frames."""
-    d, t, p = config.width, config.frames, config.frame_tokens
+    """One forward pass over one window of T frames; with latents also the denoiser, as often as in training."""
+    t, diffusion = config.frames, config.diffusion
+    denoiser = denoiser_flops(config, diffusion.repeats * t * config.tokens) if diffusion else 0.0
+    return pass_flops(config, table, t, t / 2) + denoiser
+
+
+def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: float) -> float:
+    """One pass over `frames` frames of one window, up to logits or, with latents, conditions.
+
+    `seen`: frames that one attends to over time, itself among them, on average; T / 2 in a causal window of T.
+    """
+    d, p = config.width, config.frame_tokens
     attention = 2 * 4 * d * d  # q, k, v and output, spatial and temporal
     mlp = 2 * d * config.mlp_width
-    scores = 2 * p * d + 2 * t * d / 2  # logits and weighted values; causal time counts half
+    scores = 2 * p * d + 2 * seen * d  # logits and weighted values
     per_token, per_frame = attention + mlp + scores, 0.0
     if "modulate" in config.conditioning:
         per_token += d * d
         per_frame += 3 * d * d  # shift and scale are made once per frame
     elif config.conditioning == "cross_attention":
-        per_token += 2 * d * d + 2 * t * d / 2
+        per_token += 2 * d * d + 2 * seen * d
         per_frame += 2 * d * d
     stem = table.action_width * d + d * d
-    trunk = config.layers * (p * per_token + per_frame)
-    return 2.0 * t * (trunk + stem + _frame_head_flops(config))
+    if config.diffusion:
+        ends = config.tokens * (config.diffusion.token_channels * d + d * d)  # embedding and conditions
+    else:
+        ends = config.tokens * d * config.factors * config.factor_vocab
+    return 2.0 * frames * (config.layers * (p * per_token + per_frame) + stem + ends)
 
 
-def _frame_head_flops(config: ModelConfig) -> float:
-    """Multiply-adds per frame, embedding included. The denoiser is run once on every token."""
-    d, diffusion = config.width, config.diffusion
-    if diffusion is None:
-        return config.tokens * d * config.factors * config.factor_vocab
-    w, c = diffusion.width, diffusion.token_channels
-    blocks = diffusion.depth * 5 * w * w
-    denoiser = (TIME_FEATURES + w + d + c) * w + blocks + 2 * w * w + 2 * w * c
-    return config.tokens * (c * d + d * d + diffusion.repeats * denoiser)
+def denoiser_flops(config: ModelConfig, tokens: int) -> float:
+    """One evaluation of the denoiser on so many tokens."""
+    d, w, c = config.width, config.diffusion.width, config.diffusion.token_channels
+    blocks = config.diffusion.depth * 5 * w * w
+    return 2.0 * tokens * ((TIME_FEATURES + w + d + c) * w + blocks + 2 * w * w + 2 * w * c)
 
 
 def train_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float:
