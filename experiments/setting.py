@@ -101,7 +101,12 @@ class Setting:
 
 def command(name: str, *arguments: str | Path) -> str:
     """The command line `hma NAME ARGUMENTS`, quoted for a shell."""
-    return shlex.join([PROGRAM, *name.split(), *map(_word, arguments)])
+    return f"{PROGRAM} {name} {command_words(*arguments)}".strip()
+
+
+def command_words(*arguments: str | Path) -> str:
+    """Arguments as they are written in a shell; a path as short as it can be here."""
+    return shlex.join(map(_word, arguments))
 
 
 def make_setting(where: Where) -> Setting:

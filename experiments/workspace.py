@@ -95,8 +95,8 @@ class Workspace:
             there = next(p for p in (self.root, *self.root.parents) if p.exists())
             what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
             raise ConfigError(
-                f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, or make {there} a "
-                "directory where you may write"
+                f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, in a directory where "
+                "you may write"
             ) from error
         with lock:
             try:

@@ -128,8 +128,7 @@ def _words(error: Exception) -> str:
         return f"{error} (Here: --set store.corrupt=skip.)"
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
-        what = "cannot be read or written" if place else "a file cannot be read or written"
-        return f"{place}{what} ({error.strerror}); check the path, its permissions and the space on its disk"
+        return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
     return str(error)
 
 

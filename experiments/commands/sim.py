@@ -8,7 +8,7 @@ from pathlib import Path
 
 from experiments.commands.study import wrote
 from experiments.progress import console, step
-from experiments.setting import command
+from experiments.setting import command, command_words
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,10 @@ def write_sim(
         for path in paths:
             draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
         draw_sheet(paths, out / SHEET)
-    study = command("study", "--preset", chosen.study, "--out", "runs/sim", "--data", *paths)
-    wrote(*paths, out / SHEET, then=study)
+    everything = sorted(paths) == sorted(out.glob(f"*/{paths[0].name}"))  # then a pattern says it shorter
+    data = f"{command_words(out)}/*/{paths[0].name}" if everything else command_words(*paths)
+    study = command("study", "--preset", chosen.study, "--out", "runs/sim")
+    wrote(*paths, out / SHEET, then=f"{study} --data {data}")
 
 
 def print_table(directory: Path) -> None:

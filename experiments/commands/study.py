@@ -75,8 +75,8 @@ def run_study(
         if "datasets" in axes:
             require_judged(study, workspace)
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
-            changed = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and are run again"
-            console.print(changed, markup=False, soft_wrap=True)
+            what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
+            console.print(what, markup=False, soft_wrap=True)
         all_axes = tuple(dict.fromkeys([*(earlier.axes if earlier else ()), *axes]))
         record = Record(study, setting.data, all_axes, command_line(), provenance)
         save_record(workspace, record)

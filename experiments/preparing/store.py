@@ -89,5 +89,7 @@ def _differences(
         except DataError as error:  # damaged, or of an older format
             lines = [str(error)]
         for line in lines:
+            if line.startswith("settings."):
+                line = f"store.{line.removeprefix('settings.')}"  # as --set calls it
             found.setdefault(line, []).append(spec.name)
     return [f"{line} ({few(names)})" for line, names in found.items()]

@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +16,9 @@ from experiments import pipeline
 from experiments.cli.main import main
 from experiments.commands import study as commands
 from experiments.ledger import Ledger
+from experiments.preparing import windows
 from experiments.runner import read_states
+from experiments.setting import Where, make_setting
 from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
@@ -43,7 +46,8 @@ def test_help_needs_no_jax():
     [
         (["study", "--preset", "smoke", "--set", "model.frame=4"], 2, "did you mean model.frames"),
         (["study", "--preset", "paper"], 2, "--data"),
-        (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot write"),
+        (["study", "--preset", "smoke", "--out", "{file}/out"], 2, "cannot write to {file}/out: {file} is a file"),
+        (["tokenize", "--preset", "smoke", "--out", "/proc/x/y"], 2, "nothing can be written in /proc (No such file"),
         (["study", "--preset", "smoke", "--data", "{empty}"], 1, "{empty}"),
         (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
@@ -158,6 +162,7 @@ def instant_trials(monkeypatch):
         return read_states([job.id for job in jobs], trials, Ledger(ledger.path))
 
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: PROVENANCE)
+    monkeypatch.setattr(windows, "require_judged", lambda *_: None)
     monkeypatch.setattr(commands, "run_missing", run_missing)
 
 
@@ -182,5 +187,71 @@ def test_axes_of_one_study_share_a_report(instant_trials, tmp_path):
             [path.unlink() for path in trial.iterdir()]
             trial.rmdir()
     assert load_record(Workspace(tmp_path)).axes == ("trajectories", "datasets")
-    main(["sweep", "width", "--preset", "smoke", "--out", str(tmp_path), "--set", "tau=1"])
-    assert load_record(Workspace(tmp_path)).axes == ("width",)  # another study: nothing in common
+
+
+def test_a_study_of_other_settings_is_not_drawn_over(instant_trials, tmp_path, capsys):
+    smoke = ["--preset", "smoke", "--out", str(tmp_path)]
+    assert main(["sweep", "settings", *smoke]) == 0
+    page = (tmp_path / "report.html").read_bytes()
+    capsys.readouterr()
+    other = ["sweep", "conditioning", *smoke, "--set", "train.steps=7"]
+    assert main(other) == 2
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'study.json'}: " in said and "train.steps: 3 -> 7" in said and "--replace study" in said
+    assert (tmp_path / "report.html").read_bytes() == page
+    assert load_record(Workspace(tmp_path)).axes == ("settings",)
+    assert main([*other, "--replace", "study"]) == 0
+    assert load_record(Workspace(tmp_path)).axes == ("conditioning",)  # nothing in common
+
+
+def test_settings_that_no_axis_so_far_depends_on_go_on_with_the_study(instant_trials, tmp_path):
+    smoke = ["--preset", "smoke", "--out", str(tmp_path)]
+    assert main(["sweep", "settings", *smoke]) == 0
+    for trial in (tmp_path / "trials").iterdir():
+        [path.unlink() for path in trial.iterdir()]
+        trial.rmdir()
+    assert main(["sweep", "conditioning", *smoke, "--set", "widths=8,32", "--set", "flops_per_second=1"]) == 0
+    assert load_record(Workspace(tmp_path)).axes == ("settings", "conditioning")
+
+
+def test_a_record_that_cannot_be_read_is_not_replaced_either(instant_trials, tmp_path, capsys):
+    (tmp_path / "study.json").write_text('{"study": {"name": "of another version"}}')
+    assert main(["sweep", "settings", "--preset", "smoke", "--out", str(tmp_path)]) == 2
+    assert "damaged or of another version" in capsys.readouterr().err
+    assert "of another version" in (tmp_path / "study.json").read_text()
+
+
+def test_failed_trials_are_tried_again_by_the_command_that_is_printed(instant_trials, tmp_path, capsys, monkeypatch):
+    smoke = ["--preset", "smoke", "--out", str(tmp_path)]
+    assert main(["sweep", "width", *smoke, "--set", "widths=8,32", "--workers", "2"]) == 1
+    printed = capsys.readouterr().err.split("To try them again: ")[1].strip()
+    asked = {}
+
+    def run_study(setting, axes, **how):
+        asked.update(how, setting=setting, axes=axes)
+
+    monkeypatch.setattr(commands, "run_study", run_study)
+    assert main(shlex.split(printed)[1:]) == 0
+    assert asked["retry_failed"] and asked["workers"] == 2 and asked["axes"] == ("width",)
+    assert asked["setting"] == make_setting(Where("smoke", tmp_path, set=("widths=8,32",)))
+
+
+def test_sigterm_ends_like_an_interruption_with_a_last_word(tmp_path):
+    """Before, the process was just gone, and its trials with it, without a word."""
+    program = (
+        "import sys, time; from experiments.cli import main; from experiments.commands import study\n"
+        "def run(*_, **__):\n"
+        "    print('at work', flush=True)\n"
+        "    try: time.sleep(60)\n"
+        "    finally: print('saved', flush=True)\n"
+        "study.run_study = run\n"
+        "sys.exit(main.main(['study', '--preset', 'smoke']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "at work\n"
+    process.terminate()
+    out, said = process.communicate(timeout=60)
+    assert (process.returncode, out) == (143, "saved\n")
+    assert said == "stopped by SIGTERM; the same command goes on from here\n"

@@ -19,9 +19,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
-from experiments.preparing import tokenizer, windows
 from experiments.cli.main import main
 from experiments.commands import registry as registry_commands
+from experiments.preparing import tokenizer, windows
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
 from tests.data_pipelines.fakes import make_spec, write_rlds
@@ -226,8 +226,10 @@ def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
     said = capsys.readouterr().out
     assert f"{BASE.name}: 2 of 2 training episodes are too short for 4 frames" in said
     assert "it is not evaluated: 4 frames need 8 native frames" in said
+    assert f"1 of 2 datasets can be trained on; {BASE.name} has no training window" in said
+    assert f"held out, not trained on: 2 of 6 episodes of {ARM.name}, 2 of 4 episodes of {BASE.name}" in said
     facts = json.loads((out / "data.json").read_text())
-    assert facts[BASE.name] == {"episodes": 2, "too_short": 2, "windows": 0, "skipped": 0}
+    assert facts[BASE.name] == {"episodes": 2, "too_short": 2, "windows": 0, "held_out": 2, "skipped": 0}
     assert facts[ARM.name]["too_short"] == 0 and facts[ARM.name]["windows"] > 0
 
 
@@ -275,9 +277,8 @@ def test_evaluation_without_what_was_prepared(name, study, tmp_path, refused):
     other = tmp_path / "out"
     shutil.copytree(out, other)
     shutil.rmtree(other / name) if (other / name).is_dir() else (other / name).unlink()
-    code = 2 if name == "tokenizer" else 1
-    message = refused(code, "evaluate", out / "model", *SMOKE, "--out", other, *data)
-    assert str(other / name) in message
+    message = refused(2, "evaluate", out / "model", *SMOKE, "--out", other, *data)
+    assert f"{other / name}: not made yet; run `hma tokenize --preset smoke --out {other} --data {data[1]}" in message
 
 
 def test_report_of_an_empty_directory(tmp_path, refused):
@@ -310,7 +311,7 @@ def test_training_is_not_resumed_on_other_data(study, tmp_path, refused):
     out, data = study
     other = shutil.copytree(out, tmp_path / "out")
     longer = write_rlds(tmp_path, ARM, [20] * 6)
-    message = refused(2, "train", *SMOKE, "--out", other, "--data", longer, data[-1])
+    message = refused(2, "train", *SMOKE, "--out", other, "--data", longer, data[-1], "--replace", "tokenizer")
     assert "provenance.store: " in message and str(other / "model") in message
 
 
@@ -338,7 +339,8 @@ def prepared_otherwise(study, root: Path, *settings: str, data: tuple[str, ...] 
     """A study that was prepared in another way."""
     other = shutil.copytree(study[0], root / "out")
     changes = [word for setting in settings for word in ("--set", setting)]
-    assert main(["tokenize", *SMOKE, "--out", str(other), *(data or study[1]), *changes]) == 0
+    where = ["--out", str(other), *(data or study[1]), *changes]
+    assert main(["tokenize", *SMOKE, *where, "--replace", "tokenizer"]) == 0
     return other
 
 

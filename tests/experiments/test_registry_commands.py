@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -11,8 +12,8 @@ from PIL import Image
 from data_pipelines.inspection.inspect import Shown
 from data_pipelines.registry import table as registry_table
 from experiments.cli.main import main
-from experiments.setting import Where, find_directories, make_setting
 from experiments.contact_sheet import TILE, draw_sheet
+from experiments.setting import Where, find_directories, make_setting
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
 
@@ -60,6 +61,30 @@ def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, 
     manifest = json.loads((tmp_path / "out" / "tokens" / "my_robot" / "manifest.json").read_text())
     assert manifest["spec"]["action_keys"] == ["action[:3]"] and len(manifest["action_mean"]) == 3
     assert f"--registry {entries}" in capsys.readouterr().out
+
+
+def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["--hz", "4", "--entry", "my entries.toml", "--frames", "3", "--out", "sheets"]
+    assert main(["data", "inspect", "data/my_robot", *arguments]) == 0
+    said = capsys.readouterr().out
+    directory = tmp_path / "data" / "my_robot" / "1.0.0"
+    assert said.splitlines()[-1] == (
+        f"next: hma tokenize --preset cpu --out runs/cpu --data {directory} --registry 'my entries.toml' "
+        "--set model.frames=3 --set eval.prompt_frames=1"
+    )
+    tokenise = shlex.split(said.splitlines()[-1].removeprefix("next: hma "))
+    small = ["--set", "tokenizer_train.steps=1", "--set", "store.min_val=2"]
+    monkeypatch.setattr("experiments.preparing.tokenizer.QUALITY_FRAMES", 8)
+    assert main([*tokenise, *small]) == 0
+
+
+def test_inspection_of_episodes_without_a_window_suggests_no_command(robot, tmp_path, capsys):
+    arguments = ["--hz", "4", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
+    assert main(["data", "inspect", str(robot), *arguments]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "about 0 windows" in said and "hma tokenize" not in said
+    assert "next: nothing yet. No episode that was read is as long as a window of 9 frames; frames=7 would fit." in said
 
 
 def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsys):

@@ -22,7 +22,7 @@ def test_datasets_and_contact_sheets_are_written_and_named(tmp_path, monkeypatch
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "2 of 2 episodes" in said
-    assert f"next: hma study --preset smoke --data {tmp_path}/*/1.0.0" in said
+    assert f"next: hma study --preset smoke --out runs/sim --data {tmp_path}/*/1.0.0" in said
     assert (tmp_path / "overview.png").stat().st_size > 0
     found = sorted(p.name for p in (tmp_path / "pusht").iterdir())
     assert found == ["1.0.0", "contact.png", "stats.json"]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 
 from experiments import scale_datasets, scale_trajectories, scale_width
-from experiments.setting import Preset
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.provenance import Provenance
+from experiments.setting import Preset
 from experiments.study import on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
 from experiments.trial import trial_id
@@ -94,7 +94,9 @@ def test_override_sets_nested_fields_and_lists():
         ("model.mup.enabled=3", "expected a value like"),
         ("eval.prompt_frames=4", "leaves nothing to predict"),
         ("model.tokens=9", "the tokenizer makes 16"),
-        ("widths=4,8", "must contain model.width"),
+        ("model=4", "that is a group of settings"),
+        ("tau.x=4", "tau is a value, 3.0"),
+        ("model.diffusion.width=4", "model.diffusion is null in this study"),
         ("trajectory_counts=8,4", "must increase"),
         ("train.optimizer.schedule=linear", "train.optimizer.schedule: 'linear'.*constant, cosine, wsd"),
         ("store.corrupt=ignore", "store.corrupt: 'ignore'.*raise, skip"),
@@ -106,6 +108,46 @@ def test_override_sets_nested_fields_and_lists():
 def test_wrong_override_names_the_field(setting, message):
     with pytest.raises(ConfigError, match=message):
         override(SMOKE, [setting])
+
+
+@pytest.mark.parametrize(
+    ("path", "meant"),
+    [
+        ("learning_rate", ["train.optimizer.learning_rate", "tokenizer_train.learning_rate"]),
+        ("train.learning_rate", ["train.optimizer.learning_rate"]),
+        ("optimizer.learning_rate", ["train.optimizer.learning_rate"]),
+        ("tokeniser.bits", ["tokenizer.bits"]),
+        ("tokenizer_trian.steps", ["tokenizer_train.steps"]),
+        ("transfer.width", ["transfer.widths", "model.width"]),
+        ("frame", ["model.frames"]),
+        ("mesh.data", ["execution.mesh.data"]),
+    ],
+)
+def test_unknown_setting_suggests_what_was_meant(path, meant):
+    with pytest.raises(ConfigError, match=f"did you mean {' or '.join(meant)}\\?$"):
+        override(SMOKE, [f"{path}=1"])
+
+
+@pytest.mark.parametrize(("path", "around"), [("foo", "a study has name, model.*,"), ("train.lr", "train has steps,")])
+def test_unknown_setting_like_no_other_lists_those_around_it_only(path, around):
+    with pytest.raises(ConfigError) as refusal:
+        override(CPU, [f"{path}=1"])
+    assert around in str(refusal.value) and str(refusal.value).count(", ") < 25
+
+
+def test_the_widths_of_a_sweep_do_not_bound_a_single_model():
+    study = override(CPU, ["model.width=128"])
+    assert reference_trial(study, 0).model.width == 128
+    points = {p.x: p.trial for p in scale_width.plan(study).points}
+    assert list(points) == [24, 32, 64, 96, 128]
+    assert points[128].model == study.model
+
+
+def test_the_number_of_datasets_is_checked_by_the_axis_that_counts_them():
+    study = override(SMOKE, ["datasets=a,b"])
+    assert reference_trial(study, 0).datasets == ("a", "b")
+    with pytest.raises(ConfigError, match=r"the last of dataset_counts \(2, 3\) must be the number of datasets, 2"):
+        scale_datasets.plan(study)
 
 
 @pytest.mark.parametrize(

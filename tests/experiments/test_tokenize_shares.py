@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.preparing import sources
 from experiments.cli.main import main
-from experiments.setting import Where, make_setting
+from experiments.preparing import sources
 from experiments.progress import Pace
+from experiments.setting import Where, make_setting
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
@@ -27,7 +27,8 @@ def test_shares_make_the_store_and_the_last_one_finishes_it(data, tmp_path, caps
     shares = [["tokenize", *SMOKE, *out, "--process", str(i), "--processes", "2"] for i in (0, 1)]
     assert main(shares[0]) == 2
     message = capsys.readouterr().err
-    assert "no tokenizer" in message and "hma tokenizer train --preset smoke" in message
+    assert "no tokenizer" in message
+    assert f"hma tokenizer train --preset smoke --out {tmp_path / 'out'} --data {data[1]} {data[2]}" in message
     assert main(["tokenizer", "train", *SMOKE, *out]) == 0
     said = []
     for share in shares:
@@ -65,13 +66,29 @@ def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
         root.fs.rm("/bucket", recursive=True)
 
 
-def test_store_of_an_older_format_is_made_again(data, tmp_path):
+def test_store_of_an_older_format_is_made_again_when_asked_for(data, tmp_path, capsys):
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data[:2]]
     assert main(arguments) == 0
     before = contents(tmp_path / "tokens")
     manifest = tmp_path / "tokens" / ARM.name / "manifest.json"
     manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 1}))
+    capsys.readouterr()
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "manifest format 1; this reads 2" in said and "--replace tokens" in said
+    assert main([*arguments, "--replace", "tokens"]) == 0
+    assert contents(tmp_path / "tokens") == before
+
+
+def test_processes_that_share_the_work_replace_nothing(data, tmp_path, capsys):
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data[:2]]
     assert main(arguments) == 0
+    shared = [*arguments, "--process", "0", "--processes", "2", "--set", "store.frame_step=1"]
+    before = contents(tmp_path / "tokens")
+    assert main(shared) == 2
+    assert "store.frame_step: 2 -> 1" in capsys.readouterr().err
+    assert main([*shared, "--replace", "tokens"]) == 2
+    assert "replace nothing" in capsys.readouterr().err
     assert contents(tmp_path / "tokens") == before
 
 

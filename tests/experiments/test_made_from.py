@@ -1,0 +1,277 @@
+"""What was made with other settings or data is refused and stays, byte for byte, until it is asked for."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.registry import get_spec
+from data_pipelines.suite import generate as suite_generator
+from experiments import provenance
+from experiments.cli.main import main
+from experiments.preparing import tokenizer as tokenizer_step
+from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
+from tests.data_pipelines.fakes import write_rlds
+from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
+
+STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[Path, list[str]]:
+    """A directory in which `hma tokenize` ran with settings of its own."""
+    root = tmp_path_factory.mktemp("made")
+    robots = (ARM, get_spec("disc_pusher_delta_pixels"))
+    data = ["--data", *(str(write_rlds(root / "rlds", spec, LENGTHS)) for spec in robots)]
+    assert main(["tokenize", *SMOKE, "--out", str(root / "out"), *data, "--set", "tokenizer_train.steps=5"]) == 0
+    return root / "out", data
+
+
+@pytest.fixture
+def out(made, tmp_path) -> Path:
+    return shutil.copytree(made[0], tmp_path / "out")
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Everything that was made, but for what only a report reads."""
+    files = (p for p in root.rglob("*") if p.is_file() and p.name not in (".lock", "data.json"))
+    return {str(p.relative_to(root)): p.read_bytes() for p in files}
+
+
+@pytest.fixture
+def hma(out, made, capsys):
+    """Runs a command on the directory; returns (exit code, what it said)."""
+
+    def run(command: str, *arguments: str, steps: int = 5, data: list[str] | None = None) -> tuple[int, str]:
+        capsys.readouterr()
+        where = ["--out", str(out), *(made[1] if data is None else data), "--set", f"tokenizer_train.steps={steps}"]
+        code = main([*command.split(), *SMOKE, *where, *arguments])
+        said = capsys.readouterr()
+        return code, said.err if code else said.out
+
+    return run
+
+
+# --- Nothing to ask ----------------------------------------------------------------------------
+
+
+def test_the_same_again_changes_nothing(hma, out):
+    before = contents(out)
+    assert hma("tokenize")[0] == 0 and hma("tokenizer train")[0] == 0
+    assert contents(out) == before
+
+
+@pytest.mark.parametrize(
+    "setting",
+    ["train.steps=1", "train.batch=2", "model.mlp_ratio=2", "eval.decode.unmask_steps=3", "execution.dtype=bfloat16",
+     "seeds=5", "widths=16,32", "flops_per_second=1", "transfer.rates=5", "suite.scale=2", "store.max_skipped=3"],
+)  # fmt: skip
+def test_settings_that_nothing_prepared_depends_on_ask_for_nothing(setting, hma, out):
+    before = contents(out)
+    assert hma("tokenize", "--set", setting)[0] == 0
+    assert contents(out) == before
+
+
+def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
+    shutil.rmtree(out / "tokenizer")
+    publish = tokenizer_step._publish
+    monkeypatch.setattr(tokenizer_step, "_publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert hma("tokenize")[0] == 130
+    (aside,) = out.glob("tokenizer.*")
+    monkeypatch.setattr(tokenizer_step, "_publish", publish)
+    trained = (aside / "metrics.jsonl").stat().st_mtime_ns
+    assert hma("tokenize")[0] == 0
+    assert not aside.exists() and (out / "tokenizer" / "metrics.jsonl").stat().st_mtime_ns >= trained
+
+
+# --- Refused -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "step", "line"),
+    [
+        (["--set", "tokenizer_train.steps=3"], "tokenizer", "tokenizer_train.steps: 5 -> 3"),
+        (["--set", "tokenizer.channels=8"], "tokenizer", "tokenizer.channels: 16 -> 8"),
+        (["--set", "store.min_val=1"], "tokenizer", "store.min_val: 2 -> 1"),
+        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 2 -> 1 (two_link_arm_joint_targets, "),
+        (["--set", "eval.windows_per_dataset=1"], "windows", "eval.windows_per_dataset: 2 -> 1"),
+        (["--set", "eval.seed=7"], "windows", "eval.seed: 0 -> 7"),
+        (["--set", "model.frames=3"], "windows", "model.frames: 4 -> 3"),
+    ],
+)
+@pytest.mark.parametrize("command", ["tokenize", "train"])
+def test_what_other_settings_made_is_refused_by_name_and_stays(command, arguments, step, line, hma, out):
+    before = contents(out)
+    code, said = hma(command, *arguments)
+    assert code == 2 and f"\n  {line}" in said and f"--replace {step}" in said and "another --out" in said
+    assert contents(out) == before
+    for later in STEPS[STEPS.index(step) + 1 :]:
+        assert hma(command, *arguments, "--replace", later)[0] == 2
+    assert contents(out) == before
+
+
+def test_the_command_of_the_issue(hma, out):
+    """After a tokenizer of its own, the printed command without --set made another in its place, with exit code 0."""
+    before = contents(out)
+    code, said = hma("train", steps=3)
+    assert code == 2 and "tokenizer_train.steps: 5 -> 3" in said
+    assert contents(out) == before
+
+
+def test_other_data_is_refused(hma, out, made, tmp_path):
+    before, (_, arm, pusher) = contents(out), made[1]
+    code, said = hma("tokenize", data=["--data", arm])
+    assert code == 2 and "datasets: 2 -> 1, without disc_pusher_delta_pixels" in said and "--replace windows" in said
+    other = str(write_rlds(tmp_path, ARM, [20] * 6))
+    code, said = hma("tokenize", data=["--data", other, pusher])
+    assert code == 2 and f"data of {ARM.name}.shards: " in said and "--replace tokenizer" in said
+    assert contents(out) == before
+
+
+def test_replacing_replaces_that_and_what_follows_and_nothing_before(hma, out):
+    before = contents(out)
+    assert hma("tokenize", "--set", "store.frame_step=1", "--replace", "tokens")[0] == 0
+    after = contents(out)
+    changed = {name.split("/")[0] for name in before if before[name] != after.get(name)}
+    assert changed == {"tokens", "eval_manifest.json"}
+    assert hma("tokenize", "--set", "store.frame_step=1")[0] == 0  # as it is there now
+    assert hma("tokenize")[0] == 2
+    assert hma("tokenize", "--replace", "tokens")[0] == 0
+    assert contents(out) == before
+
+
+def test_a_tokenizer_that_is_given_does_not_replace_one_that_was_trained(hma, out, tmp_path):
+    settings = ["--set", "dataset_counts=1", "--set", "tokenizer_train.seed=1"]
+    assert main(["tokenizer", "train", *SMOKE, "--out", str(tmp_path / "b"), *settings]) == 0
+    before, given = contents(out), ["--tokenizer", str(tmp_path / "b" / "tokenizer")]
+    code, said = hma("tokenize", *given)
+    assert code == 2 and "(trained here) -> " in said and "--replace tokenizer" in said
+    assert contents(out) == before
+    assert hma("tokenize", *given, "--replace", "tokenizer")[0] == 0
+    code, said = hma("tokenize")
+    assert code == 2 and "origin: given with --tokenizer, identity " in said and " -> trained here" in said
+
+
+def test_the_tokenizer_that_is_there_can_be_given(hma, out):
+    before = contents(out)
+    assert hma("tokenize", "--tokenizer", str(out / "tokenizer"))[0] == 0
+    assert contents(out) == before
+
+
+# --- Sources and earlier versions --------------------------------------------------------------
+
+
+def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypatch):
+    before = contents(out)
+    monkeypatch.setattr(tokenizer_step, "source_hash", lambda *_: "edited")
+    code, said = hma("tokenize", "--set", "tau=2")
+    assert code == 0 and "made with other sources: " in said and "-> 'edited'" in said and "tau: 3.0 -> 2.0" in said
+    assert contents(out) == before
+    assert hma("tokenize", "--replace", "suite")[0] == 0
+    assert contents(out) == before  # nothing that was asked for differs
+    shutil.rmtree(out / "tokenizer")
+    assert hma("tokenize")[0] == 0 and "other sources" not in hma("tokenize")[1]
+
+
+def test_sources_of_the_tokenizer_are_its_own():
+    everything, own = provenance.source_hash(), provenance.source_hash(("hma_jax/tokenizers",))
+    assert everything != own == provenance.source_hash(("hma_jax/tokenizers",))
+    assert provenance.source_hash(("experiments/trial.py",)) not in (everything, own)
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_a_tokenizer_that_does_not_say_what_it_was_made_from(old, hma, out):
+    (out / "tokenizer" / STAMP).unlink()
+    if old:  # as earlier versions left it
+        (out / "tokenizer" / OLD_STAMP).write_text("0123456789abcdef")
+    before = contents(out)
+    code, said = hma("tokenize")
+    assert code == 2 and "it is not written down there" in said and ("as of earlier versions" in said) == old
+    assert contents(out) == before
+    use_it = ["--tokenizer", str(out / "tokenizer")]
+    assert f"--tokenizer {out / 'tokenizer'}" in said and hma("tokenize", *use_it)[0] == 0
+    assert contents(out) == before
+
+
+def test_windows_that_were_edited_are_not_repaired_without_being_asked(hma, out):
+    manifest = out / "eval_manifest.json"
+    text = manifest.read_text()
+    manifest.write_text(text.replace('"seed": 0', '"seed": 1'))
+    code, said = hma("tokenize")
+    assert code == 2 and "it was changed" in said and "--replace windows" in said
+    assert hma("tokenize", "--replace", "windows")[0] == 0
+    assert manifest.read_text() == text
+
+
+# --- The suite ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("suite")
+    assert main(["data", "suite", *SMOKE, "--out", str(root), "--set", "dataset_counts=1"]) == 0
+    return root
+
+
+def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp_path, capsys):
+    out = shutil.copytree(suite, tmp_path / "out")
+    before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "dataset_counts=1"]
+    assert main([*command, "--set", "suite.seed=3", "--set", "suite.scale=0.1"]) == 2
+    said = capsys.readouterr().err
+    assert "suite.seed: 0 -> 3" in said and "suite.scale: 8 -> " in said and "--replace suite" in said
+    assert contents(out) == before
+    assert main([*command, "--set", "suite.seed=3", "--replace", "suite"]) == 0
+    assert contents(out) != before
+    assert main([*command, "--replace", "suite"]) == 0
+    assert contents(out) == before
+
+
+def test_a_suite_of_an_earlier_simulator_stays_in_use_and_says_so(suite, tmp_path, capsys, monkeypatch):
+    out = shutil.copytree(suite, tmp_path / "out")
+    before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "dataset_counts=1"]
+    monkeypatch.setattr(suite_generator, "GENERATOR", suite_generator.GENERATOR + 1)
+    assert main(command) == 0
+    assert "made by an earlier version of the simulator" in " ".join(capsys.readouterr().out.split())
+    assert contents(out) == before
+    (out / "suite").joinpath("nothing").mkdir()  # a missing one is made
+    assert main([*command[:-1], "dataset_counts=2"]) == 0
+    assert {k: v for k, v in contents(out).items() if k in before} == before
+
+
+def test_a_dataset_that_lost_a_shard_is_made_again(suite, tmp_path):
+    out = shutil.copytree(suite, tmp_path / "out")
+    before = contents(out)
+    next((out / "suite").rglob("*.tfrecord-*")).unlink()
+    assert main(["data", "suite", *SMOKE, "--out", str(out), "--set", "dataset_counts=1"]) == 0
+    assert contents(out) == before
+
+
+# --- Words -------------------------------------------------------------------------------------
+
+
+def test_differences_of_many_datasets_are_one_line():
+    names = [f"robot_{i}" for i in range(50)]
+    assert dataset_differences(names, names) == []
+    assert dataset_differences(names, names[::-1]) == ["datasets: 50 -> 50, in another order"]
+    (line,) = dataset_differences(names, [*names[5:], "new"])
+    assert line == "datasets: 50 -> 46, without robot_0, robot_1, robot_2 and 2 more and with new"
+    both = {"origin": "trained here", "datasets": names, "data": {n: {"shards": n} for n in names}, "x": {"y": 1}}
+    other = both | {"datasets": names[1:], "data": {n: {"shards": "other"} for n in names[49:]}, "x": {"y": 2}}
+    assert differences(both, other) == [
+        "x.y: 1 -> 2", "datasets: 50 -> 49, without robot_0", "data of robot_49.shards: 'robot_49' -> 'other'",
+    ]  # fmt: skip
+
+
+def test_to_replace_a_step_is_to_replace_what_is_made_of_it():
+    allowed = {asked: [step for step in STEPS if may_replace(step, asked)] for asked in STEPS}
+    assert allowed == {step: list(STEPS[i:]) for i, step in enumerate(STEPS)}
+    assert not any(may_replace(step, None) for step in STEPS)
+
+
+def test_the_stamp_holds_the_inputs(made):
+    stamp = json.loads((made[0] / "tokenizer" / STAMP).read_text())
+    assert stamp["inputs"]["tokenizer_train"]["steps"] == 5
+    assert stamp["inputs"]["datasets"] == [ARM.name, "disc_pusher_delta_pixels"]
+    assert set(stamp["recorded"]) == {"tau", "sources"}
+    assert BASE.name not in stamp["inputs"]["data"]

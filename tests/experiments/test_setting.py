@@ -1,0 +1,148 @@
+"""A printed command asks for exactly what the user asked for: parsed again, it gives an equal Setting."""
+
+import dataclasses
+import itertools
+import os
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.registry import get_mixture, get_spec
+from experiments import setting as settings
+from experiments.cli.main import main
+from experiments.commands import model as model_commands
+from experiments.commands import study as study_commands
+from experiments.commands import tokenize as tokenize_commands
+from experiments.setting import Setting, Where, make_setting
+from tests.data_pipelines.fakes import make_spec, write_rlds
+from tests.experiments.test_cli_errors import idle_training  # noqa: F401
+
+ARM = get_spec("two_link_arm_joint_targets")
+ENTRIES = """["my_robot"]
+image_key = "observation/image"
+action_keys = ["action"]
+action_dims = [3]
+hz = 4.0
+"""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> Path:
+    """A working directory with data, entries and a tokenizer, some under names that a shell takes apart."""
+    root = tmp_path_factory.mktemp("a place; with $pace")
+    write_rlds(root / "it's data", make_spec("my_robot", (3,)), [10] * 4)
+    write_rlds(root / "bridge", ARM, [10] * 4)
+    for name in get_mixture("dataset5"):
+        (root / "openx" / name).mkdir(parents=True)
+    (root / "my entries.toml").write_text(ENTRIES)
+    assert main(["tokenizer", "pixels", "--out", str(root / "-tok"), "--image-size", "16", "--patch", "4"]) == 0
+    return root
+
+
+# Values besides the default, for every field; a field without any fails the test below.
+SAMPLES = {
+    "preset": ["smoke-continuous"],
+    "out": [Path("runs/of mine"), Path("/tmp/x y/*"), Path("-out")],
+    "data": [("bridge/two_link_arm_joint_targets",), ("it's data/my_robot", "bridge/two_link_arm_joint_targets/1.0.0")],
+    "registry": [Path("my entries.toml")],
+    "mixture": ["dataset5"],
+    "tokenizer": [Path("-tok")],
+    "set": [
+        ("train.steps=7",),
+        ("widths=[8, 16]", "datasets=", 'model.diffusion={"channels": 8, "patch": 1}', "store.corrupt=skip"),
+        ("execution.dtype=bfloat16", "eval.decode.sampler.temperature=-0.0", "tau=1e1"),
+    ],
+    "mesh": [(-1, 1, 1), (2, -1, 4)],
+}
+
+
+def test_every_field_has_a_sample():
+    assert set(SAMPLES) == {field.name for field in dataclasses.fields(Where)}
+
+
+def combinations() -> list[Where]:
+    """Every value alone, every pair of values of two fields, and all fields at once."""
+    found = {}
+    for names in itertools.chain(((n,) for n in SAMPLES), itertools.combinations(SAMPLES, 2), [tuple(SAMPLES)]):
+        for values in itertools.product(*(SAMPLES[n] for n in names)):
+            found[repr((names, values))] = Where(**{"preset": "smoke"} | dict(zip(names, values, strict=True)))
+    return list(found.values())
+
+
+def asked_by(command: str, monkeypatch) -> Setting:
+    """The Setting that a command works on, from its text, through a shell's words and the real parser."""
+    seen = []
+    for module, name in ((study_commands, "run_study"), (tokenize_commands, "tokenize"), (model_commands, "train"),
+                         (model_commands, "evaluate"), (study_commands, "train_tokenizer")):  # fmt: skip
+        where = 0
+        monkeypatch.setattr(module, name, lambda *args, where=where, **_: seen.append(args[where]))
+    program, *words = shlex.split(command)
+    assert program == "hma" and main(words) == 0, command
+    (setting,) = seen
+    return setting
+
+
+@pytest.fixture
+def anything_goes(monkeypatch):
+    """Some combinations make no study (a mixture of data that is not there); what is tested is what is asked."""
+
+    def study_of(where: Where) -> Setting:
+        asked = where.anywhere()
+        return Setting(asked, settings.get_preset(asked.preset), (), settings.Workspace(asked.out))
+
+    for module in ("study", "data", "tokenizer", "bench"):
+        monkeypatch.setattr(f"experiments.cli.{module}.make_setting", study_of)
+    return study_of
+
+
+def test_a_printed_command_asks_for_the_same_again(world, monkeypatch, anything_goes):
+    monkeypatch.chdir(world)
+    cases = combinations()
+    assert len(cases) > 100
+    for where in cases:
+        setting = anything_goes(where)
+        assert asked_by(setting.command("tokenize"), monkeypatch) == setting, where
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        Where("smoke"),
+        Where("smoke", Path("out"), (f"bridge/{ARM.name}",), set=("train.steps=7", "widths=[8, 16]"), mesh=(-1, 1, 1)),
+        Where("smoke-continuous", None, ("it's data/my_robot",), Path("my entries.toml"), tokenizer=Path("-tok")),
+        Where("paper", Path("/tmp/x y"), ("openx",), mixture="dataset5", set=("seeds=0,1",)),
+    ],
+)
+def test_the_study_is_the_same_too(where, world, monkeypatch):
+    monkeypatch.chdir(world)
+    monkeypatch.setattr("data_pipelines.registry.table._registered", {})
+    setting = make_setting(where)
+    for name in ("tokenize", "train", "study", "sweep width", "tokenizer train"):
+        assert asked_by(setting.command(name), monkeypatch) == setting
+    assert asked_by(setting.command("evaluate", Path("-run").absolute()), monkeypatch) == setting
+
+
+def test_a_command_means_the_same_in_another_directory(world, monkeypatch, tmp_path):
+    monkeypatch.chdir(world)
+    setting = make_setting(Where("smoke", Path("out"), (f"bridge/{ARM.name}",), tokenizer=None))
+    monkeypatch.chdir(tmp_path)
+    assert asked_by(setting.command("train"), monkeypatch) == setting
+    assert str(world) in setting.command("train")
+
+
+def test_every_step_prints_a_next_one_that_drops_nothing(world, monkeypatch, capsys):
+    """From the first command to the last only by what is printed; every one of them dropped --set."""
+    monkeypatch.chdir(world)
+    where = ["--preset", "smoke", "--out", "by hand", "--set", "dataset_counts=1", "--set", "train.steps=2"]
+    words, ran = ["data", "suite", *where], []
+    while words[0] != "evaluate":
+        ran.append(words)
+        assert main(words) == 0
+        (command,) = re.findall(r"^next: (.*)$", capsys.readouterr().out, re.MULTILINE)
+        words = shlex.split(command)[1:]
+        assert words[-len(where) :] == where
+    assert [w[: -len(where)] for w in ran] == [["data", "suite"], ["tokenizer", "train"], ["tokenize"], ["train"]]
+    assert words[: -len(where)] == ["evaluate", os.path.join("by hand", "model")]
+    assert len((world / "by hand" / "model" / "metrics.jsonl").read_text().splitlines()) == 2
