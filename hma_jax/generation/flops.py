@@ -15,7 +15,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import denoiser_flops, pass_flops
 
 Way = Literal["fill", "slide", "stream", "recompute"]
-"""How a frame is made: as the methods of `window.Window`, or by passes over a whole window for every look."""
+"""How a frame is made: as in `hma_jax.generation.steps`, or by passes over a whole window for every look."""
 
 
 def frame_flops(

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import pytest
 
 from hma_jax.config import DecodeConfig, DiffusionConfig, ExecutionConfig, SamplerConfig
-from hma_jax.generation import rollout, rollout_naive
+from hma_jax.generation import rollout, rollout_naive, steps
+from hma_jax.generation.cache import Window
 from hma_jax.generation.flops import frame_flops, rollout_flops, sampler_flops
-from hma_jax.generation.window import Window, empty_cache
+from hma_jax.kernels.dense import CHUNK
 from hma_jax.model.flops import denoiser_flops, forward_flops_per_window, pass_flops
 from hma_jax.model.hma import declare_model
 from tests.tiny import TABLE, model_config, random_batch
@@ -80,7 +81,7 @@ class Case:
         return Window.over(self.declared.merge(params), self.batch["actions"], None, self.batch["embodiment"])
 
     def cache(self, params):
-        return empty_cache(self.declared.merge(params), ROWS, self.config.frames - 1)
+        return self.window(params).empty(ROWS, self.config.frames - 1)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -88,11 +89,18 @@ class Case:
 def test_a_pass_counts_exactly_what_is_multiplied(kind, conditioning):
     case = Case(diffusion=KINDS[kind], conditioning=conditioning)
     frames = case.config.frames
-    count = counted(lambda p: case.window(p).pass_over(case.batch["tokens"], None, 0).frames, case.params)
-    assert count == pass_flops(case.config, TABLE, frames, frames)  # what is masked is multiplied too
+    count = counted(lambda p: whole_pass(case, p), case.params)
+    padding = 2 * frames * (2 * CHUNK - TABLE.action_width) * case.config.width  # actions come in whole chunks
+    assert count == pass_flops(case.config, TABLE, frames, frames) + padding  # what is masked is multiplied too
     half = pass_flops(case.config, TABLE, frames, frames / 2)
     denoiser = denoiser_flops(case.config, frames * case.config.tokens) if KINDS[kind] else 0
     assert forward_flops_per_window(case.config, TABLE) == half + denoiser
+
+
+def whole_pass(case: Case, params) -> jax.Array:
+    batch = case.batch
+    model = case.declared.merge(params)
+    return model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"]).said
 
 
 def ways(case: Case, decode: DecodeConfig) -> dict:
@@ -101,9 +109,11 @@ def ways(case: Case, decode: DecodeConfig) -> dict:
     last = {"t": jnp.int32(size - 1), "key_B": case.keys, "decode": decode}
     robots = case.batch["embodiment"]
     return {
-        "fill": lambda p: case.window(p).fill(case.cache(p), newest, **last),
-        "stream": lambda p: case.window(p).stream(case.cache(p), newest, jnp.int32(size), case.keys, decode),
-        "slide": lambda p: case.window(p).slide(past, case.keys, decode),
+        "fill": lambda p: steps.fill(case.window(p), case.cache(p), newest, **last),
+        "stream": lambda p: steps.stream(
+            case.window(p), case.cache(p), newest, jnp.int32(size), case.keys, decode
+        ),
+        "slide": lambda p: steps.slide(case.window(p), past, case.keys, decode),
         "recompute": lambda p: rollout_naive(
             case.declared.merge(p), past, case.batch["actions"], robots, case.keys, decode
         ),
