@@ -56,7 +56,7 @@ CPU = Study(
         # stems that do not start near zero, and the chunk that leads to a frame given with it.
         trunk_gain=0.5, stem_gain=1.0, action_alignment="causal",
     ),
-    execution=ExecutionConfig(remat="products"),
+    execution=ExecutionConfig(remat="none"),
     train=TrainConfig(
         steps=1000, batch=12,
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),

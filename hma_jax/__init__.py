@@ -6,6 +6,7 @@ throughout, in signatures, parameter axes and tensor names:
     B batch             T frames               S image tokens per frame
     K action tokens     D width                H heads (I = D / H, one head's width)
     N layers            F mlp width            E embodiments
+    W width of a diffusion head
     U padded action width (stride x native dim)
     Q vocabulary factors                       V entries per factor
     C latent channels   P tokens per frame in the trunk (S + K)

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from experiments.bench.record import Stage
@@ -39,13 +39,14 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.process.stdin.close()
+        with suppress(BrokenPipeError):  # it ended by itself
+            self.process.stdin.close()
         self.process.wait()
 
     def run(self, stage: str) -> float:
         """Seconds. Raises ConfigError if the process ended instead of answering."""
-        self.process.stdin.write(f"{stage}\n")
-        self.process.stdin.flush()
+        with suppress(BrokenPipeError):
+            print(stage, file=self.process.stdin, flush=True)
         answer = self.process.stdout.readline()
         require(
             bool(answer),
@@ -62,12 +63,13 @@ def time_beside(
     unknown = sorted(set(names) - set(RELEASED))
     require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASED)}")
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
-    script = Path(__file__).with_name("released.py")
+    # As text: started from its file, it would find our modules beside it before those of the standard library.
+    script = Path(__file__).with_name("released.py").read_text()
     order = list(dict.fromkeys(turn for name in names for turn in ((THEIRS, RELEASED[name]), (OURS, name))))
     seconds: dict[tuple[str, str], list[float]] = {turn: [] for turn in order}
     with ExitStack() as stack:
         workers = {
-            THEIRS: stack.enter_context(Worker([str(python), str(script)], PYTHONPATH=str(release.absolute()))),
+            THEIRS: stack.enter_context(Worker([str(python), "-c", script], PYTHONPATH=str(release.absolute()))),
             OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"])),
         }
         for turn in range(-1, turns):  # the first one compiles and warms up

@@ -42,9 +42,9 @@ class ResBlock(nnx.Module):
     def __init__(self, width: int):
         init = xavier_uniform(width, width)
         self.norm = LayerNorm(width, axis=None, eps=FINE_EPS)
-        self.into = Linear((width, width), (None, "F"), init=init, role="vector")
-        self.out = Linear((width, width), ("F", None), init=init, role="vector")
-        self.modulation = Linear((width, 3 * width), (None, "F"), init=zeros, role="vector")
+        self.into = Linear((width, width), ("W", "F"), init=init, role="vector")
+        self.out = Linear((width, width), ("F", "W"), init=init, role="vector")
+        self.modulation = Linear((width, 3 * width), ("W", "F"), init=zeros, role="vector")
 
     def __call__(self, x: jax.Array, condition: jax.Array) -> jax.Array:
         shift, scale, gate = jnp.split(self.modulation(jax.nn.silu(condition)), 3, axis=-1)
@@ -66,13 +66,13 @@ class Denoiser(nnx.Module):
         self.dtype, self.of_actions = dtype, axis == "U"
         small = normal(0.02)
         self.multiplier = config.mup_multiplier("readout")
-        self.time_in = Linear((TIME_FEATURES, width), (None, "F"), init=small, role="vector")
-        self.time_out = Linear((width, width), ("F", None), init=small, role="vector")
+        self.time_in = Linear((TIME_FEATURES, width), ("W", "F"), init=small, role="vector")
+        self.time_out = Linear((width, width), ("F", "W"), init=small, role="vector")
         self.condition = Linear((config.width, width), ("D", "F"), init=small, role="output")
         init = xavier_uniform(channels, width)
         self.into = Linear((channels, width), (axis, "F"), init=init, role="vector")
         self.blocks = nnx.List([ResBlock(width) for _ in range(config.diffusion.depth)])
-        self.modulation = Linear((width, 2 * width), (None, "F"), init=zeros, role="vector")
+        self.modulation = Linear((width, 2 * width), ("W", "F"), init=zeros, role="vector")
         self.out = param((width, 2, channels), ("F", None, axis), zeros, role="vector")
         self.out_bias = bias((2, channels), (None, axis))
 

@@ -20,6 +20,7 @@ from hma_jax.config import ConfigError, MeshConfig
 RULES: dict[str, str | tuple[str, ...]] = {
     "B": ("data", "fsdp"),
     "D": "fsdp",
+    "W": "fsdp",
     "D_out": "tensor",
     "H": "tensor",
     "F": "tensor",

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, MeshConfig, ModelConfig
+from hma_jax.config import ConfigError, DiffusionConfig, MeshConfig, ModelConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.sharding import audit_sharding, describe_sharding, make_mesh, plan_sharding
 from tests.tiny import TABLE, model_config
@@ -20,10 +20,10 @@ from tests.tiny import TABLE, model_config
 PROGRAM = Path(__file__).with_name("train_on_mesh.py")
 
 
-def run_on(devices: int, mesh: str, run_dir: Path, steps: int = 5) -> dict:
+def run_on(devices: int, mesh: str, run_dir: Path, steps: int = 5, kind: str = "ids") -> dict:
     flags = f"--xla_force_host_platform_device_count={devices}"
     done = subprocess.run(
-        [sys.executable, "-m", "tests.multidevice.train_on_mesh", mesh, str(run_dir), str(steps)],
+        [sys.executable, "-m", "tests.multidevice.train_on_mesh", mesh, str(run_dir), str(steps), kind],
         env=os.environ | {"XLA_FLAGS": flags},
         cwd=PROGRAM.parents[2],
         capture_output=True,
@@ -46,6 +46,13 @@ def test_eight_devices_train_as_one_does_and_checkpoints_move_between_meshes(tmp
     np.testing.assert_allclose(longer["losses"], back["losses"], rtol=1e-5)
 
 
+def test_latents_train_on_eight_shards_of_the_parameters_as_on_one_device(tmp_path: Path):
+    one = run_on(1, "1,1,1", tmp_path / "one", steps=3, kind="latents")
+    eight = run_on(8, "1,8,1", tmp_path / "eight", steps=3, kind="latents")
+    np.testing.assert_allclose(eight["losses"], one["losses"], rtol=1e-5)
+    assert eight["split"] > 0.9 and one["split"] == 0
+
+
 def abstract_mesh(data: int, fsdp: int, tensor: int):
     class Fake:
         shape = {"data": data, "fsdp": fsdp, "tensor": tensor}
@@ -53,9 +60,11 @@ def abstract_mesh(data: int, fsdp: int, tensor: int):
     return Fake()
 
 
-def test_no_large_parameter_of_the_base_model_is_left_whole():
-    declared = declare_model(ModelConfig(), TABLE)
-    mesh = abstract_mesh(2, 4, 2)
+@pytest.mark.parametrize("diffusion", [None, DiffusionConfig()])
+@pytest.mark.parametrize("mesh", [(2, 4, 2), (1, 8, 1)])
+def test_no_large_parameter_of_the_base_model_is_left_whole(diffusion, mesh):
+    declared = declare_model(ModelConfig(diffusion=diffusion, action_heads=False), TABLE)
+    mesh = abstract_mesh(*mesh)
     decisions = plan_sharding(declared, mesh, MeshConfig())
     audit_sharding(decisions, mesh)
     whole = [d.name for d in decisions if d.replicated and d.spec.size > 2**16]
