@@ -38,10 +38,11 @@ def child_environment(slot: int, workers: int, compile_cache: Path | None = None
 
 def settle() -> None:
     """Called first in a child: takes its cores and arranges to die with its parent."""
-    keep_freed_memory()
     cores = os.environ.get(_CORES)
     if cores:
         os.sched_setaffinity(0, {int(c) for c in cores.split(",")})
+    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+        keep_freed_memory()
     parent = int(os.environ.get(_PARENT, "0"))
     if parent:
         _die_with(parent)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from experiments.bench.record import Stage
 from experiments.bench.timing import summarise
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 
 RELEASED = {
     "forward": "forward",
@@ -48,10 +48,9 @@ class Worker:
         with suppress(BrokenPipeError):
             print(stage, file=self.process.stdin, flush=True)
         answer = self.process.stdout.readline()
-        require(
-            bool(answer),
-            f"the process that times {stage!r} ended with code {self.process.wait()}; what it printed is above",
-        )
+        if not answer:
+            code = self.process.wait()
+            raise ConfigError(f"the process that times {stage!r} ended with code {code}; what it printed is above")
         return float(answer)
 
 

@@ -1,7 +1,5 @@
 """`python -m experiments.cli` is `hma`."""
 
-import sys
+from experiments.cli.start import start
 
-from experiments.cli.main import main
-
-sys.exit(main())
+start()

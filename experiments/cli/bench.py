@@ -182,6 +182,28 @@ def load(
     commands.load(store, data, windows, batch, frames, size, threads, out)
 
 
+@bench_app.command(name="release")
+def release(
+    checkout: Positional[Path],
+    python: Path,
+    stages: Annotated[tuple[str, ...], arg(metavar="[STAGE ...]")] = (),
+    turns: int = 5,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time the base models beside the official PyTorch release: two processes that take turns.
+
+    Args:
+        checkout: A clone of github.com/liruiw/HMA.
+        python: An interpreter with what the release imports: torch, einops, mup, transformers,
+            huggingface_hub, scipy.
+        stages: Some of: forward, fill, slide, step, "continuous fill", "continuous slide",
+            "continuous few" (10 sampler steps against the release's 100). All if not given.
+        turns: Timed turns of every stage, after one untimed.
+        out: Directory for the record.
+    """
+    commands.release(checkout, python, stages, turns, out)
+
+
 @bench_app.command(name="report")
 def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
     """Print records as Markdown tables, and draw them.

@@ -174,6 +174,15 @@ def load(
     console.print(f"wrote {out / f'load-{name}-memory'}.csv and .png", soft_wrap=True)
 
 
+def release(checkout: Path, python: Path, stages: Sequence[str], turns: int, out: Path) -> None:
+    from experiments.bench.beside import RELEASED, time_beside
+
+    names = stages or tuple(RELEASED)
+    with step(f"time {len(names)} stages beside the release") as update:
+        found, ratios = time_beside(checkout, python, names, turns, lambda what, turn: update(turn, turns, what))
+    _write("release", "base", "float32", 0, {"stages": list(names)}, found, ratios, (), out)
+
+
 def report(records: Sequence[Path], figure: Path | None) -> None:
     from experiments.bench.record import read_record
     from experiments.bench.report import markdown, plot_records

@@ -1,30 +1,48 @@
-"""How this process holds host memory: it keeps what it frees.
+"""How a process holds host memory: in huge pages, and on one core it keeps what it frees.
 
 XLA's CPU backend takes its temporary buffers anew for every call. glibc gives blocks of that
 size back to the kernel and asks for them again, and the page faults are then a third of a
-training step (`perf record`: 37 % of samples in the kernel; a step of the cpu study 200 ms
-before, 120 ms after, on one core).
+training step. Pages of 2 MiB make them few. With one arena that never shrinks there are none,
+but several threads then wait for one another: that is for processes of one core.
+docs/performance.md has the figures.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 import platform
+import sys
 
 HUGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-"""Environment that a child process starts with to use transparent huge pages as well; glibc
-reads it before anything of ours runs."""
+"""Environment that a process starts with to use transparent huge pages; glibc reads it before
+anything of ours runs."""
 
 # Names and numbers of malloc.h.
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
 
 
+def restart_with_huge_pages() -> None:
+    """Starts the program of this process again, in this process, with `HUGE_PAGES`. Call it first of all.
+
+    Returns where it is so already: the tunables are set, as the user wants them or by an earlier
+    call. Does nothing where the C library is not glibc.
+    """
+    if "GLIBC_TUNABLES" not in os.environ and _is_glibc():
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | HUGE_PAGES)
+
+
 def keep_freed_memory() -> None:
-    """Call before the first computation. Does nothing where the C library is not glibc."""
-    if platform.libc_ver()[0] != "glibc":
+    """For a process of one core; call before the first computation. Does nothing where the C library is
+    not glibc."""
+    if not _is_glibc():
         return
     mallopt = ctypes.CDLL(None).mallopt
     mallopt(_M_MMAP_MAX, 0)
     mallopt(_M_TRIM_THRESHOLD, 2**31 - 1)
     mallopt(_M_TOP_PAD, 64 * 2**20)
     mallopt(_M_ARENA_MAX, 1)
+
+
+def _is_glibc() -> bool:
+    return platform.libc_ver()[0] == "glibc"

@@ -1,6 +1,7 @@
 """The runner survives crashes, interruptions and its own death, and repeats nothing."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -133,3 +134,20 @@ def test_a_child_uses_huge_pages_unless_the_user_said_otherwise(monkeypatch):
     assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.hugetlb=0")
     assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=0"
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the setting is glibc's")
+@pytest.mark.parametrize("asked", [None, "glibc.malloc.hugetlb=0"])
+def test_the_program_starts_again_with_huge_pages_unless_the_user_said_otherwise(asked, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import os, sys\n"
+        "from hma_jax.runtime.host_memory import restart_with_huge_pages\n"
+        "print('started', flush=True)\n"
+        "restart_with_huge_pages()\n"
+        "print(os.environ['GLIBC_TUNABLES'], *sys.argv[1:])\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"} | ({"GLIBC_TUNABLES": asked} if asked else {})
+    command = [sys.executable, "-u", program, "--set", "a b"]
+    lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert lines == ["started"] * (1 if asked else 2) + [f"{asked or 'glibc.malloc.hugetlb=1'} --set a b"]

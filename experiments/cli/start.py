@@ -1,0 +1,12 @@
+"""Where the program starts: before anything large is imported, it settles how the process holds memory."""
+
+import sys
+
+from hma_jax.runtime.host_memory import restart_with_huge_pages
+
+
+def start() -> None:
+    restart_with_huge_pages()
+    from experiments.cli.main import main
+
+    sys.exit(main())
