@@ -38,8 +38,10 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
 def to_official(run: Positional[Path], out: Path) -> None:
     """Write a run as a checkpoint that the official PyTorch release loads.
 
-    What came from the release and was not trained since goes back byte for byte. Models that the
-    release cannot compute are refused by the field that it lacks.
+    What came from the release and was not trained since goes back byte for byte. Anything else is
+    written so that the release's from_pretrained loads it and computes the same: muP that the release
+    cannot hold (continuous models of another width than 256, other attention scales) is folded into the
+    weights, which a note says. Models that it cannot compute are refused by the field that it lacks.
 
     Args:
         run: Directory of the training run.

@@ -19,12 +19,15 @@ def from_official(checkpoint: Path, out: Path) -> None:
     require_free(out)
     run = read_official(checkpoint)
     write_run(run, out)
+    if run.model.conditioning == "cross_attention":
+        console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
     _describe(run)
     wrote(out, then=f"hma convert to-safetensors {_quoted(out)} --out DIR (or to-stablehlo, to-official)")
 
 
 def to_official(run: Path, out: Path) -> None:
-    from hma_jax.convert import require_free, write_official
+    from hma_jax.convert import loads_in_release, require_free, write_official
+    from hma_jax.convert.official import read_config
     from hma_jax.training.train import load_run
 
     require_free(out)
@@ -32,8 +35,11 @@ def to_official(run: Path, out: Path) -> None:
     for remark in write_official(loaded, out):
         console.print(f"note: {remark}", markup=False, soft_wrap=True)
     _describe(loaded)
-    then = f"load it with the official release, or read it again: hma convert from-official {_quoted(out)}"
-    wrote(out, then=f"{then} --out RUN")
+    again = f"hma convert from-official {_quoted(out)} --out RUN"
+    if loads_in_release(read_config(out)):
+        name = "STMAR" if loaded.model.diffusion else "STMaskGIT"
+        again = f"load it in the official release with {name}.from_pretrained({str(out)!r}), or read it again: {again}"
+    wrote(out, then=again)
 
 
 def to_safetensors(run: Path, out: Path) -> None:

@@ -3,13 +3,13 @@
 A directory holds config.json and model.safetensors, or a torch file in its place. Reading is
 strict: a tensor too few, too many or of another shape is refused, where the release leaves random
 weights in its place. What we have no use for is kept in the run's provenance, so that a run that
-came from there goes back byte for byte.
+came from there and was not trained since goes back byte for byte. In every other run what muP
+multiplies with is folded into the weights where the release would multiply otherwise (`multipliers`).
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ import numpy as np
 from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
 from hma_jax.config.json import stable_hash
 from hma_jax.convert.aside import written_aside
+from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.convert.official_config import (
-    BASE_WIDTH,
     CONTINUOUS_DEFAULTS,
     DISCRETE_DEFAULTS,
     is_continuous,
@@ -28,6 +28,7 @@ from hma_jax.convert.official_config import (
     read_table,
     write_config,
 )
+from hma_jax.convert.release_limits import ATTENTION_SCALE, loads_in_release, released_form, require_official
 from hma_jax.convert.table import check_names, flat, from_official, nested, official_parts, to_official
 from hma_jax.convert.tensors import Stored, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
@@ -38,6 +39,8 @@ from hma_jax.training.train import Run
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")
 FLOATS = ("float32", "float16", "bfloat16")
+CLIP = 10.0
+"""What the release keeps predicted clean values in while sampling; its configuration has no field for it."""
 
 
 def official_shapes(model: ModelConfig, table: EmbodimentTable) -> dict[str, tuple[int, ...]]:
@@ -131,6 +134,11 @@ def write_official(run: Run, directory: Path) -> list[str]:
     """
     config = official_config(run)
     tensors, remarks = official_tensors(run)
+    if not loads_in_release(config):
+        remarks.append(
+            "it goes back as it came, which the release itself does not load: its muP stops at continuous "
+            "models of another width than 256. Once trained on here, it is written with muP folded in"
+        )
     with written_aside(directory) as aside:
         (aside / CONFIG).write_text(json.dumps(config, indent=2, sort_keys=True))
         write_safetensors(aside / WEIGHTS, tensors)
@@ -138,40 +146,35 @@ def write_official(run: Run, directory: Path) -> list[str]:
 
 
 def official_config(run: Run) -> dict[str, Any]:
-    """The original config.json where the run still is what it described, else brought up to date."""
+    """The original config.json where the run still is what it described, else brought up to date.
+
+    Raises ConfigError if the release could not compute the model.
+    """
+    form = _form(run)
     source = run.provenance.get("official", {})
     original = source.get("config", {})
-    model = _at_official_base(run.model)
-    fields = write_config(run.model, run.table, run.train.masking)
+    fields = write_config(form, run.table, run.train.masking)
     if original and source["table"] == stable_hash(run.table):
-        same = read_model(original, CONFIG) == model and read_masking(original) == run.train.masking
-        if same:
+        if _same(read_model(original, CONFIG), form) and read_masking(original) == run.train.masking:
             return original
         kept = ("action_domains", "d_actions", "action_stats")
         fields = {name: value for name, value in fields.items() if name not in kept}
-    return {**(CONTINUOUS_DEFAULTS if model.diffusion else DISCRETE_DEFAULTS), **original, **fields}
+    return {**(CONTINUOUS_DEFAULTS if form.diffusion else DISCRETE_DEFAULTS), **original, **fields}
 
 
 def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
-    """(name -> array, remarks for the user)."""
-    remarks = []
-    model = replace(_at_official_base(run.model), action_heads=True)
-    leaves = declare_model(model, run.table).leaves()
+    """(name -> array, remarks for the user). Raises ConfigError as `official_config` does."""
+    form, remarks = _form(run), []
+    leaves = declare_model(form, run.table).leaves()
     arrays = flat(run.params)
     if not run.model.action_heads:
         arrays |= {
             path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays
         }
         remarks.append("the release has action heads, this model has none: they are written as zeros")
-    ratio = model.mup_multiplier("readout") / run.model.mup_multiplier("readout")
-    if ratio != 1:
-        outputs = [path for path, spec in leaves.items() if spec.role == "output"]
-        arrays |= {path: np.asarray(arrays[path]) * np.float32(ratio) for path in outputs}
-        remarks.append(
-            f"read-outs are multiplied by {ratio:g}, because the release divides their inputs by width / "
-            f"{model.mup.base_width} and this model by width / {run.model.mup.base_width}"
-        )
-    tensors = to_official(nested(arrays), official_parts(model, run.table, leaves))
+    arrays = folded(arrays, leaves, run.model, form)
+    remarks += _remarks(run.model, form)
+    tensors = to_official(nested(arrays), official_parts(form, run.table, leaves))
     for entry in run.table.entries:
         for name, values in zip(_statistics(entry.name), (entry.mean, entry.std), strict=True):
             tensors[name] = np.asarray(values, np.float32)
@@ -179,10 +182,49 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     return {name: _narrow(x, halves.get(name)) for name, x in tensors.items()}, remarks
 
 
-def _at_official_base(model: ModelConfig) -> ModelConfig:
-    """With the base width that the release computes with, and nothing of muP taken away."""
-    base = model.width if model.diffusion else BASE_WIDTH
-    return replace(model, mup=replace(model.mup, base_width=base, without=()))
+def _form(run: Run) -> ModelConfig:
+    """The model that is written: as it came where it came from the release and was not trained since, else
+    as the release holds it. Raises ConfigError if the release could not compute it."""
+    source = run.provenance.get("official")
+    untouched = source and run.step == 0 and source["table"] == stable_hash(run.table)
+    if untouched and read_model(source["config"], CONFIG) == run.model:
+        return run.model
+    require_official(run.model, run.table)
+    return released_form(run.model)
+
+
+def _same(theirs: ModelConfig, form: ModelConfig) -> bool:
+    """Whether the multipliers and everything else are equal; a base width means nothing without muP."""
+    switches = theirs.mup.enabled == form.mup.enabled
+    return theirs == form or (switches and released_form(theirs) == released_form(form))
+
+
+def _remarks(model: ModelConfig, form: ModelConfig) -> list[str]:
+    remarks = []
+    reads, queries = readout_ratio(model, form), query_ratio(model, form)
+    what = "what conditions the diffusion heads is" if model.diffusion else "read-outs are"
+    if model.mup.enabled and not form.mup.enabled:
+        why = (
+            f"attention scales of {ATTENTION_SCALE} / head width only"
+            if model.mup.attention_scale != ATTENTION_SCALE or "attention" in model.mup.without
+            else "continuous models of width 256 only"
+        )
+        remarks.append(
+            f"muP is folded into the weights and off in {CONFIG}, because the release has it for {why}: "
+            f"queries are multiplied by {queries:g}, {what} multiplied by {reads:g}. It computes the same; "
+            "trained on, it has the learning rates of a model without muP"
+        )
+    elif reads != 1:
+        remarks.append(
+            f"{what} multiplied by {reads:g}, because the release divides their inputs by width / "
+            f"{form.mup.base_width} and this model by width / {model.mup.base_width}"
+        )
+    if model.diffusion and model.diffusion.clip != CLIP:
+        remarks.append(
+            f"while sampling the release keeps predicted clean values in +-{CLIP:g}, this model in "
+            f"+-{model.diffusion.clip:g}"
+        )
+    return remarks
 
 
 def _narrow(tensor: np.ndarray, dtype: str | None) -> np.ndarray:

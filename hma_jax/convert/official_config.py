@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from hma_jax.config import ConfigError, MaskingConfig, ModelConfig, require
+from hma_jax.config import MaskingConfig, ModelConfig, require
 from hma_jax.config.json import from_dict
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 BASE_WIDTH = 256
-"""Where the release's muP multipliers are 1. Its continuous variant has no other width."""
+"""Where the release's muP multipliers are 1."""
 
 CONTINUOUS_ONLY = {
     "Diffusion": True,
@@ -218,11 +218,7 @@ def read_table(
 
 
 def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingConfig) -> dict[str, Any]:
-    """The fields of an official config.json that follow from a model of ours.
-
-    Raises ConfigError for what the official format cannot say.
-    """
-    require_official(model, table)
+    """The fields of an official config.json that follow from a model the release can hold (`release_limits`)."""
     config = {theirs: getattr(model, ours) for theirs, ours in MODEL_FIELDS.items()}
     config |= {theirs: getattr(masking, ours) for theirs, ours in MASKING_FIELDS.items()}
     config |= {
@@ -230,7 +226,6 @@ def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingCon
         "use_mup": model.mup.enabled,
         "action_network": next(k for k, v in NETWORKS.items() if v == model.conditioning),
         "jointly_predict_actions": masking.predicts_actions,
-        "num_factored_vocabs": model.factors,
         "init_actions": True,
         "action_domains": list(table.names),
         "d_actions": table.chunks.tolist(),
@@ -242,28 +237,6 @@ def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingCon
         config["dataloader_mask_ratio_min"] = masking.mask_angle_min
     else:
         config |= {"image_vocab_size": model.vocab_size, "factored_vocab_size": model.factor_vocab}
+        config["num_factored_vocabs"] = model.factors
         config["dataloader_mask_ratio_min"] = masking.clean_rate_min
     return config
-
-
-def require_official(model: ModelConfig, table: EmbodimentTable) -> None:
-    """Raises ConfigError for a model that the release cannot compute."""
-    reasons = []
-    if model.action_alignment != "released":
-        reasons.append(
-            f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only"
-        )
-    if model.mup.enabled and (model.mup.attention_scale != 8 or "attention" in model.mup.without):
-        reasons.append(
-            f"its attention scale is not the release's 8 / head width (model.mup.attention_scale "
-            f"{model.mup.attention_scale:g}, model.mup.without {list(model.mup.without)})"
-        )
-    if model.diffusion and model.diffusion.steps != 1000:
-        reasons.append(f"model.diffusion.steps is {model.diffusion.steps}, the release has 1000 only")
-    for entry in table.entries:
-        if "." in entry.name or not entry.name:
-            reasons.append(f"the robot's name {entry.name!r} has a dot, with which torch separates modules")
-        if entry.chunk == 0:
-            reasons.append(f"{entry.name} has no actions, the release's robots all have some")
-    if reasons:
-        raise ConfigError("the official format cannot hold this model: " + "; ".join(reasons))

@@ -3,7 +3,10 @@
 import json
 from pathlib import Path
 
+import pytest
+
 from experiments.cli.main import main
+from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
 
 CHECKPOINT = Path(__file__).parent.parent / "golden" / "04_discrete_mlp"
 
@@ -28,3 +31,14 @@ def test_a_checkpoint_goes_through_every_format_and_back(tmp_path, capsys):
     about = json.loads((program / "model.json").read_text())
     assert about["outputs"][0]["shape"] == [1, 1, 16]
     assert {path.name for path in program.iterdir()} == {"model.json", "model.safetensors", "model.stablehlo"}
+
+
+@pytest.mark.parametrize(("base", "loads"), [(DISCRETE, True), (CONTINUOUS, False)], ids=["discrete", "continuous"])
+def test_what_the_release_does_not_load_is_not_said_to_load(base, loads, tmp_path, capsys):
+    start, run, back = make_checkpoint(tmp_path / "a", base, [("push", 2, 1)]), tmp_path / "run", tmp_path / "back"
+    assert main(["convert", "from-official", str(start), "--out", str(run)]) == 0
+    assert main(["convert", "to-official", str(run), "--out", str(back)]) == 0
+    said = capsys.readouterr().out.replace("\n", "")
+    assert ("load it in the official release with STMaskGIT.from_pretrained" in said) == loads
+    assert ("which the release itself does not load" in said) != loads
+    assert f"hma convert from-official {back} --out RUN" in said

@@ -1,0 +1,59 @@
+"""Which of our models the official release can compute, and in which form it holds them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from hma_jax.config import ConfigError, ModelConfig, MupConfig
+from hma_jax.convert.official_config import BASE_WIDTH, is_continuous
+from hma_jax.model.embodiments import EmbodimentTable
+
+ATTENTION_SCALE = 8
+"""What the release divides by the head width under muP, to multiply q.k with."""
+
+
+def can_hold_mup(model: ModelConfig) -> bool:
+    """Whether the release computes with the multipliers of this model's muP.
+
+    It takes every width of the discrete variant. A continuous model of another width than 256 stops in
+    the shape check of its muP, because the condition of the diffusion heads is no read-out there.
+    """
+    scale = model.mup.attention_scale == ATTENTION_SCALE and "attention" not in model.mup.without
+    return scale and (model.diffusion is None or model.width == BASE_WIDTH)
+
+
+def released_form(model: ModelConfig) -> ModelConfig:
+    """The model that the release makes of `model`'s configuration, with action heads and multipliers of
+    its own; `multipliers.folded` are its parameters. muP that it cannot hold is off there."""
+    mup = MupConfig(enabled=model.mup.enabled and can_hold_mup(model), base_width=BASE_WIDTH)
+    return replace(model, mup=mup, action_heads=True)
+
+
+def loads_in_release(config: Mapping[str, Any]) -> bool:
+    """Whether the release's `from_pretrained` takes this config.json; see `can_hold_mup`."""
+    return not (is_continuous(config) and config.get("use_mup") and config["d_model"] != BASE_WIDTH)
+
+
+def require_official(model: ModelConfig, table: EmbodimentTable) -> None:
+    """Raises ConfigError for a model that the release cannot compute."""
+    reasons = []
+    if model.action_alignment != "released":
+        reasons.append(
+            f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only"
+        )
+    if model.conditioning == "cross_attention":
+        reasons.append("model.conditioning is 'cross_attention', which the release computes otherwise")
+    if math.isqrt(model.tokens) ** 2 != model.tokens:
+        reasons.append(f"model.tokens {model.tokens} do not make a square, the release's frames are square")
+    if model.diffusion and model.diffusion.steps != 1000:
+        reasons.append(f"model.diffusion.steps is {model.diffusion.steps}, the release has 1000 only")
+    for entry in table.entries:
+        if "." in entry.name or not entry.name:
+            reasons.append(f"the robot's name {entry.name!r} has a dot, with which torch separates modules")
+        if entry.chunk == 0:
+            reasons.append(f"{entry.name} has no actions, the release's robots all have some")
+    if reasons:
+        raise ConfigError("the official format cannot hold this model: " + "; ".join(reasons))

@@ -1,0 +1,150 @@
+"""Models that never were official: written so that the release computes the same, or refused by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, MupConfig
+from hma_jax.convert import loads_in_release, read_official, write_official
+from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
+from hma_jax.model.hma import declare_model
+from hma_jax.training.train import Run
+from tests.hma_jax.convert.fakes import CONTINUOUS, make_checkpoint
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
+
+RELEASED = replace(DIFFUSION, steps=1000)
+"""The process that the release has."""
+
+
+def everything(config, params) -> dict[str, np.ndarray]:
+    """All that a model computes: of frames, and of actions where it has heads for them."""
+    declared, batch = declare_model(config, TABLE), jax.tree.map(jnp.asarray, random_batch(0, config, 2))
+    rng, robots = np.random.default_rng(0), batch["embodiment"]
+    own = np.arange(TABLE.action_width) < TABLE.chunks[np.asarray(robots), None]  # beyond it is padding
+
+    def apply(params):
+        model = declared.merge(params)
+        out = model(batch["tokens"], None, batch["actions"], robots)
+        made = {"frames": out.said}
+        if config.diffusion:
+            time = jnp.asarray(rng.integers(0, 1000, batch["tokens"].shape[:3]))
+            made["denoiser"] = model.denoiser(batch["tokens"], time, out.said)
+        if config.action_heads:
+            noised = (batch["actions"], time[..., 0]) if config.diffusion else ()
+            actions = model.action_head(*noised, out.actions, robots)
+            actions = actions.reshape(*actions.shape[:2], -1, TABLE.action_width)
+            made["actions"] = jnp.where(own[:, None, None], actions, 0)
+        return made
+
+    return jax.jit(apply)(params)
+
+
+def written(config, params, folder: Path, step: int = 7) -> tuple[Run, dict, list[str]]:
+    """What is read back, its config.json and the remarks."""
+    remarks = write_official(Run(config, train_config(), TABLE, params, step, {}), folder)
+    return read_official(folder), json.loads((folder / "config.json").read_text()), remarks
+
+
+def same_numbers(config, params, back: Run) -> None:
+    assert back.table.names == TABLE.names
+    np.testing.assert_array_equal(back.table.statistics(), TABLE.statistics())
+    ours, theirs = everything(config, params), everything(back.model, back.params)
+    for name, want in ours.items():
+        np.testing.assert_allclose(theirs[name], want, rtol=0, atol=1e-5 * np.abs(want).max(), err_msg=name)
+
+
+def test_a_discrete_model_keeps_mup_at_the_base_width_of_the_release(tmp_path):
+    """Another muP base width, no action heads: read-outs are rescaled, heads are zero."""
+    config = model_config(action_heads=False, frames=3)
+    _, params = lively_params(config)
+    back, official, remarks = written(config, params, tmp_path / "a")
+    assert any("0.125" in remark for remark in remarks) and any("zeros" in remark for remark in remarks)
+    assert official["use_mup"] and back.model.mup.base_width == 256 and loads_in_release(official)
+    same_numbers(config, params, back)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"diffusion": RELEASED, "mup": MupConfig()}, "continuous models of width 256 only"),
+        ({"qkv_bias": True, "mup": MupConfig(base_width=64, attention_scale=3.0)}, "attention scales of 8 /"),
+        ({"qk_norm": True, "mup": MupConfig(attention_scale=3.0)}, "attention scales of 8 /"),
+    ],
+    ids=["continuous", "attention_scale", "attention_scale-qk_norm"],
+)
+def test_mup_that_the_release_cannot_hold_is_folded_into_the_weights(changes, said, tmp_path):
+    config = model_config(frames=3, **changes)
+    _, params = lively_params(config)
+    back, official, remarks = written(config, params, tmp_path / "a")
+    assert len(remarks) == 1 and said in remarks[0]
+    assert official["use_mup"] is False and not back.model.mup.enabled and loads_in_release(official)
+    same_numbers(config, params, back)
+
+
+def test_folding_writes_only_what_stands_beside_a_multiplier():
+    config = model_config(qkv_bias=True, mup=MupConfig(base_width=8))
+    target = replace(config, mup=MupConfig(enabled=False))
+    declared, params = lively_params(config)
+    leaves = declared.leaves()
+    arrays = {path: np.asarray(x) for path, x in zip(leaves, jax.tree.leaves(params), strict=True)}
+    out = folded(arrays, leaves, config, target)
+    assert readout_ratio(config, target) == 0.25 and query_ratio(config, target) == pytest.approx(8**0.5)
+    changed = {path for path, x in out.items() if x is not arrays[path]}
+    attention = {f"trunk/blocks/{axis}/{name}" for axis in ("space", "time") for name in ("qkv", "qkv_bias")}
+    assert changed == attention | {"action_head/linear/kernel", "frame_head/linear/kernel"}
+    for path in attention:
+        np.testing.assert_array_equal(out[path][..., 1:, :, :], arrays[path][..., 1:, :, :])
+
+
+def test_attention_that_does_not_follow_mup_folds_to_what_it_is(tmp_path):
+    config = model_config(mup=MupConfig(base_width=8, without=("attention",)))
+    params = declare_model(config, TABLE).init(0)
+    back, _, remarks = written(config, params, tmp_path / "a")
+    assert "queries are multiplied by 1, read-outs are multiplied by 0.25" in remarks[0]
+    assert (back.params["trunk"]["blocks"]["time"]["qkv"] == params["trunk"]["blocks"]["time"]["qkv"]).all()
+
+
+def test_mup_that_the_release_has_stays_on(tmp_path):
+    config = model_config(diffusion=RELEASED, width=256, layers=1, frames=2, mup=MupConfig())
+    _, official, remarks = written(config, declare_model(config, TABLE).init(0), tmp_path / "a")
+    assert official["use_mup"] and loads_in_release(official) and not remarks
+
+
+def test_what_came_with_mup_that_the_release_refuses_loses_it_once_it_is_trained(tmp_path):
+    start = make_checkpoint(tmp_path / "a", CONTINUOUS, [("push", 2, 1)])
+    trained = replace(read_official(start), step=3)
+    remarks = write_official(trained, tmp_path / "b")
+    assert "queries are multiplied by 2.82843" in remarks[0] and "heads is multiplied by 1." in remarks[0]
+    before, after = (json.loads((tmp_path / x / "config.json").read_text()) for x in "ab")
+    assert after == before | {"use_mup": False, "factored_vocab_size": 64}
+    assert not loads_in_release(before) and loads_in_release(after)
+
+
+def test_another_range_of_clean_values_is_said(tmp_path):
+    config = model_config(diffusion=replace(RELEASED, clip=4.0), mup=MupConfig(enabled=False))
+    _, _, remarks = written(config, declare_model(config, TABLE).init(0), tmp_path / "a")
+    assert remarks == ["while sampling the release keeps predicted clean values in +-10, this model in +-4"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"action_alignment": "causal"}, "action_alignment"),
+        ({"conditioning": "cross_attention"}, "conditioning is 'cross_attention'"),
+        ({"tokens": 12}, "model.tokens 12 do not make a square"),
+        ({"diffusion": DIFFUSION}, "diffusion.steps is 20"),
+    ],
+)
+def test_what_the_release_cannot_compute_is_refused_by_name(changes, message, tmp_path):
+    config = model_config(**changes)
+    run = Run(config, train_config(), TABLE, declare_model(config, TABLE).init(0), 0, {})
+    with pytest.raises(ConfigError, match=message):
+        write_official(run, tmp_path / "a")
+    assert not (tmp_path / "a").exists()
