@@ -11,11 +11,12 @@ from hma_jax.config.execution import Dtype, ExecutionConfig, MeshConfig
 from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
 from hma_jax.config.pretrained_tokenizers import (
     AnyTokenizerConfig,
+    ImageSize,
     Latents,
     Magvit2Config,
     PixelsConfig,
-    Square,
     SvdVaeConfig,
+    TokenGrid,
 )
 from hma_jax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
 from hma_jax.config.training import MaskingConfig, OptimizerConfig, Setting, TrainConfig
@@ -29,6 +30,7 @@ __all__ = [
     "Dtype",
     "EvalConfig",
     "ExecutionConfig",
+    "ImageSize",
     "Latents",
     "Magvit2Config",
     "MaskingConfig",
@@ -39,8 +41,8 @@ __all__ = [
     "PixelsConfig",
     "SamplerConfig",
     "Setting",
-    "Square",
     "SvdVaeConfig",
+    "TokenGrid",
     "TokenizerConfig",
     "TokenizerTrainConfig",
     "TrainConfig",

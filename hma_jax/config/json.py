@@ -80,7 +80,11 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
 
 
 def _by_kind(options: list[Any], value: Any, where: str) -> Any:
-    """Of several configs the one whose `kind` is `value`'s; the first of them has none."""
+    """Of several configs the one whose `kind` is `value`'s; the first of them has none. Of several types
+    the tuple where `value` is a list."""
+    tuples = [option for option in options if typing.get_origin(option) is tuple]
+    if isinstance(value, (list, tuple)) and tuples:
+        return tuples[0]
     if len(options) == 1 or not isinstance(value, dict) or "kind" not in value:
         return options[0]
     kinds = {option.kind: option for option in options if hasattr(option, "kind")}

@@ -14,35 +14,57 @@ from hma_jax.config.base import require
 from hma_jax.config.execution import Dtype
 from hma_jax.config.tokenizer import TokenizerConfig
 
+ImageSize = int | tuple[int, int]
+"""Pixels along the sides of an image: one number for a square, else (height, width)."""
 
-class Square:
-    """What follows from `image_size` and `token_size`: tokens on a square grid."""
 
-    image_size: int
+class TokenGrid:
+    """What follows from `image_size` and `token_size`: tokens on a grid, row by row."""
+
+    image_size: ImageSize
 
     @property
     def token_size(self) -> int:
-        """Pixels along one side of a token."""
+        """Pixels along one side of a token, which is square."""
         raise NotImplementedError
 
     @property
+    def image_shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        size = self.image_size
+        return (size, size) if isinstance(size, int) else size
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """(rows, columns) of tokens."""
+        height, width = self.image_shape
+        return height // self.token_size, width // self.token_size
+
+    @property
     def grid(self) -> int:
-        """Tokens along one side of the image."""
-        return self.image_size // self.token_size
+        """Tokens along one side of a square image. Raises ConfigError for images that are not square."""
+        rows, columns = self.grid_shape
+        require(rows == columns, f"tokens on a grid of {rows} x {columns} have no one side; use grid_shape")
+        return rows
 
     @property
     def tokens(self) -> int:
         """S: tokens per frame."""
-        return self.grid**2
+        rows, columns = self.grid_shape
+        return rows * columns
 
     def _check_size(self, name: str) -> None:
+        height, width = self.image_shape
         require(
-            self.image_size >= 1 and self.image_size % self.token_size == 0,
+            min(height, width) >= 1 and height % self.token_size == 0 == width % self.token_size,
             f"{name}.image_size {self.image_size} is not a multiple of {self.token_size}, a token's side",
         )
+        if height == width:
+            # One way to write a square: equal settings have one identity.
+            object.__setattr__(self, "image_size", height)
 
 
-class Ids(Square):
+class Ids(TokenGrid):
     """Tokens are ids of `bits` binary channels, split evenly into `factors`."""
 
     bits: int
@@ -63,7 +85,7 @@ class Ids(Square):
         return 2**self.bits
 
 
-class Latents(Square):
+class Latents(TokenGrid):
     """Tokens are `patch` x `patch` cells of `cell_channels` values each, flattened row by row."""
 
     patch: int
@@ -89,7 +111,7 @@ class Magvit2Config(Ids):
     """
 
     kind: Literal["magvit2"] = "magvit2"
-    image_size: int = 256
+    image_size: ImageSize = 256
     channels: int = 128  # of the first level
     multipliers: tuple[int, ...] = (1, 1, 2, 2, 4)  # of `channels`, level by level
     res_blocks: int = 2  # per level, and in the middle
@@ -126,7 +148,7 @@ class SvdVaeConfig(Latents):
     """
 
     kind: Literal["svd-vae"] = "svd-vae"
-    image_size: int = 256
+    image_size: ImageSize = 256
     channels: tuple[int, ...] = (128, 256, 512, 512)  # level by level; all but the last halve the image
     layers: int = 2  # residual blocks per level; the decoder has one more
     latent_channels: int = 4
@@ -157,7 +179,7 @@ class PixelsConfig(Latents):
     """No network: a token is a patch of pixels, in -1..1 divided by `std`."""
 
     kind: Literal["pixels"] = "pixels"
-    image_size: int = 64
+    image_size: ImageSize = 64
     patch: int = 8
     std: float = 0.5  # of pixels in -1..1, about that of natural images
 

@@ -63,6 +63,11 @@ class TokenizerConfig:
         )
 
     @property
+    def image_shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        return self.image_size, self.image_size
+
+    @property
     def grid(self) -> int:
         """Tokens along one side of the image."""
         return self.image_size // self.downsample

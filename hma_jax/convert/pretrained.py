@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import Dtype, Magvit2Config, require
+from hma_jax.config import Dtype, ImageSize, Magvit2Config, require
 from hma_jax.config.json import from_dict
 from hma_jax.convert.official import read_config
 from hma_jax.convert.table import check_names, nested
@@ -140,20 +140,23 @@ def tokenizer_params(
 
 
 def read_magvit2(
-    path: Path, *, image_size: int = 256, compute_dtype: Dtype = "float32"
+    path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtype = "float32"
 ) -> Magvit2Tokenizer:
     """From `magvit2.ckpt`, a safetensors file, or a directory of either with config.json.
 
+    `image_size` has to suit the number of levels: any multiple of 2^(levels - 1), 16 for the published one.
     Raises ConfigError naming what of the file is not as it should be.
     """
     path = Path(path)
     ours: dict[str, Any] = {"image_size": image_size, "compute_dtype": compute_dtype}
-    config = Magvit2Config(**ours)
     if path.is_dir():
         official = read_config(path)
-        # Odd numbers of bits do not make two factors.
-        ours["factors"] = 1 if official.get("z_channels", 0) % 2 else config.factors
+        bits = official.get("z_channels")
+        if isinstance(bits, int) and bits % Magvit2Config.factors:
+            ours["factors"] = 1
         config = MAGVIT2.config(official, str(path / "config.json"), **ours)
+    else:
+        config = Magvit2Config(**ours)
     tensors = read_tensors(path)
     kept = {name: t for name, t in tensors.items() if not name.startswith(IGNORED)}
     declared = Magvit2Tokenizer.declare(config)
@@ -161,7 +164,7 @@ def read_magvit2(
 
 
 def read_svd_vae(
-    directory: Path, *, image_size: int = 256, patch: int = 2, compute_dtype: Dtype = "float32"
+    directory: Path, *, image_size: ImageSize = 256, patch: int = 2, compute_dtype: Dtype = "float32"
 ) -> SvdVaeTokenizer:
     """From a directory of the diffusers library: config.json and diffusion_pytorch_model.safetensors.
 

@@ -23,21 +23,29 @@ class Tokenizer(Protocol):
     """Images to S tokens each, and back.
 
     A token is an id, int32, or a vector of C latent channels, float32 of about unit standard
-    deviation. Tokens run over a square grid row by row. An id is sum_q digit_q V^q: factor 0 in
-    the low digits. Both directions are deterministic, and an image's result does not depend on
-    the others of its batch: tokens made in one job equal those made in another.
+    deviation. Tokens run over a grid row by row, a square one where images are square. An id is
+    sum_q digit_q V^q: factor 0 in the low digits. Both directions are deterministic, and an image's
+    result does not depend on the others of its batch: tokens made in one job equal those made in another.
     """
 
     @property
-    def image_size(self) -> int: ...
+    def image_size(self) -> int:
+        """Pixels along one side. ConfigError if images are not square."""
+        ...
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        ...
+
     @property
     def grid(self) -> int:
-        """Tokens along one side of the image."""
+        """Tokens along one side of the image. ConfigError if images are not square."""
         ...
 
     @property
     def tokens(self) -> int:
-        """S = grid^2."""
+        """S: tokens per frame."""
         ...
 
     @property
@@ -69,11 +77,11 @@ class Tokenizer(Protocol):
     def params(self) -> Params: ...
 
     def encode(self, images: np.ndarray) -> np.ndarray:
-        """uint8 [B, image_size, image_size, 3] -> int32 [B, S] or float32 [B, S, C]."""
+        """uint8 [B, height, width, 3] -> int32 [B, S] or float32 [B, S, C]."""
         ...
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """What `encode` makes -> uint8 [B, image_size, image_size, 3]."""
+        """What `encode` makes -> uint8 [B, height, width, 3]."""
         ...
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:

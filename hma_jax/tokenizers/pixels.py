@@ -36,4 +36,4 @@ class PixelTokenizer(BaseTokenizer):
         return patchify(normalise(images) / self.config.std, self.config.patch)
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
-        return to_pixels(unpatchify(tokens, self.config.patch, self.grid) * self.config.std)
+        return to_pixels(unpatchify(tokens, self.config.patch, self.config.grid_shape[1]) * self.config.std)

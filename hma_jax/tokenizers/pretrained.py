@@ -6,6 +6,7 @@ on. Reading their weights from the files they are published in is `convert.pretr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from einops import rearrange
 
-from hma_jax.config import Magvit2Config, Square, SvdVaeConfig, require
+from hma_jax.config import Magvit2Config, SvdVaeConfig, TokenGrid, require
 from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.base import PIECE, in_pieces
@@ -31,8 +32,8 @@ LATENT_LIMIT = 25.0
 """What unscaled latents are clipped to before they are decoded, as in the release."""
 
 
-def _piece(config: Square) -> int:
-    return max(1, min(PIECE, PIXELS // config.image_size**2))
+def _piece(config: TokenGrid) -> int:
+    return max(1, min(PIECE, PIXELS // math.prod(config.image_shape)))
 
 
 class Magvit2Tokenizer(BaseTokenizer):
@@ -54,7 +55,7 @@ class Magvit2Tokenizer(BaseTokenizer):
         return rearrange(latents_to_ids(z), "b h w -> b (h w)")
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
-        grid = rearrange(tokens, "b (h w) -> b h w", h=self.grid)
+        grid = rearrange(tokens, "b (h w) -> b h w", h=self.config.grid_shape[0])
         return to_pixels(self._declared.merge(params).decoder(ids_to_codes(grid, self.config.bits)))
 
 
@@ -110,4 +111,4 @@ class SvdVaeTokenizer(BaseTokenizer):
 
     def cells(self, tokens: jax.Array) -> jax.Array:
         """The inverse of `tokens_of`."""
-        return unpatchify(tokens, self.config.patch, self.grid) / self.config.scale
+        return unpatchify(tokens, self.config.patch, self.config.grid_shape[1]) / self.config.scale

@@ -81,7 +81,17 @@ class BaseTokenizer(abc.ABC):
 
     @property
     def image_size(self) -> int:
-        return self.config.image_size
+        height, width = self.image_shape
+        require(
+            height == width,
+            f"this tokenizer is for images of {height} x {width} pixels, square ones are needed here; "
+            "import it again with one image size",
+        )
+        return height
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        return self.config.image_shape
 
     @property
     def grid(self) -> int:
@@ -133,7 +143,7 @@ class BaseTokenizer(abc.ABC):
         Raises ConfigError for another shape or type.
         """
         images = np.asarray(images)
-        shape = (self.image_size, self.image_size, 3)
+        shape = (*self.image_shape, 3)
         require(
             images.dtype == np.uint8 and images.ndim == 4 and images.shape[1:] == shape,
             f"the tokenizer encodes uint8 images [B, {', '.join(map(str, shape))}], "

@@ -13,7 +13,7 @@ from hma_jax.config import AnyTokenizerConfig, ConfigError, Magvit2Config, Pixel
 from hma_jax.config.json import from_dict, from_json, to_json
 from hma_jax.model.frames import compose, factorise
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
-from hma_jax.tokenizers.network import normalise
+from hma_jax.tokenizers.network import normalise, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes
 from tests.hma_jax.pretrained import MAGVIT2_SMALL, PIXELS_SMALL, VAE_SMALL, make, noise
 
@@ -122,6 +122,7 @@ def test_a_configuration_of_any_kind_comes_back_from_json():
     ("make_config", "message"),
     [
         (lambda: replace(MAGVIT2_SMALL, image_size=17), "magvit2.image_size 17 is not a multiple of 2"),
+        (lambda: replace(MAGVIT2_SMALL, image_size=(16, 17)), r"image_size \(16, 17\) is not a multiple of 2"),
         (lambda: replace(VAE_SMALL, image_size=18), "svd-vae.image_size 18 is not a multiple of 4"),
         (lambda: replace(MAGVIT2_SMALL, groups=3), "4 channels does not split into 3 groups"),
         (lambda: replace(MAGVIT2_SMALL, bits=5), "bits 5 do not split into 2"),
@@ -132,6 +133,48 @@ def test_a_configuration_of_any_kind_comes_back_from_json():
 def test_a_configuration_that_cannot_work_is_refused(make_config, message):
     with pytest.raises(ConfigError, match=message):
         make_config()
+
+
+# --- Images that are not square ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_images_need_not_be_square(kind, tmp_path):
+    """Rows and columns are not taken for each other: not going in, not coming out, not on disk."""
+    config = replace(CONFIGS[kind], image_size=(12, 20))
+    tokenizer = make(config, piece=2)
+    images = np.random.default_rng(0).integers(0, 256, (2, 12, 20, 3), np.uint8)
+    rows, columns = config.grid_shape
+    tokens = tokenizer.encode(images)
+    assert tokens.shape[:2] == (2, tokenizer.tokens) == (2, rows * columns) and rows < columns
+    frames = tokenizer.decode(tokens)
+    assert frames.shape == images.shape
+    if kind == "pixels":
+        assert np.array_equal(frames, images)
+    else:
+        network = tokenizer._declared.merge(tokenizer.params)
+        if kind == "magvit2":
+            codes = ids_to_codes(jnp.asarray(tokens).reshape(2, rows, columns), config.bits)
+            want = network.decoder(codes)
+        else:
+            want = network.decode(tokenizer.cells(jnp.asarray(tokens)), 1)
+        np.testing.assert_array_less(np.abs(np.asarray(to_pixels(want)) - frames), 0.51)
+    save_tokenizer(tokenizer, tmp_path)
+    assert load_config(tmp_path) == config and load_tokenizer(tmp_path).identity == tokenizer.identity
+    with pytest.raises(ConfigError, match="12, 20, 3"):
+        tokenizer.encode(images.swapaxes(1, 2))
+    for side in ("image_size", "grid"):
+        with pytest.raises(ConfigError, match="12 x 20 pixels, square ones|grid of . x .*no one side"):
+            getattr(tokenizer, side)
+
+
+def test_a_square_is_written_as_one_number_and_keeps_its_identity():
+    pair = replace(MAGVIT2_SMALL, image_size=(16, 16))
+    assert pair == MAGVIT2_SMALL and '"image_size": 16' in to_json(pair)
+    assert make(PIXELS_SMALL).identity == make(replace(PIXELS_SMALL, image_size=(16, 16))).identity
+    assert make(PIXELS_SMALL).identity == "7f095de6cea08766"  # as before there were others than squares
+    with pytest.raises(ConfigError, match="expected 2 values"):
+        from_dict(Magvit2Config, {"image_size": [8, 8, 8]})
 
 
 # --- Ids ---------------------------------------------------------------------------------------
