@@ -34,17 +34,23 @@ def blank_frame(config: ModelConfig, batch: int) -> Frame:
     return Frame(jnp.zeros(shape, dtype), jnp.ones((batch, config.tokens), bool))
 
 
+def cosine_schedule(progress: float) -> float:
+    """Share of a frame's tokens that is masked after `progress` (0 to 1) of its steps: cos(pi/2 progress)."""
+    return math.cos(progress * math.pi / 2)
+
+
 def masked_counts(config: ModelConfig, steps: int) -> list[int]:
     """Tokens still masked after each step: cos(pi/2 (k+1)/M) S, and none after the last.
 
     As released the discrete variant rounds up; the continuous one down, but to at least one and
-    at most S - 1 (reference sections 3.2 and 3.3).
+    at most S - 1 (reference sections 3.2 and 3.3). Where the share is one half the last bit decides, so
+    each multiplies in the order in which the release does.
     """
     size = config.tokens
-    exact = [math.cos(math.pi / 2 * (k + 1) / steps) * size for k in range(steps - 1)]
     if config.diffusion:
+        exact = [math.cos(math.pi / 2 * (k + 1) / steps) * size for k in range(steps - 1)]
         return [min(max(math.floor(x), 1), size - 1) for x in exact] + [0]
-    return [math.ceil(x) for x in exact] + [0]
+    return [math.ceil(cosine_schedule((k + 1) / steps) * size) for k in range(steps - 1)] + [0]
 
 
 def sample_tokens(

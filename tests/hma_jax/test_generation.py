@@ -31,6 +31,14 @@ def test_masked_counts_are_the_cosine_schedule_of_the_release():
     assert masked_counts(continuous, 4) == [236, 181, 97, 0]
 
 
+def test_where_half_of_a_frame_stays_masked_the_last_bit_is_the_release_s():
+    """cos(pi/2 2/3) comes out a little above or below 1/2, by the order of its products: one token more or less."""
+    discrete = model_config(tokens=256)
+    assert [masked_counts(discrete, steps)[2 * steps // 3 - 1] for steps in (3, 39, 51)] == [129, 129, 129]
+    continuous = model_config(tokens=256, diffusion=DIFFUSION)
+    assert [masked_counts(continuous, steps)[2 * steps // 3 - 1] for steps in (3, 39, 51)] == [128, 127, 127]
+
+
 def jitted_rollout(declared, batch, actions, keys, decode, prompt, **options):
     """params -> frames of one rollout of `batch` from `prompt` frames."""
     return jax.jit(
