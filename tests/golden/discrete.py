@@ -1,4 +1,4 @@
-"""Cases of the discrete model: logits, loss and gradients, generation, actions, training steps."""
+"""Cases of the discrete model: logits, loss and gradients, generation."""
 
 from __future__ import annotations
 
@@ -9,17 +9,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import DecodeConfig, MaskingConfig, OptimizerConfig
+from hma_jax.config import DecodeConfig, MaskingConfig
 from hma_jax.generation import rollout
 from hma_jax.generation.decoding import Frame, masked_counts, sample_tokens, unmask
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import is_spec
 from hma_jax.objective.losses import masked_loss, smoothed_cross_entropy
 from hma_jax.objective.masking import Masked
-from hma_jax.training.optimizer import apply_adamw, clip_by_global_norm, init_adam, learning_rate_multiplier
-from hma_jax.training.step import find_presence
 from tests.golden.case import Case, norms
 from tests.golden.mup_table import check_mup_table
 
@@ -239,125 +236,3 @@ def rolled_out(case: Case, tokens: jax.Array, prompt: int, actions: jax.Array) -
 
     start = tokens[:, :prompt]
     return jnp.concatenate([start, run(case.params, start)], axis=1)
-
-
-# --- Actions -----------------------------------------------------------------------------------
-
-
-def check_joint(case: Case) -> None:
-    ids, masked = windows(case, "tokens")
-    batch = len(ids)
-    everything = jnp.ones(ids.shape[:2], bool)
-
-    @jax.jit
-    def read(params, actions, robots, hidden):
-        model = case.declared.merge(params)
-        out = model(ids, masked, actions, robots, hidden_BT=hidden)
-        return out.said, model.action_head(out.actions, robots)
-
-    for robot in case.domains:
-        robots, chunk = case.robot(robot, batch), case.table.entries[case.table.index(robot)].chunk
-        for way, hidden in (("given", ~everything), ("policy", everything)):
-            logits, predicted = read(case.params, case.actions(robot), robots, hidden)
-            check_channels_first(case, f"states_{way}__{robot}", logits)
-            case.check(f"actions_{way}__{robot}", predicted[..., :chunk])
-        raw = case.table.unnormalise(predicted, robots)
-        case.check(f"actions_policy_unnormalized__{robot}", raw[..., :chunk])
-    _check_joint_training(case)
-
-    tokens, _ = windows(case, "clean_tokens")
-    robot, prompt = case.domains[0], case.info["num_prompt"]
-    nothing = jnp.zeros_like(case.actions(robot))
-    window, _, out = Decoder(case, nothing, everything).generate(tokens, prompt, 1, [])
-    case.check("generate_policy_tokens", window.reshape(batch, -1))
-    robots = case.robot(robot, batch)
-    predicted = case.declared.merge(case.params).action_head(out.actions, robots)
-    raw = case.table.unnormalise(predicted, robots)
-    chunk = case.table.entries[case.table.index(robot)].chunk
-    case.check("generate_policy_actions_unnormalized", raw[..., :chunk])
-
-
-def _check_joint_training(case: Case) -> None:
-    """As released: hidden actions go on modulating, and the action loss is the mean squared error to
-    raw actions times the mean of the mask."""
-    ids, masked = windows(case, "input_ids")
-    labels, _ = windows(case, "labels")
-    robot, batch = case.domains[0], len(ids)
-    actions, robots = case.actions(robot), case.robot(robot, batch)
-    chunk = case.table.entries[case.table.index(robot)].chunk
-    hidden = jnp.asarray(case.inputs["action_mask_draw"] < case.inputs["action_drop_ratio"])[..., 0]
-    masking = replace(MASKING, setting="full", action_leak="conditioning")
-    weight = case.settings["action_loss_weight"]
-    recorded = as_masked(ids, masked, hidden)
-
-    @jax.jit
-    def gradient(params):
-        def total(p):
-            model = case.declared.merge(p)
-            loss, accuracy = loss_and_accuracy(model, recorded, labels, actions, robots, masking)
-            out = model(ids, masked, actions, robots, hidden_BT=hidden, leak=masking.action_leak)
-            predicted = model.action_head(out.actions, robots)[..., :chunk]
-            action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(
-                hidden.astype(jnp.float32)
-            )
-            return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.said)
-
-        return jax.grad(total, has_aux=True)(params)
-
-    grads, (loss, accuracy, action_loss, predicted, logits) = gradient(case.params)
-    case.check("train_loss", loss)
-    case.check("train_acc", accuracy)
-    case.check("train_action_loss", action_loss)
-    case.check("train_actions", predicted)
-    check_channels_first(case, "train_logits", logits)
-    case.check("train_action_mask", hidden[..., None])
-    named = case.official(grads)
-    case.check_group("grad", named)
-    case.check_group("gradnorm", norms(named))
-    case.check_zero(named, case.info["unused_parameters"])
-
-
-# --- Training ----------------------------------------------------------------------------------
-
-
-def check_train_steps(case: Case) -> None:
-    """Updates with absent robots, muP learning rates, clipping and decay."""
-    settings, config = case.info["optimizer"], case.run.model
-    optimizer = OptimizerConfig(
-        learning_rate=settings["lr"],
-        weight_decay=settings["weight_decay"],
-        beta1=settings["beta1"],
-        beta2=settings["beta2"],
-        epsilon=settings["eps"],
-        clip_norm=settings["max_grad_norm"],
-    )
-    specs = case.declared.specs
-    multipliers = jax.tree.map(lambda spec: learning_rate_multiplier(spec, config), specs, is_leaf=is_spec)
-    trained = jnp.ones(case.table.size, bool)
-
-    @jax.jit
-    def step(params, state, recorded, labels, actions, robots):
-        def mean_loss(p):
-            return loss_and_accuracy(case.declared.merge(p), recorded, labels, actions, robots)[0]
-
-        loss, grads = jax.value_and_grad(mean_loss)(params)
-        grads, norm = clip_by_global_norm(grads, optimizer.clip_norm)
-        presence = find_presence(recorded, robots, trained, config)
-        rate = jnp.float32(optimizer.learning_rate)
-        return *apply_adamw(grads, state, params, specs, multipliers, presence, rate, optimizer), loss, norm
-
-    params, state = case.params, init_adam(case.params, case.table.size)
-    losses, gradient_norms = [], []
-    for s, robot in enumerate(case.info["step_domains"]):
-        ids = jnp.asarray(case.inputs["input_ids"][s])
-        ids = ids.reshape(len(ids), -1, config.tokens)
-        masked = ids == config.vocab_size
-        labels = jnp.asarray(case.inputs["labels"][s]).reshape(ids.shape)
-        recorded = as_masked(jnp.where(masked, 0, ids), masked)
-        actions, robots = case.actions(f"step{s}"), case.robot(robot, len(ids))
-        params, state, loss, norm = step(params, state, recorded, labels, actions, robots)
-        losses.append(loss)
-        gradient_norms.append(norm)
-    case.check("loss_per_step", jnp.stack(losses))
-    case.check("grad_norm_before_clip_per_step", jnp.stack(gradient_norms))
-    case.check_group("final", case.official(params))

@@ -10,8 +10,10 @@ import jax
 import numpy as np
 import pytest
 
+from hma_jax.convert import read_magvit2
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from tests.golden import verify
+from tests.hma_jax.pretrained import write_published
 
 HERE = Path(__file__).parent
 CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exists())
@@ -127,6 +129,85 @@ def test_pixels_off_by_more_than_rounding_fail(copy, capsys):
     rewrite(case / "outputs.npz", change)
     assert verify.main([str(case)]) == 1
     assert "FAIL decoded_uint8_num_frames1" in said(capsys)
+
+
+# --- What other cases of the format hold ---------------------------------------------------------
+
+
+def test_a_schedule_is_compared_at_any_points(tmp_path, capsys):
+    points, values = [2 / 3, 0.0, 0.5, 1 / 3, 1.0], [0.5, 1.0, 0.5**0.5, 0.75**0.5, 6.123233995736766e-17]
+    path = tmp_path / "cosine_schedule.json"
+    path.write_text(json.dumps({"u": points, "value": values}))
+    assert verify.main([str(tmp_path)]) == 0
+    path.write_text(json.dumps({"u": points, "value": [*values[:3], values[3] + 1e-9, values[4]]}))
+    assert verify.main([str(tmp_path)]) == 1
+    assert "FAIL cosine_schedule" in said(capsys)
+
+
+def test_learning_rates_without_warm_up_start_at_once(tmp_path):
+    table = {"warmup_steps": 0, "total_steps": 10, "index": [0, 1, 9], "constant_with_warmup": [1.0, 1.0, 1.0]}
+    (tmp_path / "learning_rate.json").write_text(json.dumps(table))
+    assert verify.main([str(tmp_path)]) == 0
+
+
+def test_norms_of_changes_are_compared(copy, capsys):
+    """Those of the release's own parameters before and after; one of them is then made wrong."""
+    case = copy("13_discrete_train_steps")
+    start = {name: tensor.read() for name, tensor in read_safetensors(case / "model.safetensors").items()}
+    before = len(np.load(case / "outputs.npz").files)
+
+    def change(arrays):
+        for key in [key for key in arrays if key.startswith("final::")]:
+            name, final = key.removeprefix("final::"), arrays.pop(key)
+            arrays[f"final_change_norm::{name}"] = np.linalg.norm(final - start[name])
+        arrays["final_change_norm::pos_embed_TSC"] *= 1.01
+
+    rewrite(case / "outputs.npz", change)
+    info = json.loads((case / "case.json").read_text())
+    tolerance = {key.replace("final::", "final_change_norm::"): value for key, value in info["tolerance"].items()}
+    (case / "case.json").write_text(json.dumps(info | {"tolerance": tolerance}))
+    assert verify.main([str(case)]) == 1
+    out = said(capsys)
+    assert out.count("FAIL") == 1 and "FAIL final_change_norm::pos_embed_TSC" in out
+    assert out.count("ok   final_change_norm::") == before - 3
+
+
+def test_a_training_case_without_mup_is_trained_without_it(copy, capsys):
+    """Adam's first step moves every parameter with a gradient by the learning rate, here one and the same."""
+    case = copy("13_discrete_train_steps")
+    settings = json.loads((case / "config.json").read_text())
+    (case / "config.json").write_text(json.dumps(settings | {"use_mup": False}))
+    info = json.loads((case / "case.json").read_text())
+    optimizer = info["optimizer"] | {"weight_decay": 0.0, "eps": 1e-12}
+    name = "decoder.layers.1.mlp.fc1.weight"  # under muP by a rate of its own
+    moved = read_safetensors(case / "model.safetensors")[name].read().size ** 0.5 * optimizer["lr"]
+    steps = {"step_domains": info["step_domains"][:1], "optimizer": optimizer}
+    tolerance = {f"final_change_norm::{name}": {"atol": 0.0, "rtol": 1e-4}}
+    (case / "case.json").write_text(json.dumps(info | steps | {"mup": "off", "tolerance": tolerance}))
+    np.savez(case / "outputs.npz", **{f"final_change_norm::{name}": np.float32(moved)})
+    assert verify.main([str(case)]) == 0, said(capsys)
+
+
+@pytest.mark.parametrize("sizes", [[(12, 20)], [(20, 12), (4, 2)], []], ids=str)
+def test_images_of_any_size_that_the_levels_can_halve_are_compared(sizes, tmp_path, capsys):
+    """Of a tokenizer of two levels; without images there are ids to decode."""
+    case = write_published(tmp_path / "case", "magvit2")
+    (case / "case.json").write_text(json.dumps({"kind": "tokenizer"}))
+    ids = np.random.default_rng(1).integers(0, 64, (2, 3, 5), np.int32)
+    inputs, outputs = {"random_indices": ids}, {}
+    tokenizer = read_magvit2(case, image_size=(6, 10))
+    images = np.asarray(tokenizer.decode_fn(tokenizer.params, ids.reshape(2, 15)))
+    outputs["decoded_uint8__random_indices"] = np.moveaxis(images.astype(np.uint8), -1, 1)
+    for height, width in sizes:
+        tokenizer, name = read_magvit2(case, image_size=(height, width)), f"images_{height}x{width}"
+        images = np.random.default_rng(0).integers(0, 256, (2, height, width, 3), np.uint8)
+        inputs[name] = np.moveaxis(images, -1, 1).astype(np.float32) / 127.5 - 1
+        outputs[f"indices__{name}"] = tokenizer.encode(images).reshape(2, height // 2, width // 2)
+    np.savez(case / "inputs.npz", **inputs)
+    np.savez(case / "outputs.npz", **outputs)
+    assert verify.main([str(case)]) == 0, said(capsys)
+    rewrite(case / "inputs.npz", lambda arrays: arrays.update(random_indices=ids[:, ::-1]))
+    assert verify.main([str(case)]) == 1
 
 
 def test_a_broken_case_does_not_stop_the_others(copy, capsys):

@@ -46,9 +46,16 @@ def check_pixels(case: Case, output: str, images: jax.Array) -> None:
 # --- MAGVIT2 -----------------------------------------------------------------------------------
 
 
+def one_token(case: Case, levels: str) -> int:
+    """Pixels along one side of a token, by the settings' list of `levels`: an image size that always suits.
+
+    A tokenizer is for one size of images, but its network takes those of every size, and a case may have several.
+    """
+    return 2 ** (len(case.settings[levels]) - 1)
+
+
 def check_magvit2(case: Case) -> None:
-    size = max(x.shape[-1] for x in case.inputs.values() if x.dtype.kind == "f")
-    tokenizer = read_magvit2(case.folder, image_size=size)
+    tokenizer = read_magvit2(case.folder, image_size=one_token(case, "ch_mult"))
     network = tokenizer.declare(tokenizer.config)
     encode = jax.jit(lambda params, images: network.merge(params).encoder(images))
     decode = jax.jit(lambda params, codes: network.merge(params).decoder(codes))
@@ -76,8 +83,7 @@ def check_magvit2(case: Case) -> None:
 
 
 def check_vae(case: Case) -> None:
-    size = max(x.shape[-1] for name, x in case.inputs.items() if name.startswith("images"))
-    tokenizer = read_svd_vae(case.folder, image_size=size, patch=1)
+    tokenizer = read_svd_vae(case.folder, image_size=one_token(case, "block_out_channels"), patch=1)
     network = tokenizer.declare(tokenizer.config)
     moments = jax.jit(lambda params, images: network.merge(params).moments(images))
     for name, values in case.inputs.items():

@@ -1,6 +1,8 @@
 """python -m tests.golden.verify CASE_DIR...: compares this implementation with reference cases.
 
-Any folder of the format is taken, whatever its sizes, robots and seeds; `case.json` says its kind.
+Any folder of the format is taken, whatever its sizes, robots and seeds; `case.json` says its kind. It may hold some
+of the outputs of its kind only: images of any size, or only ids to decode; schedules at any points; parameters after
+training whole, as changes or as norms (`final`, `final_norm`, `final_change`, `final_change_norm`), with muP or without.
 Every output is compared, or named as not compared; the exit code is 1 on any failure.
 """
 
@@ -12,15 +14,15 @@ import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tests.golden import continuous, data, discrete, tables, tokenizers
+from tests.golden import continuous, data, discrete, discrete_actions, tables, tokenizers, training
 from tests.golden.case import Case
 
 KINDS: dict[str, Callable[[Case], None]] = {
     "discrete_logits": discrete.check_logits,
     "discrete_loss": discrete.check_loss,
     "discrete_generation": discrete.check_generation,
-    "discrete_joint": discrete.check_joint,
-    "discrete_train": discrete.check_train_steps,
+    "discrete_joint": discrete_actions.check_joint,
+    "discrete_train": training.check_train_steps,
     "mar_forward": continuous.check_forward,
     "mar_loss": continuous.check_loss,
     "mar_generation": continuous.check_generation,
