@@ -22,11 +22,14 @@ study: $(VENV)/installed
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8
 
+# Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py.
 test: $(VENV)/installed-test
-	$(PYTEST) -m "not slow"
+	XLA_FLAGS= $(PYTEST) -m "exact and not slow"
+	$(PYTEST) -m "not exact and not slow"
 
 test-slow: $(VENV)/installed-test
-	$(PYTEST)
+	XLA_FLAGS= $(PYTEST) -m exact
+	$(PYTEST) -m "not exact"
 
 # constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves.
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check \

@@ -12,6 +12,11 @@ CACHE = Path(__file__).parent.parent / ".jax_cache"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Tiny programs run once or twice: compiling them well costs more than it saves.
+# Tiny programs run once or twice: compiling them well costs more than it saves. Tests marked `exact` are run
+# again without this (`make test`): what is promised to be equal has to be so as users compile it.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 keep_freed_memory()
+
+
+def pytest_report_header() -> str:
+    return f"XLA_FLAGS: {os.environ['XLA_FLAGS'] or 'none, as users compile'}"

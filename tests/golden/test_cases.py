@@ -15,6 +15,8 @@ from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from tests.golden import verify
 from tests.hma_jax.pretrained import write_published
 
+pytestmark = pytest.mark.exact
+
 HERE = Path(__file__).parent
 CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exists())
 

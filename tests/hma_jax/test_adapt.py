@@ -11,6 +11,8 @@ from hma_jax.model.hma import declare_model
 from hma_jax.training.adapt import add_embodiments
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
+pytestmark = pytest.mark.exact
+
 NEWCOMERS = (
     Embodiment("humanoid", 26, 3, (0.1,) * 26, (2.0,) * 26),  # wider than anyone before
     Embodiment("cart", 1, 1, (0.0,), (1.0,)),
@@ -44,6 +46,28 @@ def test_old_robots_answers_stay_bit_identical(diffusion, conditioning: str):
     after = answer(declare_model(config, table), wider, table)
     np.testing.assert_array_equal(before[0], after[0])
     np.testing.assert_array_equal(before[1], after[1])
+
+
+@pytest.mark.parametrize(("rows", "frames"), [(1, 1), (3, 4), (8, 6)])
+def test_an_old_robot_s_answer_does_not_depend_on_how_wide_the_table_is(rows: int, frames: int):
+    """Kernels choose their blocks by the shapes they get: none of these may be the table's."""
+    config = model_config(layers=1, frames=max(frames, 2))
+    declared, params = lively_params(config)
+    batch = {k: v[:rows] for k, v in random_batch(0, config).items()}
+    tokens = batch["tokens"][:, :frames]
+
+    def answer(declared, params, width: int) -> tuple[jax.Array, jax.Array]:
+        actions = np.pad(batch["actions"][:, :frames], ((0, 0), (0, 0), (0, width - TABLE.action_width)))
+        out = jax.jit(lambda p: declared.merge(p)(tokens, None, actions, batch["embodiment"]))(params)
+        return out.said, out.actions
+
+    said, pooled = answer(declared, params, TABLE.action_width)
+    for width in (1, 33, 300):
+        newcomer = Embodiment("newcomer", width, 1, (0.1,) * width, (2.0,) * width)
+        wider, table = add_embodiments(params, config, TABLE, (newcomer,), seed=3)
+        again = answer(declare_model(config, table), wider, table.action_width)
+        np.testing.assert_array_equal(again[0], said)
+        np.testing.assert_array_equal(again[1], pooled)
 
 
 def test_new_robots_start_as_they_would_have_from_the_beginning():

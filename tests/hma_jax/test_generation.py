@@ -18,6 +18,8 @@ from hma_jax.generation import (
 from hma_jax.generation.decoding import Frame, masked_counts, unmask
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
+pytestmark = pytest.mark.exact
+
 SAMPLER = SamplerConfig(steps=5)
 
 

@@ -3,11 +3,14 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from hma_jax.config import DecodeConfig, DiffusionConfig, SamplerConfig
 from hma_jax.generation import read_actions
 from hma_jax.model.hma import Outputs
 from tests.tiny import lively_params, model_config
+
+pytestmark = pytest.mark.exact
 
 
 def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():

@@ -47,6 +47,7 @@ def dying_batches(after: int):
     return make
 
 
+@pytest.mark.exact
 def test_a_run_that_broke_and_resumed_is_byte_equal_to_one_that_did_not(tmp_path: Path):
     whole = train(tmp_path / "whole")
     with pytest.raises(OSError):
@@ -91,6 +92,7 @@ def test_a_checkpoint_of_another_configuration_is_refused_by_name(tmp_path: Path
         train(tmp_path, provenance={"data": "other"})
 
 
+@pytest.mark.exact
 def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path):
     def stop_at_three(step: int, steps: int, metrics: dict) -> None:
         if step == 3:
@@ -127,6 +129,7 @@ def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path
     assert [json.loads(line)["step"] for line in log.read_text().splitlines()] == [1, 2, 3, 4, 5, 6]
 
 
+@pytest.mark.exact
 def test_micro_batches_change_nothing_but_rounding(tmp_path: Path):
     whole = train(tmp_path / "whole")
     split = train(tmp_path / "split", execution=ExecutionConfig(accumulate=4))

@@ -13,6 +13,8 @@ import pytest
 
 from hma_jax.training.checkpoints import read_checkpoint
 
+pytestmark = pytest.mark.exact
+
 ROOT = Path(__file__).parents[2]
 
 

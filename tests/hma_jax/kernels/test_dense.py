@@ -14,6 +14,8 @@ from hma_jax.kernels.dense import (
 )
 from tests.hma_jax.kernels.test_attention import check_equal, drawn
 
+pytestmark = pytest.mark.exact
+
 ROBOTS = jnp.array([2, 0, 2, 3, 2])
 
 
@@ -53,13 +55,13 @@ WIDTHS = [1, 2, 7, 31, 32, 33, 64, 65, 100, 176, 300]
 
 @pytest.mark.parametrize("rows, out", [((4, 6), 32), ((1, 1), 24), ((3, 12), 256)], ids=str)
 def test_padding_the_action_axis_changes_no_bit(rows: tuple, out: int):
-    """Each width in a program of its own, padded to all larger ones."""
+    """Each width in a program of its own, padded to the next larger ones and to the largest."""
     into, back = jax.jit(from_actions), jax.jit(to_actions)
     for width in WIDTHS:
         x, w = drawn(width, *rows, width), drawn(1, width, out)
         features = drawn(2, *rows, out)
         want, columns = into(x, w), back(features, w.T)
-        for wider in WIDTHS[WIDTHS.index(width) :]:
+        for wider in {*WIDTHS[WIDTHS.index(width) :][1:3], WIDTHS[-1]}:
             more = wider - width
             got = into(jnp.pad(x, [(0, 0)] * len(rows) + [(0, more)]), jnp.pad(w, [(0, more), (0, 0)]))
             np.testing.assert_array_equal(got, want)
