@@ -89,7 +89,7 @@ def make_record(kind: str, subject: str, command: str, **fields: Any) -> BenchRe
         command,
         date=time.strftime("%Y-%m-%d"),
         machine=describe_machine(jax.devices()),
-        peak_flops_per_second=peak_flops() or 0.0,
+        peak_flops_per_second=peak_flops(fields["dtype"]) or 0.0,
         peak_memory_bytes=peak_memory_bytes(),
         **fields,
     )

@@ -1,8 +1,10 @@
-"""Layer norm without its parameters, GELU, a feature on every token: formulas with their gradients.
+"""Layer norm, GELU, vectors that meet arrays: formulas with their gradients.
 
 The gradients are the usual ones. They are written out so that a backward pass keeps no more than it needs,
 and so that XLA's CPU compiler is not given what it is slow at: a sum over the last axis of a product of two
-arrays, which it computes many times slower than a product with a vector of ones.
+arrays, which it computes many times slower than a product with a vector of ones. What all rows share has
+a gradient that is summed over all of them, in float32 whatever the type of the rows: in bfloat16 a sum of
+thousands of terms would stop growing at a few hundred.
 """
 
 from __future__ import annotations
@@ -79,3 +81,52 @@ def _over_tokens_backward(tokens: int, _: None, dy: jax.Array) -> tuple[jax.Arra
 
 
 over_tokens.defvjp(lambda x, tokens: (over_tokens(x, tokens), None), _over_tokens_backward)
+
+
+# --- Vectors that rows share -----------------------------------------------------------------------
+
+
+@jax.custom_vjp
+def shifted(x: jax.Array, shift: jax.Array) -> jax.Array:
+    """x + shift in the type of x; `shift` broadcasts."""
+    return x + shift.astype(x.dtype)
+
+
+shifted.defvjp(lambda x, shift: (shifted(x, shift), shift), lambda shift, dy: (dy, _sum_to(dy, shift)))
+
+
+@jax.custom_vjp
+def scaled(x: jax.Array, scale: jax.Array) -> jax.Array:
+    """x * scale in the type of x; `scale` broadcasts."""
+    return x * scale.astype(x.dtype)
+
+
+def _scaled_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, scale = saved
+    return dy * scale.astype(dy.dtype), _sum_to(dy.astype(jnp.float32) * x.astype(jnp.float32), scale)
+
+
+scaled.defvjp(lambda x, scale: (scaled(x, scale), (x, scale)), _scaled_backward)
+
+
+@jax.custom_vjp
+def replaced(x: jax.Array, where: jax.Array, vector: jax.Array) -> jax.Array:
+    """x [..., D] in its type, `vector` (which broadcasts) where bool `where` [...] says."""
+    return jnp.where(where[..., None], vector.astype(x.dtype), x)
+
+
+def _replaced_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array) -> tuple[jax.Array, None, jax.Array]:
+    where, vector = saved
+    where = where[..., None]
+    return jnp.where(where, 0, dy), None, _sum_to(jnp.where(where, dy, 0), vector)
+
+
+replaced.defvjp(lambda x, where, vector: (replaced(x, where, vector), (where, vector)), _replaced_backward)
+
+
+def _sum_to(dy: jax.Array, like: jax.Array) -> jax.Array:
+    """The gradient of what broadcast from the shape of `like`, in its type; summed in float32."""
+    leading = dy.ndim - like.ndim
+    axes = [axis for axis in range(dy.ndim) if axis < leading or like.shape[axis - leading] < dy.shape[axis]]
+    total = jnp.sum(dy.astype(jnp.float32), axis=axes, keepdims=True)
+    return total.reshape(like.shape).astype(like.dtype)

@@ -12,6 +12,7 @@ from hma_jax.config import ExecutionConfig, ModelConfig
 from hma_jax.kernels import remat
 from hma_jax.kernels.attention import find_backend
 from hma_jax.kernels.dense import contract
+from hma_jax.kernels.pointwise import shifted
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm
 from hma_jax.model.params import bias, param
@@ -55,7 +56,7 @@ class Attention(nnx.Module):
         """x [..., D] -> queries, keys and values [..., 3, H, I]."""
         qkv = contract(x, self.qkv.astype(x.dtype))
         if self.qkv_bias is not None:
-            qkv = qkv + self.qkv_bias.astype(x.dtype)
+            qkv = shifted(qkv, self.qkv_bias.get_value())
         qkv = remat.product(qkv)
         if self.norm is None:
             return qkv
@@ -64,7 +65,7 @@ class Attention(nnx.Module):
     def project_out(self, y: jax.Array) -> jax.Array:
         """y [..., H, I] -> [..., D]."""
         out = contract(y, self.out.astype(y.dtype), 2)
-        return out if self.out_bias is None else out + self.out_bias.astype(y.dtype)
+        return out if self.out_bias is None else shifted(out, self.out_bias.get_value())
 
     def over_space(self, x_BTPD: jax.Array) -> jax.Array:
         """Every token sees every token of its own frame."""

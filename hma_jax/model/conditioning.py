@@ -15,7 +15,7 @@ from flax import nnx
 from hma_jax.config import ModelConfig
 from hma_jax.kernels import plain, remat
 from hma_jax.kernels.dense import per_robot
-from hma_jax.kernels.pointwise import layer_norm, over_tokens
+from hma_jax.kernels.pointwise import layer_norm, over_tokens, scaled, shifted
 from hma_jax.model.attention import attention_scale
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, own
@@ -121,7 +121,7 @@ class CrossAttention(nnx.Module):
     def _heads(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """[B, ..., D] -> [B, ..., H, I], a layer norm over each head."""
         x = layer_norm(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
-        return x * own(self.gain, slice_B, x) + own(self.bias, slice_B, x)
+        return shifted(scaled(x, own(self.gain, slice_B, x)), own(self.bias, slice_B, x))
 
 
 def _where_shown(action: ActionFeature, y: jax.Array) -> jax.Array:

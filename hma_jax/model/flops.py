@@ -57,22 +57,23 @@ def train_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float
     return 3.0 * forward_flops_per_window(config, table)
 
 
-PEAK_BF16_FLOPS = {
-    "NVIDIA H100": 989e12,
-    "NVIDIA H200": 989e12,
-    "NVIDIA A100": 312e12,
-    "TPU v4": 275e12,
-    "TPU v5 lite": 197e12,
-    "TPU v5p": 459e12,
-    "TPU v6 lite": 918e12,
+PEAK_FLOPS = {
+    "NVIDIA H100": (989e12, 495e12),
+    "NVIDIA H200": (989e12, 495e12),
+    "NVIDIA A100": (312e12, 156e12),
+    "TPU v4": (275e12, 275e12),
+    "TPU v5 lite": (197e12, 197e12),
+    "TPU v5p": (459e12, 459e12),
+    "TPU v6 lite": (918e12, 918e12),
 }
-"""Dense bf16 peak per device by the start of its kind, from the makers' data sheets."""
+"""Dense peak per device by the start of its kind, from the makers' data sheets: of products of bfloat16, and of
+float32 as JAX multiplies it by default, which is TF32 on NVIDIA and one bfloat16 pass on TPU."""
 
 
-def peak_flops() -> float | None:
-    """Of all this program's devices together; None where the kind is unknown (CPUs)."""
+def peak_flops(dtype: str) -> float | None:
+    """Of products of `dtype`, on all this program's devices together; None where the kind is unknown (CPUs)."""
     kind = jax.devices()[0].device_kind
-    for prefix, peak in PEAK_BF16_FLOPS.items():
+    for prefix, (bfloat16, float32) in PEAK_FLOPS.items():
         if kind.startswith(prefix):
-            return peak * jax.device_count()
+            return (bfloat16 if dtype == "bfloat16" else float32) * jax.device_count()
     return None

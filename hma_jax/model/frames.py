@@ -13,6 +13,7 @@ from flax import nnx
 
 from hma_jax.config import DiffusionConfig, ModelConfig
 from hma_jax.kernels.dense import look_up
+from hma_jax.kernels.pointwise import replaced
 from hma_jax.model.initial import input_fan_out, readout_init, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
 from hma_jax.model.params import normal, param, used, xavier_uniform, zeros
@@ -70,7 +71,7 @@ class TokenEmbed(nnx.Module):
         q, v, _ = self.tables.shape
         digits = factorise(ids, q, v)
         x = sum(look_up(self.tables[i], digits[..., i]) for i in range(q)).astype(dtype)
-        return x if masked is None else jnp.where(masked[..., None], self.mask.astype(dtype), x)
+        return x if masked is None else replaced(x, masked, self.mask.get_value())
 
 
 class LatentEmbed(nnx.Module):

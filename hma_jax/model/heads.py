@@ -16,7 +16,7 @@ from flax import nnx
 
 from hma_jax.config import ExecutionConfig, ModelConfig
 from hma_jax.kernels.dense import contract, from_actions, take_by_robot, to_actions
-from hma_jax.kernels.pointwise import layer_norm
+from hma_jax.kernels.pointwise import layer_norm, shifted
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import readout_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear
@@ -93,13 +93,13 @@ class Denoiser(nnx.Module):
     def _into(self, x: jax.Array) -> jax.Array:
         if not self.of_actions:
             return self.into(x)
-        return from_actions(x, self.into.kernel.astype(x.dtype)) + self.into.bias.astype(x.dtype)
+        return shifted(from_actions(x, self.into.kernel.astype(x.dtype)), self.into.bias.get_value())
 
     def _out(self, x: jax.Array) -> jax.Array:
         """[..., F] -> [..., 2 C]."""
         w = self.out.astype(x.dtype)
         both = jnp.stack([to_actions(x, w[:, k]) for k in (0, 1)], -2) if self.of_actions else contract(x, w)
-        y = both + self.out_bias.astype(x.dtype)
+        y = shifted(both, self.out_bias.get_value())
         return y.reshape(*y.shape[:-2], -1)
 
 

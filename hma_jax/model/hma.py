@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ExecutionConfig, ModelConfig
+from hma_jax.kernels.pointwise import over_tokens, replaced, shifted
 from hma_jax.model.conditioning import ActionFeature
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import make_embed, make_frame_head
@@ -102,7 +103,7 @@ class HMA(nnx.Module):
             action = ActionFeature(feature, shown)
             if config.concat:
                 x = jnp.concatenate([x, self._action_tokens(feature, hidden_BT, leak, positions)], axis=2)
-        x = x + jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]].astype(self.dtype)
+        x = shifted(x, jnp.take(self.positions.get_value(), positions, axis=0)[:, : x.shape[2]])
         if self.norm is not None:
             x = self.norm(x)
         x = constrain(x, ("B", None, None, "D_act"))
@@ -117,10 +118,9 @@ class HMA(nnx.Module):
     ) -> jax.Array:
         """K copies of each frame's feature, or of its learned vector where it is hidden."""
         if hidden_BT is not None and leak != "all":
-            vector = jnp.take(self.action_mask.get_value(), positions, axis=0).astype(feature_BTD.dtype)
-            feature_BTD = jnp.where(hidden_BT[..., None], vector, feature_BTD)
-        b, t, d = feature_BTD.shape
-        return jnp.broadcast_to(feature_BTD[:, :, None], (b, t, self.config.action_tokens, d))
+            vectors_TD = jnp.take(self.action_mask.get_value(), positions, axis=0)
+            feature_BTD = replaced(feature_BTD, hidden_BT, vectors_TD)
+        return over_tokens(feature_BTD, self.config.action_tokens)
 
     def align(self, actions: jax.Array) -> jax.Array:
         """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own as released,

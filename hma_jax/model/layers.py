@@ -15,7 +15,7 @@ from hma_jax.kernels.dense import (
     per_robot_to_actions,
     take_by_robot,
 )
-from hma_jax.kernels.pointwise import layer_norm
+from hma_jax.kernels.pointwise import layer_norm, scaled, shifted
 from hma_jax.model.params import Initializer, Role, bias, ones, param
 
 BLOCK_EPS = 1e-5
@@ -31,7 +31,7 @@ class LayerNorm(nnx.Module):
         self.eps = eps
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        return layer_norm(x, self.eps) * self.gain.astype(x.dtype) + self.bias.astype(x.dtype)
+        return shifted(scaled(layer_norm(x, self.eps), self.gain.get_value()), self.bias.get_value())
 
 
 class Linear(nnx.Module):
@@ -52,7 +52,7 @@ class Linear(nnx.Module):
     def __call__(self, x: jax.Array, dtype: jnp.dtype | None = None) -> jax.Array:
         """x [..., in] -> [..., out] in the type of x, or in `dtype`, which is then that of the sum."""
         y = contract(x, self.kernel.astype(x.dtype), dtype=dtype)
-        return y if self.bias is None else y + self.bias.astype(y.dtype)
+        return y if self.bias is None else shifted(y, self.bias.get_value())
 
 
 class EmbodimentLinear(nnx.Module):
@@ -73,7 +73,7 @@ class EmbodimentLinear(nnx.Module):
 
     def __call__(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
-        return self.map(x, self.kernel.astype(x.dtype), slice_B) + own(self.bias, slice_B, x)
+        return shifted(self.map(x, self.kernel.astype(x.dtype), slice_B), own(self.bias, slice_B, x))
 
 
 def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
@@ -85,6 +85,6 @@ def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array
 
 
 def own(vectors: nnx.Param, slice_B: jax.Array, like: jax.Array) -> jax.Array:
-    """Each example's own vector [E, D] -> [B, 1, ..., D], to meet `like` [B, ..., D] in its type."""
-    taken = take_by_robot(vectors.astype(like.dtype), slice_B)
+    """Each example's own vector [E, D] -> [B, 1, ..., D], to meet `like` [B, ..., D]."""
+    taken = take_by_robot(vectors.get_value(), slice_B)
     return taken.reshape(len(taken), *(1,) * (like.ndim - 2), -1)

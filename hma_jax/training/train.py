@@ -82,7 +82,7 @@ def train_model(
             options=replace(
                 options,
                 flops_per_step=config.batch * train_flops_per_window(model, table),
-                peak_flops=peak_flops(),
+                peak_flops=peak_flops(execution.dtype),
                 may_change=extendable,
             ),
             progress=progress,

@@ -1,8 +1,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from hma_jax.kernels.pointwise import gelu, layer_norm, over_tokens
+from hma_jax.kernels.pointwise import gelu, layer_norm, over_tokens, replaced, scaled, shifted
 
 
 def drawn(seed: int, *shape: int) -> np.ndarray:
@@ -35,3 +36,21 @@ def test_the_gradient_over_tokens_is_their_sum():
     check_values_and_gradients(
         lambda x: over_tokens(x, 7), lambda x: jnp.repeat(x[:, :, None], 7, axis=2), drawn(0, 2, 3, 4)
     )
+
+
+@pytest.mark.parametrize("shape", [(4,), (3, 1, 4), (2, 1, 1, 4), (5, 4)], ids=str)
+def test_vectors_meet_rows_of_any_shape(shape: tuple[int, ...]):
+    x, v, here = drawn(0, 2, 3, 5, 4), drawn(1, *shape), drawn(2, 2, 3, 5) > 0
+    check_values_and_gradients(shifted, lambda x, v: x + v, x, v)
+    check_values_and_gradients(scaled, lambda x, v: x * v, x, v)
+    check_values_and_gradients(lambda x, v: replaced(x, here, v), lambda x, v: jnp.where(here[..., None], v, x), x, v)
+
+
+@pytest.mark.parametrize(
+    "meet", [shifted, lambda x, v: scaled(x + 1, v), lambda x, v: replaced(x, jnp.ones(len(x), bool), v)]
+)
+def test_the_gradient_of_what_rows_share_is_summed_in_float32(meet):
+    """In bfloat16 a running sum stops growing at a few hundred equal terms."""
+    x, v = jnp.zeros((4097, 2), jnp.bfloat16), jnp.ones(2)
+    gradient = jax.grad(lambda v: jnp.sum(meet(x, v).astype(jnp.float32)))(v)
+    np.testing.assert_array_equal(gradient, [4097, 4097])
