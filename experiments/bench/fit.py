@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, ModelConfig, TrainConfig
+from hma_jax.kernels.attention import backend_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_window
 from hma_jax.model.hma import declare_model
@@ -70,6 +71,8 @@ def check_fit(
     model: ModelConfig, table: EmbodimentTable, train: TrainConfig, execution: ExecutionConfig, devices: list[Any]
 ) -> Fit:
     """Compiles the training step for `devices`. Raises ConfigError if the mesh does not suit them."""
+    if execution.attention == "auto":  # of those devices, not of this machine's
+        execution = replace(execution, attention=backend_of(devices[0].platform))
     declared = declare_model(model, table, execution)
     mesh_config = execution.mesh
     mesh = make_mesh(mesh_config, devices)

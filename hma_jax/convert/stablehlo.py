@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from hma_jax.config import ConfigError, DecodeConfig, ModelConfig, require
+from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, ModelConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.neutral import describe_tensors
@@ -67,7 +67,8 @@ def generate_function(
     [B, T, U], raw and padded with zeros; embodiment int32 [B]; key uint32 [2], of which every row
     of the batch derives its own random numbers.
     """
-    declared = declare_model(model, table)
+    # One program for every platform: none of them may be a single platform's own.
+    declared = declare_model(model, table, ExecutionConfig(attention="plain"))
 
     def generate(weights, prompt, actions, embodiment, key):
         base = jax.random.wrap_key_data(key, impl="threefry2x32")
@@ -123,7 +124,10 @@ def _describe(
     run: Run, config: ProgramConfig, inputs: dict[str, jax.ShapeDtypeStruct], exported: export.Exported
 ) -> dict[str, Any]:
     tensors = describe_tensors(declare_model(run.model, run.table).leaves())
-    of_array = lambda x: {"shape": list(x.shape), "dtype": x.dtype.name}  # noqa: E731
+
+    def of_array(x: jax.ShapeDtypeStruct) -> dict[str, Any]:
+        return {"shape": list(x.shape), "dtype": x.dtype.name}
+
     order = [
         {"name": f"weights/{name}", "shape": t["shape"], "dtype": "float32"}
         for name, t in sorted(tensors.items())

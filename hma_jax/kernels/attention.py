@@ -42,9 +42,14 @@ BACKENDS = {
 OF_PLATFORM = {"cpu": "cpu", "gpu": "cudnn", "cuda": "cudnn", "tpu": "splash"}
 
 
+def backend_of(platform: str) -> str:
+    """The name of what `auto` means on a platform as JAX calls it."""
+    return OF_PLATFORM.get(platform, "plain")
+
+
 def find_backend(name: str) -> Backend:
     """The backend called `name`; `auto` is the one of the default device's platform."""
     if name == "auto":
-        name = OF_PLATFORM.get(jax.default_backend(), "plain")
+        name = backend_of(jax.default_backend())
     require(name in BACKENDS, f"execution.attention {name!r} is unknown; known: auto, {', '.join(BACKENDS)}")
     return BACKENDS[name]
