@@ -15,7 +15,7 @@ from hma_jax.config import TokenizerConfig
 from hma_jax.evaluation.metrics import Stat, mean_and_sem, psnr
 from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.base import Tokenizer
-from hma_jax.tokenizers.network import Autoencoder, normalise, to_pixels
+from hma_jax.tokenizers.network import Autoencoder, from_pixels, to_pixels
 from hma_jax.tokenizers.shared import BaseTokenizer
 
 
@@ -34,7 +34,7 @@ class AutoencoderTokenizer(BaseTokenizer):
         return declare_tokenizer(config)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
-        return self._from_latents(self._declared.merge(params).encoder(normalise(images)))
+        return self._from_latents(self._declared.merge(params).encoder(from_pixels(images)))
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         return to_pixels(self._declared.merge(params).decoder(self._to_latents(tokens)))

@@ -76,6 +76,11 @@ class Tokenizer(Protocol):
     @property
     def params(self) -> Params: ...
 
+    @property
+    def piece(self) -> int:
+        """Images that a device takes at a time."""
+        ...
+
     def encode(self, images: np.ndarray) -> np.ndarray:
         """uint8 [B, height, width, 3] -> int32 [B, S] or float32 [B, S, C]."""
         ...
@@ -86,6 +91,10 @@ class Tokenizer(Protocol):
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         """Pure, for use inside a jit: what `encode` makes -> float32 [B, ...] in 0..255."""
+        ...
+
+    def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure, for use inside a jit: `decode_fn` rounded as `decode` does it."""
         ...
 
 

@@ -8,10 +8,11 @@ import jax
 import numpy as np
 
 from hma_jax.config import TokenizerConfig, require
+from hma_jax.model.frames import factorise
 from hma_jax.model.params import Params
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
 from hma_jax.tokenizers.base import Tokenizer
-from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids, split_factors
+from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
 
 
 class LfqTokenizer(AutoencoderTokenizer):
@@ -34,7 +35,7 @@ class LfqTokenizer(AutoencoderTokenizer):
 
 def code_usage(tokenizer: Tokenizer, images: np.ndarray) -> tuple[float, ...]:
     """Perplexity of each factor's code distribution over all positions of `images`; at most V."""
-    digits = np.asarray(split_factors(tokenizer.encode(images), tokenizer.factors, tokenizer.factor_vocab))
+    digits = np.asarray(factorise(tokenizer.encode(images), tokenizer.factors, tokenizer.factor_vocab))
     usage = []
     for factor in range(tokenizer.factors):
         counts = np.bincount(digits[..., factor].ravel())

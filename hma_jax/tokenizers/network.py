@@ -110,7 +110,7 @@ class Autoencoder(nnx.Module):
         self.decoder = Decoder(config)
 
 
-def normalise(images: jax.Array) -> jax.Array:
+def from_pixels(images: jax.Array) -> jax.Array:
     """uint8 or float images in 0..255 to float32 in -1..1."""
     return images.astype(jnp.float32) / 127.5 - 1.0
 

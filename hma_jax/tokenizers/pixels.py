@@ -14,7 +14,7 @@ from flax import nnx
 from hma_jax.config import PixelsConfig
 from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
-from hma_jax.tokenizers.network import normalise, to_pixels
+from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.shared import BaseTokenizer
 
 
@@ -33,7 +33,7 @@ class PixelTokenizer(BaseTokenizer):
         return declare(nnx.Module)  # no parameters
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
-        return patchify(normalise(images) / self.config.std, self.config.patch)
+        return patchify(from_pixels(images) / self.config.std, self.config.patch)
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
         return to_pixels(unpatchify(tokens, self.config.patch, self.config.grid_shape[1]) * self.config.std)

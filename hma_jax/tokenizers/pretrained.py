@@ -20,7 +20,7 @@ from hma_jax.model.frames import patchify, unpatchify
 from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.base import PIECE, in_pieces
 from hma_jax.tokenizers.magvit2 import Magvit2
-from hma_jax.tokenizers.network import normalise, to_pixels
+from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
 from hma_jax.tokenizers.shared import BaseTokenizer
 from hma_jax.tokenizers.svd_vae import SvdVae
@@ -51,7 +51,7 @@ class Magvit2Tokenizer(BaseTokenizer):
         return _piece(config)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
-        z = self._declared.merge(params).encoder(normalise(images))
+        z = self._declared.merge(params).encoder(from_pixels(images))
         return rearrange(latents_to_ids(z), "b h w -> b (h w)")
 
     def decode_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
@@ -74,7 +74,7 @@ class SvdVaeTokenizer(BaseTokenizer):
         return _piece(config)
 
     def encode_fn(self, params: Params, images: jax.Array) -> jax.Array:
-        mean, _ = self._declared.merge(params).moments(normalise(images))
+        mean, _ = self._declared.merge(params).moments(from_pixels(images))
         return self.tokens_of(mean)
 
     def decode_fn(self, params: Params, tokens: jax.Array, frames: int = 1) -> jax.Array:

@@ -29,11 +29,6 @@ def ids_to_codes(ids: jax.Array, bits: int) -> jax.Array:
     return 2.0 * bit.astype(jnp.float32) - 1.0
 
 
-def split_factors(ids: jax.Array, factors: int, factor_vocab: int) -> jax.Array:
-    """Factor ids [..., Q] of token ids [...]; factor 0 holds the low bits."""
-    return ids[..., None] // factor_vocab ** jnp.arange(factors, dtype=ids.dtype) % factor_vocab
-
-
 def nearest_code(z: jax.Array) -> jax.Array:
     """Code values in {-1, +1} of latents, without a gradient; 0 counts as negative."""
     return jax.lax.stop_gradient(jnp.where(z > 0, 1.0, -1.0).astype(z.dtype))

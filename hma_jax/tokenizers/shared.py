@@ -65,7 +65,7 @@ class BaseTokenizer(abc.ABC):
         self._declared = declared
         self._mesh = make_mesh(MeshConfig(), list(devices or jax.local_devices()))
         self._encode = self._shared_out(self.encode_fn)
-        self._decode = self._shared_out(self._decode_to_uint8)
+        self._decode = self._shared_out(self.decode_uint8_fn)
 
     @classmethod
     @abc.abstractmethod
@@ -159,7 +159,8 @@ class BaseTokenizer(abc.ABC):
         tokens = self._checked(np.asarray(tokens))
         return in_pieces(lambda piece: self._decode(self._placed, piece), tokens, self.at_once)
 
-    def _decode_to_uint8(self, params: Params, tokens: jax.Array) -> jax.Array:
+    def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure: what `decode` does to tokens that are known to be some."""
         # DIFFERS: the release truncates, which darkens every image by half a grey level.
         return jnp.round(self.decode_fn(params, tokens)).astype(jnp.uint8)
 

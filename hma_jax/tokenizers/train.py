@@ -21,7 +21,7 @@ from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokeniz
 from hma_jax.tokenizers.continuous import make_continuous
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
-from hma_jax.tokenizers.network import normalise
+from hma_jax.tokenizers.network import from_pixels
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
 from hma_jax.training.loop import LoopOptions, Progress, fit
 from hma_jax.training.state import TrainState
@@ -85,7 +85,7 @@ def tokenizer_loss(
     """(loss, metrics) of images [B, H, W, 3] in 0..255: squared error of what comes back through
     quantised or noisy latents, plus the quantiser's terms. `key` is for the noise."""
     model = declared.merge(params)
-    target = normalise(images)
+    target = from_pixels(images)
     z = model.encoder(target)
     if config.quantise:
         passed, (penalty, terms) = quantize(z), _regularisers(z, config)

@@ -13,7 +13,7 @@ from hma_jax.config import AnyTokenizerConfig, ConfigError, Magvit2Config, Pixel
 from hma_jax.config.json import from_dict, from_json, to_json
 from hma_jax.model.frames import compose, factorise
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
-from hma_jax.tokenizers.network import normalise, to_pixels
+from hma_jax.tokenizers.network import from_pixels, to_pixels
 from hma_jax.tokenizers.quantizer import ids_to_codes
 from tests.hma_jax.pretrained import MAGVIT2_SMALL, PIXELS_SMALL, VAE_SMALL, make, noise
 
@@ -183,7 +183,7 @@ def test_a_square_is_written_as_one_number_and_keeps_its_identity():
 def test_bit_k_of_an_id_is_the_sign_of_channel_k_and_factor_0_holds_the_low_ones(magvit2):
     images = noise(3)
     network = magvit2.declare(magvit2.config)
-    z = jax.jit(lambda p, x: network.merge(p).encoder(normalise(x)))(magvit2.params, images)
+    z = jax.jit(lambda p, x: network.merge(p).encoder(from_pixels(x)))(magvit2.params, images)
     bits = (np.asarray(z) > 0).reshape(3, -1, 6)
     ids = magvit2.encode(images)
     assert np.array_equal(ids, (bits * 2 ** np.arange(6)).sum(-1))
@@ -198,7 +198,7 @@ def test_bit_k_of_an_id_is_the_sign_of_channel_k_and_factor_0_holds_the_low_ones
 def test_tokens_are_patches_of_the_scaled_mean_and_cells_undo_it(vae):
     images = noise(2)
     network = vae.declare(vae.config)
-    mean = jax.jit(lambda p, x: network.merge(p).moments(normalise(x))[0])(vae.params, images)
+    mean = jax.jit(lambda p, x: network.merge(p).moments(from_pixels(x))[0])(vae.params, images)
     mean = np.asarray(mean)  # [B, 8, 8, 4]
     tokens = vae.encode(images)
     assert tokens.shape == (2, 16, 16)
