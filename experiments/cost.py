@@ -62,14 +62,15 @@ def estimate(trial: Trial) -> Cost:
     from hma_jax.model.hma import declare_model
 
     table, config = declared_table(trial.datasets), trial.eval
-    rows = -(-config.windows_per_dataset // config.batch) * config.batch  # the last batch is filled up
+    windows = len(trial.evaluated) * config.windows_per_dataset
+    batches = -(-windows // config.batch)  # the last one is filled up
     if trial.measure_untrained:
-        rows += config.batch
+        batches += -(-len(trial.evaluated) * min(config.batch, config.windows_per_dataset) // config.batch)
     return Cost(
         parameters=declare_model(trial.model, table).count(),
         parameters_one_robot=declare_model(trial.model, ONE_ROBOT).count(),
         train_flops=train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
-        evaluation_flops=len(trial.evaluated) * rows * evaluation_flops_per_window(trial, table),
+        evaluation_flops=batches * config.batch * evaluation_flops_per_window(trial, table),
     )
 
 

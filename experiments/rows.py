@@ -36,12 +36,12 @@ LAST = 0.1
 """The part of a run's steps that these are."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
-    """One number with its standard error over `n` windows (the training loss: steps), and where it
-    comes from.
+    """One number with its standard error, and where it comes from.
 
-    A trial without a result has one row per sweep, with `metric` empty.
+    It is a mean over `n` windows of `episodes` episodes, which the error counts (the training loss: over
+    `n` steps, `episodes` 0). A trial without a result has one row per sweep, with `metric` empty.
     """
 
     sweep: str
@@ -57,6 +57,7 @@ class Row:
     mean: float
     sem: float
     n: int
+    episodes: int = 0
     parameters: int
     train_flops: float
     store: str
@@ -91,33 +92,32 @@ def collect(
 def _rows(
     sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, provenance: Provenance
 ) -> list[Row]:
-    from hma_jax.evaluation.metrics import mean_and_sem
-    from hma_jax.evaluation.protocol import Evaluation
+    from hma_jax.evaluation.statistics import Stat, mean_and_sem
+    from hma_jax.evaluation.summary import Summary
 
-    def row(role: str, scope: str, metric: str, mean: float, sem: float, n: int) -> Row:
+    def row(role: str, scope: str, metric: str, stat: Stat) -> Row:
         return Row(
             sweep=sweep.name, x=point.x, label=sweep.label(point.x), role=role, series=point.series,
             seed=point.trial.train.seed, trial=id, status=state,
-            scope=scope, metric=metric, mean=mean, sem=sem, n=n,
+            scope=scope, metric=metric, **dataclasses.asdict(stat),
             parameters=result["parameters"] if result else 0,
             train_flops=result["train_flops"] if result else 0.0,
             **dataclasses.asdict(provenance),
         )  # fmt: skip
 
     if result is None:
-        return [row(point.role, "", "", math.nan, math.nan, 0)]
-    parts = [(point.role, Evaluation.from_dict(result["evaluation"]))]
+        return [row(point.role, "", "", Stat(math.nan, math.nan, 0))]
+    parts = [(point.role, Summary.from_dict(result["evaluation"]))]
     if result["untrained"]:
-        parts.append((UNTRAINED, Evaluation.from_dict(result["untrained"])))
+        parts.append((UNTRAINED, Summary.from_dict(result["untrained"])))
     last = result["losses"][-max(round(LAST * len(result["losses"])), 1) :]
-    loss = mean_and_sem(last)
-    rows = [row(point.role, TRAINING, LOSS, loss.mean, loss.sem, loss.n)]
-    for role, evaluation in parts:
-        judged = [name for name in sweep.scope if name in evaluation.datasets]  # those with windows
-        scopes = {OVERALL: evaluation.over(judged)}
-        scopes |= {name: evaluation.datasets[name] for name in judged}
+    rows = [row(point.role, TRAINING, LOSS, mean_and_sem(last))]
+    for role, summary in parts:
+        judged = [name for name in sweep.scope if name in summary.datasets]  # those with windows
+        scopes = {OVERALL: summary.over(judged)}
+        scopes |= {name: summary.datasets[name] for name in judged}
         for scope, metrics in scopes.items():
-            rows += [row(role, scope, m, s.mean, s.sem, s.n) for m, s in sorted(metrics.items())]
+            rows += [row(role, scope, m, s) for m, s in sorted(metrics.items())]
     return rows
 
 
@@ -132,7 +132,7 @@ def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
 
 
 def read_csv(path: Path) -> list[Row]:
-    kinds = {"x": _number, "seed": int, "n": int, "parameters": int}
+    kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
     with open(path, newline="") as file:
         return [Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}) for record in csv.DictReader(file)]
@@ -147,7 +147,7 @@ def _number(text: str) -> float:
 class CurvePoint:
     """The seeds of one x together.
 
-    `sem` joins the spread over seeds and over windows. `seed_sem` is the former alone, nan for a
+    `sem` joins the spread over seeds and over episodes. `seed_sem` is the former alone, nan for a
     single seed: the error of a comparison on the same windows.
     """
 
@@ -165,8 +165,8 @@ def curve(
 ) -> list[CurvePoint]:
     """The points of a curve by increasing x; none where no trial has the metric.
 
-    sem^2 = variance over seeds / seeds + mean of the windows' sem^2: all seeds are judged on the
-    same windows, so that the second part does not shrink with their number.
+    sem^2 = variance over seeds / seeds + mean of each seed's sem^2 over episodes: all seeds are judged
+    on the same windows, so that the second part does not shrink with their number.
     """
     groups: dict[float, list[Row]] = defaultdict(list)
     for r in rows:
@@ -177,10 +177,10 @@ def curve(
         means = [r.mean for r in group]
         mean = sum(means) / len(means)
         spread = sum((m - mean) ** 2 for m in means) / max(len(means) - 1, 1) / len(means)
-        windows = sum(r.sem**2 for r in group) / len(group)
+        episodes = sum(r.sem**2 for r in group) / len(group)
         points.append(
             CurvePoint(
-                x, mean, sem=math.sqrt(spread + windows),
+                x, mean, sem=math.sqrt(spread + episodes),
                 seed_sem=math.sqrt(spread) if len(group) > 1 else math.nan,
                 seeds={r.seed: r.mean for r in group}, parameters=group[0].parameters, label=group[0].label,
             )

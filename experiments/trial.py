@@ -4,6 +4,7 @@ A trial's directory holds
     job.json        the trial and its provenance (written by the runner)
     run/            the training run (`hma_jax.training`): log, checkpoints
     samples.npz     true and predicted frames of a few windows per dataset
+    windows.csv.gz  every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
     result.json     written last: a trial with this file is finished
 """
 
@@ -12,7 +13,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.loading.loader import LoaderConfig
     from data_pipelines.tokens.store import TokenStore
-    from hma_jax.evaluation.protocol import Evaluation
+    from hma_jax.evaluation.evaluate import Evaluation
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
     from hma_jax.tokenizers.base import Tokenizer
@@ -166,23 +167,23 @@ def evaluate_on(
     setting: Setting = "forward",
     *,
     execution: ExecutionConfig = ExecutionConfig(),
-    first_batches: bool = False,
+    first: int | None = None,
     progress: Progress = lambda *_: None,
 ) -> Evaluation:
-    """The protocol over the frozen windows of `names`; only the first batch of each on request."""
+    """The protocol over the frozen windows of `names`, or over the `first` ones of each."""
     from data_pipelines.loading.evalset import eval_batches
-    from hma_jax.evaluation.protocol import evaluate
+    from hma_jax.evaluation.evaluate import evaluate
 
     manifest = materials.manifest
-    batches = eval_batches(materials.store, table, manifest, config.batch, names)
-    windows = sum(len(d.windows) for d in manifest.datasets if d.dataset in names)
+    batches = eval_batches(materials.store, table, manifest, config.batch, names, first=first)
+    windows = sum(len(d.windows[:first]) for d in manifest.datasets if d.dataset in names)
     progress("evaluating", 0, windows)
     return evaluate(
         params,
         model,
         table,
         materials.tokenizer,
-        _first_of_each_dataset(batches) if first_batches else batches,
+        batches,
         config,
         setting=setting,
         execution=execution,
@@ -218,15 +219,15 @@ def run_trial(
     subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
     evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, execution=execution, progress=progress)
     untrained = None
-    if trial.measure_untrained:  # what it says of one batch it says of all: it has learnt nothing
+    if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
         fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))
         untrained = evaluate_on(
-            trial.evaluated, fresh, *subject, execution=execution, first_batches=True
-        ).to_dict()
+            trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
+        ).summary.to_dict()
 
-    write_samples(directory / "samples.npz", evaluation.samples)
+    write_evaluation(directory, evaluation)
     result = {
-        "evaluation": evaluation.to_dict(),
+        "evaluation": evaluation.summary.to_dict(),
         "untrained": untrained,
         "losses": trained.losses,
         "parameters": declared.count(),
@@ -243,13 +244,12 @@ def run_trial(
     return result
 
 
-def _first_of_each_dataset(batches: Iterator[dict]) -> Iterator[dict]:
-    """The first batch of each dataset."""
-    seen = set()
-    for batch in batches:
-        if batch["dataset"] not in seen:
-            seen.add(batch["dataset"])
-            yield batch
+def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
+    """Writes windows.csv.gz and samples.npz into `directory`."""
+    from hma_jax.evaluation.windows import FILE
+
+    evaluation.windows.save(directory / FILE)
+    write_samples(directory / "samples.npz", evaluation.samples)
 
 
 def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:

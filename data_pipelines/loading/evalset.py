@@ -125,13 +125,17 @@ def eval_batches(
     manifest: EvalManifest,
     batch: int,
     datasets: Sequence[str] | None = None,
+    *,
+    first: int | None = None,
 ) -> Iterator[dict]:
-    """Batches of the frozen windows, one dataset at a time, each padded to `batch` rows.
+    """Batches of the frozen windows (of each dataset the `first` ones, or all), dataset by dataset.
 
+    A batch may hold windows of several datasets; the last one is padded to `batch` rows.
     `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C], `actions` float32 [B, T, U] (raw
-    units), `embodiment` int32 [B], `frames` uint8 [B, T, H, W, 3], `window` int32 [B] (number of
-    the window in the manifest, the same whatever the batch size and choice of datasets), `valid`
-    bool [B] (False for padding, which repeats the last window) and `dataset`, its name.
+    units), `embodiment` int32 [B], `images` uint8 [B, T, H, W, 3] (recorded), `valid` bool [B] (False
+    for padding, which repeats the last window), and what names a window, the same whatever the batch
+    size and the choice of datasets: `dataset`, a list of B names, `episode` int32 [B] (its number in
+    the source) and `start` int32 [B] (native frame).
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
     dataset is not in the manifest or in `table`.
@@ -152,40 +156,36 @@ def eval_batches(
             f"{store.root / name}: no raw frames to compare with. Tokenise it with keep_frames='val'.",
         )
     store.check_table(table, wanted)
-    return _batches(store, table, manifest, batch, wanted)
+    windows = [(name, *window) for name in wanted for window in frozen[name].windows[:first]]
+    return _batches(store, table, manifest.frames, batch, windows)
 
 
 def _batches(
-    store: TokenStore, table: EmbodimentTable, manifest: EvalManifest, batch: int, wanted: Sequence[str]
+    store: TokenStore, table: EmbodimentTable, frames: int, batch: int, windows: Sequence[tuple[str, int, int]]
 ) -> Iterator[dict]:
-    first = dict(zip((d.dataset for d in manifest.datasets), _offsets(manifest), strict=True))
-    windows = {d.dataset: d.windows for d in manifest.datasets}
-    for name in wanted:
-        for at in range(0, len(windows[name]), batch):
-            count = min(batch, len(windows[name]) - at)
-            rows = [min(at + k, at + count - 1) for k in range(batch)]
-            items = [_window(store, table, manifest.frames, name, *windows[name][row]) for row in rows]
-            yield {
-                **{key: np.stack([item[key] for item in items]) for key in items[0]},
-                "embodiment": np.full(batch, table.index(name), np.int32),
-                "window": np.asarray([first[name] + row for row in rows], np.int32),
-                "valid": np.arange(batch) < count,
-                "dataset": name,
-            }
+    for at in range(0, len(windows), batch):
+        rows = [_window(store, table, frames, *window) for window in windows[at : at + batch]]
+        count = len(rows)
+        rows += rows[-1:] * (batch - count)
+        columns = {key: [row[key] for row in rows] for key in rows[0]}
+        names = columns.pop("dataset")
+        yield {
+            **{key: np.stack(column) for key, column in columns.items()},
+            "dataset": names,
+            "valid": np.arange(batch) < count,
+        }
 
 
-def _offsets(manifest: EvalManifest) -> list[int]:
-    counts = [len(d.windows) for d in manifest.datasets]
-    return [sum(counts[:k]) for k in range(len(counts))]
-
-
-def _window(
-    store: TokenStore, table: EmbodimentTable, frames: int, name: str, episode: int, start: int
-) -> dict[str, np.ndarray]:
+def _window(store: TokenStore, table: EmbodimentTable, frames: int, name: str, episode: int, start: int) -> dict:
+    """One row of a batch."""
     facts = store.manifest(name)
     item = store.episode(name, "val", episode)
     return {
         "tokens": cut_tokens(item, start, frames, facts),
         "actions": cut_actions(item, start, frames, facts, table.action_width),
-        "frames": cut_frames(item.frames, start, frames, facts),
+        "images": cut_frames(item.frames, start, frames, facts),
+        "embodiment": np.int32(table.index(name)),
+        "dataset": name,
+        "episode": np.int32(item.episode),
+        "start": np.int32(start * facts.frame_step),
     }

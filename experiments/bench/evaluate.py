@@ -17,8 +17,9 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import DecodeConfig, EvalConfig, require
+from hma_jax.evaluation.evaluate import in_groups, plan_groups
 from hma_jax.evaluation.metrics import factored_cross_entropy
-from hma_jax.evaluation.protocol import evaluation_inputs, make_evaluator
+from hma_jax.evaluation.protocol import evaluation_inputs, make_predictor
 from hma_jax.generation import rollout_naive
 from hma_jax.generation.decoding import Frame, blank_frame, decode_frame
 from hma_jax.model.flops import forward_flops_per_window
@@ -29,7 +30,8 @@ def time_evaluation(subject: Subject, rows: int, config: EvalConfig, repeats: in
     """Stages `protocol` and `literal`, on `rows` windows. Raises ConfigError if their numbers differ."""
     model, table, declared = subject.config, subject.table, subject.declared
     require(model.diffusion is None, "hma bench eval compares likelihoods of ids: choose a discrete model")
-    batch = subject.batch(rows) | {"window": jnp.arange(rows, dtype=jnp.int32)}
+    number = jnp.arange(rows, dtype=jnp.int32)
+    batch = subject.batch(rows) | {"episode": number, "start": jnp.zeros_like(number)}
     weights = subject.inference_params
     sequences, keys = evaluation_inputs(batch, table, config)
 
@@ -51,12 +53,19 @@ def time_evaluation(subject: Subject, rows: int, config: EvalConfig, repeats: in
         last = [under(sequences[:, r])[1][:, -1] for r in range(1, sequences.shape[1])]
         return entropy, frames, jnp.stack(last, axis=1)
 
-    fast = compile_call(make_evaluator(model, table, config, execution=subject.execution), weights, batch)
+    predict = make_predictor(model, table, config, execution=subject.execution)
+    groups, _ = plan_groups(rows, subject.execution.windows_at_once, ways=1)
+    groups = groups if rows % groups == 0 else 1
+
+    def protocol(params: Any, batch: dict[str, jax.Array]) -> Any:
+        return in_groups(lambda group: predict(params, group), batch, groups)
+
+    fast = compile_call(protocol, weights, batch)
     slow = compile_call(literal, weights)
     calls = {"protocol": lambda: fast(weights, batch), "literal": lambda: slow(weights)}
     (metrics, predicted), (entropy, frames, last) = (call() for call in calls.values())
     gap = float(jnp.abs(metrics["cross_entropy"] - entropy).max())
-    same = float(jnp.minimum((predicted.frames == frames).mean(), (predicted.last_random == last).mean()))
+    same = float(jnp.minimum((predicted.tokens == frames).mean(), (predicted.random_last == last).mean()))
     require(
         gap < 1e-3 and same == 1 or subject.execution.dtype != "float32",
         f"the fast protocol differs from the literal one: cross-entropy by {gap:g}, {1 - same:.2%} of tokens",

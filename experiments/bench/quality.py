@@ -18,8 +18,9 @@ from experiments.bench.models import EXECUTION, Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
 from experiments.bench.timing import time_by_turns
-from hma_jax.config import EvalConfig, ModelConfig, require
-from hma_jax.evaluation.protocol import evaluate
+from hma_jax.config import EvalConfig, ModelConfig
+from hma_jax.evaluation.evaluate import evaluate
+from hma_jax.evaluation.summary import paired_difference
 
 SAMPLER_STEPS = (100, 50, 25, 12, 8, 4)
 LOOKS = (8, 4, 2, 1)
@@ -27,11 +28,13 @@ LOOKS = (8, 4, 2, 1)
 
 @dataclass(frozen=True)
 class Judged:
-    """One decoding; a row of quality.csv. Quality is a mean over datasets with its standard error."""
+    """One decoding; a row of quality.csv. Quality is a mean over datasets with its standard error, which
+    counts episodes."""
 
     decoding: str
     frames: int  # of a rollout, prompt included
     windows: int
+    episodes: int
     psnr: float  # dB, mean over predicted frames
     psnr_sem: float
     psnr_last: float
@@ -40,6 +43,8 @@ class Judged:
     ssim_sem: float
     delta_psnr: float  # dB, last frame
     delta_psnr_sem: float
+    psnr_gap: float = 0.0  # to the reference's PSNR on the same windows, and the error of that difference
+    psnr_gap_sem: float = 0.0
     milliseconds_per_frame: float = 0.0  # median, of one rollout at a time
     cost: float = 1.0  # time per frame over the reference's
 
@@ -72,19 +77,25 @@ def judge(
     progress: Callable[[str, int], None],
 ) -> tuple[list[Judged], list[Stage]]:
     """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time."""
-    rows, calls = [], {}
+    rows, calls, reference = [], {}, None
     for done, (name, config) in enumerate(settings.items()):
         progress(name, done)
-        found = evaluate(
-            subject.params, subject.config, subject.table, tokenizer, iter(batches()), config, samples_per_dataset=0
-        ).overall
-        require(found["psnr"].n > 0, "there are no windows of that length to judge on; choose fewer --frames")
+        evaluation = evaluate(
+            subject.params, subject.config, subject.table, tokenizer, batches(), config,
+            execution=subject.execution, samples_per_dataset=0,
+        )  # fmt: skip
+        found, windows = evaluation.summary.overall, evaluation.windows
+        stats = {metric: found[metric] for metric in ("psnr", "psnr_last", "ssim", "delta_psnr")}
+        if reference is None:
+            reference = windows
+        else:
+            stats["psnr_gap"] = paired_difference(windows, reference, config.perplexity_group).overall["psnr"]
         values = {
-            f"{metric}{end}": round(getattr(found[metric], kind), 5)
-            for metric in ("psnr", "psnr_last", "ssim", "delta_psnr")
+            f"{metric}{end}": round(getattr(stat, kind), 5)
+            for metric, stat in stats.items()
             for end, kind in (("", "mean"), ("_sem", "sem"))
         }
-        rows.append(Judged(name, frames, found["psnr"].n, **values))
+        rows.append(Judged(name, frames, found["psnr"].n, found["psnr"].episodes, **values))
         calls[name] = compile_rollout(subject, 1, frames, config.prompt_frames, config.decode)
     progress("timing", len(settings))
     weights = subject.inference_params

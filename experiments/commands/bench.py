@@ -120,7 +120,7 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     stem = out / f"quality-{frames}"
     write_csv(stem.with_suffix(".csv"), Judged, rows)
     plot_quality(rows, stem.with_suffix(".png"))
-    gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr - rows[0].psnr for r in rows[1:]}
+    gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr_gap for r in rows[1:]}
     facts = {"model": trained.model, "eval": replace(config, batch=1), "frames": frames, "windows": rows[0].windows}
     _write("quality", f"{frames}-frames", subject.execution.dtype, 0, facts, stages, gaps, (), out)
     console.print(f"wrote {stem}.csv and {stem}.png", soft_wrap=True)

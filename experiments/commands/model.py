@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 SHOWN = (
     "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain"
 )  # fmt: skip
-"""Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all."""
+"""Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all, and
+windows.csv.gz those of every window."""
 
 
 def train(
@@ -140,7 +141,8 @@ def say_data(trial: Trial, materials: Materials) -> None:
 
 
 def evaluate(setting: Setting, run: Path) -> None:
-    from experiments.trial import evaluate_on, open_materials, write_samples
+    from experiments.trial import evaluate_on, open_materials, write_evaluation
+    from hma_jax.evaluation.windows import FILE
     from hma_jax.training.train import load_run
 
     trained = load_run(run)
@@ -163,14 +165,15 @@ def evaluate(setting: Setting, run: Path) -> None:
             execution=setting.study.execution,
             progress=lambda phase, done, total: update(done, total, phase),
         )
-    metrics = [m for m in SHOWN if m in evaluation.overall]
+    summary = evaluation.summary
+    metrics = [m for m in SHOWN if m in summary.overall]
     table = tidy_table(f"{short(run)}, step {trained.step:,}", "dataset", *metrics)
-    for name, stats in [*evaluation.datasets.items(), ("overall", evaluation.overall)]:
+    for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
         table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
     console.print(table)
-    write_atomically(run / "evaluation.json", json.dumps(evaluation.to_dict(), indent=1))
-    write_samples(run / "samples.npz", evaluation.samples)
-    wrote(run / "evaluation.json", run / "samples.npz")
+    write_evaluation(run, evaluation)
+    write_atomically(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
+    wrote(run / "evaluation.json", run / FILE, run / "samples.npz")
 
 
 def require_prepared(setting: Setting) -> None:

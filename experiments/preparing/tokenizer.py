@@ -169,7 +169,8 @@ def _publish(aside: Path, place: Path, made_from: MadeFrom) -> None:
 
 def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> dict[str, float]:
     """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames: mean, sem, n."""
-    from hma_jax.evaluation.metrics import mean_and_sem, psnr
+    from hma_jax.evaluation.metrics import psnr
+    from hma_jax.evaluation.statistics import mean_and_sem
 
     values: list[float] = []
     while len(values) < QUALITY_FRAMES:

@@ -98,7 +98,7 @@ def _headline(
     if home and "perplexity" in metrics:
         cards += [
             card("perplexity, reference", _at_reference(rows, home, "perplexity"),
-                 "s.e. over windows and seeds"),
+                 "s.e. over episodes and seeds"),
             card("perplexity, untrained", _at_reference(rows, home, "perplexity", UNTRAINED),
                  f"vocabulary size is {study.model.vocab_size:,}"),
         ]  # fmt: skip
@@ -201,7 +201,7 @@ def _dataset_table(rows: Sequence[Row], sweep: Sweep, workspace: Workspace) -> s
         lines.append([html.escape(name), *counts, *(cell(name, metric) for metric in metrics)])
     return (
         "<p>PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR "
-        "of repeating the last given frame. Errors are standard errors.</p>"
+        "of repeating the last given frame. Errors are standard errors over episodes and seeds.</p>"
         + table(["dataset", "episodes", "too short", "skipped", "windows", *map(head.get, metrics)], lines)
     )
 

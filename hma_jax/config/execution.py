@@ -50,7 +50,11 @@ class ExecutionConfig:
     remat: Remat = "everything"
     attention: Attention = "auto"
     accumulate: int = 1  # micro-batches per optimiser step
+    # Of an evaluation batch, per device, that are in memory at a time; each is continued under
+    # 1 + eval.random_actions action sequences, and the caches of those are most of the memory.
+    windows_at_once: int = 4
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
     def __post_init__(self):
         require(self.accumulate >= 1, f"execution.accumulate must be at least 1, got {self.accumulate}")
+        require(self.windows_at_once >= 1, f"execution.windows_at_once must be at least 1, got {self.windows_at_once}")

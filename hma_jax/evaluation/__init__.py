@@ -1,1 +1,1 @@
-"""Evaluation: metric definitions and the protocol that applies them to a trained model."""
+"""Evaluation: what a model is asked to predict, every window's numbers, their means and errors."""

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from hma_jax.config import TokenizerConfig
-from hma_jax.evaluation.metrics import Stat, mean_and_sem, psnr
+from hma_jax.evaluation.metrics import psnr
+from hma_jax.evaluation.statistics import Stat, mean_and_sem
 from hma_jax.model.params import Declared, Params, declare
 from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.network import Autoencoder, from_pixels, to_pixels

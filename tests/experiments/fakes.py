@@ -90,10 +90,10 @@ def result_of(trial: Trial, without: Sequence[str] = ()) -> dict:
     stats = {"perplexity": perplexity, "cross_entropy": math.log(perplexity), "delta_psnr": delta,
              "psnr": 20.0, "psnr_copy": 18.0, "ssim": 0.8, "accuracy": 0.3}  # fmt: skip
     evaluation = {
-        name: {m: {"mean": v + i, "sem": 0.2, "n": 10} for m, v in stats.items() if m not in without}
+        name: {m: {"mean": v + i, "sem": 0.2, "n": 10, "episodes": 4} for m, v in stats.items() if m not in without}
         for i, name in enumerate(trial.evaluated)
     }
-    first = {m: {"mean": 256.0, "sem": 0.0, "n": 2} for m in ("perplexity", "psnr") if m not in without}
+    first = {m: {"mean": 256.0, "sem": 0.0, "n": 2, "episodes": 2} for m in ("perplexity", "psnr") if m not in without}
     return {
         "evaluation": evaluation,
         "untrained": dict.fromkeys(trial.evaluated, first) if trial.measure_untrained else None,

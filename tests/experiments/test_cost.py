@@ -11,7 +11,7 @@ from experiments.cost import estimate, evaluation_flops_per_window
 from experiments.presets import SMOKE, SMOKE_CONTINUOUS
 from experiments.sweep import reference_trial
 from hma_jax.config import EvalConfig, ExecutionConfig, MaskingConfig
-from hma_jax.evaluation.protocol import make_evaluator
+from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model
 from tests.hma_jax.test_generation_flops import DIFFUSION, ROWS, counted
 from tests.tiny import TABLE, model_config, random_batch
@@ -32,21 +32,23 @@ def test_evaluation_counts_what_the_protocol_multiplies(diffusion, context, sett
         train=replace(SMOKE.train, masking=MaskingConfig(setting=setting)),
     )  # fmt: skip
     execution = ExecutionConfig(attention="plain")
-    batch = {k: v[:ROWS] for k, v in random_batch(0, config).items()} | {"window": np.arange(ROWS, dtype=np.int32)}
-    evaluator = make_evaluator(config, TABLE, protocol, setting, execution)
+    number = np.arange(ROWS, dtype=np.int32)
+    batch = {k: v[:ROWS] for k, v in random_batch(0, config).items()} | {"episode": number, "start": number}
+    predict = make_predictor(config, TABLE, protocol, setting, execution)
     params = jax.eval_shape(lambda: declare_model(config, TABLE, execution).init(0))
     # Action heads, attention over time and what is masked make the difference.
-    assert evaluation_flops_per_window(trial, TABLE) == pytest.approx(counted(evaluator, params, batch), rel=0.05)
+    assert evaluation_flops_per_window(trial, TABLE) == pytest.approx(counted(predict, params, batch), rel=0.05)
 
 
-def test_the_last_batch_of_a_dataset_is_filled_up():
+def test_batches_hold_windows_of_several_datasets_and_the_last_is_filled_up():
     trial = replace(reference_trial(SMOKE, 0), measure_untrained=False)
-    assert (trial.eval.windows_per_dataset, trial.eval.batch) == (2, 2)
+    assert (len(trial.evaluated), trial.eval.windows_per_dataset, trial.eval.batch) == (3, 2, 2)
 
     def flops(**changes) -> float:
         return estimate(replace(trial, eval=replace(trial.eval, **changes))).evaluation_flops
 
-    assert flops(windows_per_dataset=3) == flops(windows_per_dataset=4) == 2 * flops()
+    assert flops(windows_per_dataset=3) == pytest.approx(10 / 6 * flops())
+    assert flops(windows_per_dataset=3, batch=4) == flops(windows_per_dataset=4) == 2 * flops()
 
 
 def test_samplers_of_latents_are_paid_for_step_by_step():

@@ -26,4 +26,4 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path):
     for tokens in (train["tokens"], validation["tokens"]):
         assert tokens.dtype == np.float32
         assert tokens.shape == (2, model.frames, model.tokens, model.diffusion.token_channels)
-    assert materials.tokenizer.decode(validation["tokens"][0]).shape == validation["frames"][0].shape
+    assert materials.tokenizer.decode(validation["tokens"][0]).shape == validation["images"][0].shape

@@ -28,7 +28,7 @@ def test_rows_carry_hashes_and_average_over_the_scope(drawn):
     each = [r for r in rows if r.trial == first.trial and r.metric == "perplexity" and r.scope != OVERALL]
     assert [r.scope for r in each] == ["arm", "rover"]  # the reference knows three, the axis judges two
     assert first.mean == pytest.approx(sum(r.mean for r in each) / 2)
-    assert first.sem == pytest.approx(0.2 / math.sqrt(2)) and first.n == 20
+    assert first.sem == pytest.approx(0.2 / math.sqrt(2)) and (first.n, first.episodes) == (20, 8)
     assert (first.store, first.code) == (PROVENANCE.store, PROVENANCE.code)
 
 

@@ -17,6 +17,8 @@ from experiments.trial import open_materials
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
 from hma_jax.config.json import from_json, to_json
+from hma_jax.evaluation.summary import summarise
+from hma_jax.evaluation.windows import FILE, WindowTable
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.data_pipelines.fakes import write_rlds
 from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensors, write_checkpoint
@@ -62,6 +64,10 @@ def test_released_model_is_evaluated_on_ids_of_an_imported_tokenizer(arm, tmp_pa
     assert f"taken for those of the tokenizer here, {load_tokenizer(tokenizer).identity}" in said
     evaluation = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert evaluation[ARM.name]["perplexity"]["mean"] == pytest.approx(64, rel=0.3)
+    windows = WindowTable.load(tmp_path / "run" / FILE)
+    summary = summarise(windows, get_preset("smoke").eval.perplexity_group)
+    assert json.dumps(summary.to_dict(), indent=1) == (tmp_path / "run" / "evaluation.json").read_text()
+    assert evaluation[ARM.name]["psnr"]["episodes"] == len(set(windows.episode.tolist()))
 
     assert hma("convert", "from-official", released(tmp_path / "b", 256), "--out", tmp_path / "run2") == 0
     assert hma("evaluate", tmp_path / "run2", *common) == 2
@@ -84,9 +90,9 @@ def test_latents_of_a_given_tokenizer_reach_the_batches_that_a_model_takes(kind,
     model = on_tokenizer(get_preset("smoke-continuous"), materials.tokenizer.config).model
     assert batch["tokens"].shape == (2, 4, model.tokens, model.diffusion.token_channels)
     frames = materials.tokenizer.decode(batch["tokens"][0])
-    assert frames.shape == batch["frames"][0].shape
+    assert frames.shape == batch["images"][0].shape
     if kind == "pixels":  # nothing is lost on the way through the store
-        assert np.array_equal(frames, batch["frames"][0])
+        assert np.array_equal(frames, batch["images"][0])
 
 
 def test_importing_again_overwrites_nothing(tmp_path, capsys):

@@ -41,20 +41,40 @@ def test_fewer_windows_are_a_subset_of_more(store):
         assert len(a.windows) == 2 and set(a.windows) < set(b.windows)
 
 
-def test_batches_give_each_window_once_with_its_frames_and_actions(store, table, manifest):
+def names_of(batch):
+    """(dataset, episode, start) of the rows that are not padding."""
+    rows = zip(batch["dataset"], batch["episode"].tolist(), batch["start"].tolist(), strict=True)
+    return [name for name, valid in zip(rows, batch["valid"], strict=True) if valid]
+
+
+def test_batches_give_each_window_once_with_its_images_and_actions(store, table, manifest):
     seen = []
     for batch in eval_batches(store, table, manifest, batch=2):
-        assert batch["frames"].shape == (2, 4, 8, 8, 3) and batch["frames"].dtype == np.uint8
-        entry = table.entries[table.index(batch["dataset"])]
-        assert (batch["embodiment"] == table.index(batch["dataset"])).all()
-        assert np.array_equal(batch["frames"][..., 0, 0, 1], batch["tokens"][..., 0] % 256)
-        steps = batch["tokens"][..., 0] % 256
-        chunk = batch["actions"][..., : entry.chunk].reshape(2, 4, entry.stride, entry.action_dim)
-        assert (chunk[..., 1] == steps[..., None] + np.arange(entry.stride)).all()
-        episodes = set((batch["tokens"][:, 0, 0] // 256).tolist())
-        assert episodes <= set(store.manifest(entry.name).val.episodes)
-        seen += batch["window"][batch["valid"]].tolist()
-    assert seen == list(range(sum(len(d.windows) for d in manifest.datasets)))
+        assert batch["images"].shape == (2, 4, 8, 8, 3) and batch["images"].dtype == np.uint8
+        assert np.array_equal(batch["images"][..., 0, 0, 1], batch["tokens"][..., 0] % 256)
+        for row, name in enumerate(batch["dataset"]):
+            entry = table.entries[table.index(name)]
+            assert batch["embodiment"][row] == table.index(name)
+            steps = batch["tokens"][row, :, 0] % 256
+            chunk = batch["actions"][row, :, : entry.chunk].reshape(4, entry.stride, entry.action_dim)
+            assert (chunk[..., 1] == steps[..., None] + np.arange(entry.stride)).all()
+            # A frame's colour says which episode and which native step it is of.
+            episode, step = divmod(int(batch["tokens"][row, 0, 0]), 256)
+            assert (batch["episode"][row], batch["start"][row]) == (episode, step)
+        seen += names_of(batch)
+    wanted = [
+        (d.dataset, store.manifest(d.dataset).val.episodes[at], start * store.manifest(d.dataset).frame_step)
+        for d in manifest.datasets
+        for at, start in d.windows
+    ]
+    assert seen == wanted
+
+
+def test_the_first_windows_of_each_dataset_alone(store, table, manifest):
+    everything = [names_of(b) for b in eval_batches(store, table, manifest, 100)][0]
+    (few,) = eval_batches(store, table, manifest, 6, first=2)
+    for name in store.names:
+        assert [w for w in names_of(few) if w[0] == name] == [w for w in everything if w[0] == name][:2]
 
 
 def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, manifest):
@@ -66,22 +86,25 @@ def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, mani
     for a, b in pairs:
         assert b["tokens"].shape == (2, 4, 4, 3) and b["tokens"].dtype == np.float32
         assert np.array_equal(b["tokens"][..., 0] * 256 + b["tokens"][..., 1], a["tokens"])
-        assert np.array_equal(a["frames"], b["frames"])
+        assert np.array_equal(a["images"], b["images"])
 
 
-def test_last_batch_is_padded_by_repeating(store, table, manifest):
-    batches = [b for b in eval_batches(store, table, manifest, 3) if b["dataset"] == "arm"]
-    assert batches[-1]["valid"].tolist() == [True, True, False]
-    assert batches[-1]["window"].tolist() == [3, 4, 4]
-    assert np.array_equal(batches[-1]["tokens"][1], batches[-1]["tokens"][2])
+def test_only_the_last_batch_is_padded_by_repeating(store, table, manifest):
+    *whole, last = eval_batches(store, table, manifest, 4)
+    assert all(b["valid"].all() for b in whole) and any(len(set(b["dataset"])) == 2 for b in whole)
+    count = sum(len(d.windows) for d in manifest.datasets) % 4
+    assert last["valid"].tolist() == [row < count for row in range(4)]
+    for row in range(count, 4):
+        assert np.array_equal(last["tokens"][row], last["tokens"][count - 1])
+        assert last["dataset"][row] == last["dataset"][count - 1]
 
 
-def test_a_window_keeps_its_number_in_other_batches_and_selections(store, table, manifest):
+def test_a_window_keeps_its_name_in_other_batches_and_selections(store, table, manifest):
     def tokens(batch, datasets=None):
         return {
-            int(w): t.tobytes()
+            name: t.tobytes()
             for b in eval_batches(store, table, manifest, batch, datasets)
-            for w, t in zip(b["window"], b["tokens"], strict=True)
+            for name, t in zip(names_of(b), b["tokens"][b["valid"]], strict=True)
         }
 
     everything = tokens(4)

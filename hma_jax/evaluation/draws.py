@@ -1,0 +1,84 @@
+"""Every random number of an evaluation, as a function of the seed and of what it is drawn for.
+
+A window is known by its robot's name, its episode and its start. No number depends on which other
+robots the table has, how wide the widest robot's chunks are, the batch, the row in it or the devices:
+every trial, and every model that robots were added to, is judged with the same ones.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from statistics import NormalDist
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.model.embodiments import EmbodimentTable
+
+Purpose = Literal["actions", "decoding", "likelihood", "policy"]
+"""What random numbers are for; each purpose has its own."""
+
+
+def window_keys(
+    seed: int,
+    purpose: Purpose,
+    table: EmbodimentTable,
+    embodiment_B: jax.Array,
+    episode_B: jax.Array,
+    start_B: jax.Array,
+) -> jax.Array:
+    """A key for each window, [B]."""
+    base = jax.random.fold_in(jax.random.key(seed), get_args(Purpose).index(purpose))
+    name_E = jnp.asarray([_number(name) for name in table.names], jnp.uint32)
+
+    def one(*name: jax.Array) -> jax.Array:
+        key = base
+        for part in name:
+            key = jax.random.fold_in(key, part)
+        return key
+
+    return jax.vmap(one)(name_E[embodiment_B], episode_B, start_B)
+
+
+def random_actions(
+    key_B: jax.Array, embodiment_B: jax.Array, table: EmbodimentTable, draws: int, frames: int
+) -> jax.Array:
+    """[B, draws, T = frames, U]: N(mean, std) of each robot's own actions; 0 in the padding.
+
+    Every value of a chunk has a key of its own: a wider robot in the table adds keys and changes none.
+    Bit for bit the same in batches of any shape.
+    """
+
+    def one(key: jax.Array, value: jax.Array) -> jax.Array:
+        return _normal(jax.random.fold_in(key, value), (draws, frames))
+
+    of_window = jax.vmap(one, (None, 0), -1)
+    noise = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
+    mean_BU, std_BU = (jnp.asarray(x)[embodiment_B] for x in table.statistics())
+    # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
+    from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)
+    return mean_BU[:, None, None] + from_mean
+
+
+QUANTILES = 2**16
+
+
+@functools.cache
+def _quantiles() -> np.ndarray:
+    """float32: equally likely values of N(0, 1)."""
+    normal = NormalDist()
+    return np.asarray([normal.inv_cdf((i + 0.5) / QUANTILES) for i in range(QUANTILES)], np.float32)
+
+
+def _normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """N(0, 1) to 16 bits, by a table: `jax.random.normal` computes a logarithm, whose last bit depends on
+    the shape of the array and on the processor."""
+    return jnp.asarray(_quantiles())[jax.random.bits(key, shape, jnp.uint32) >> 16]
+
+
+def _number(name: str) -> np.uint32:
+    """The same for a name everywhere and always."""
+    return np.frombuffer(hashlib.sha256(name.encode()).digest()[:4], "<u4")[0]

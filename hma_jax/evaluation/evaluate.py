@@ -1,0 +1,193 @@
+"""Applies the protocol to a trained model: batches in, a table of windows out.
+
+One compiled call per batch predicts, decodes and compares. The batch lies over the devices of the
+mesh, some windows at a time (`execution.windows_at_once`), and only numbers per window come back: those
+of one batch are read while the devices work on the next.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from einops import rearrange
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.evaluation.images import Decode, Decoder, Sample, image_metrics, make_clips
+from hma_jax.evaluation.protocol import Predicted, make_predictor
+from hma_jax.evaluation.summary import Summary, summarise
+from hma_jax.evaluation.windows import WindowTable, join
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Params
+from hma_jax.runtime.sharding import RULES, batch_sharding, constrain, make_mesh, param_shardings
+
+T = TypeVar("T")
+ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
+"""What of a batch goes to the devices."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Every window's numbers, their means with errors, and a few clips to look at."""
+
+    windows: WindowTable
+    summary: Summary
+    samples: dict[str, dict[str, np.ndarray]]  # {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}}
+
+
+def evaluate(
+    params: Params,
+    model: ModelConfig,
+    table: EmbodimentTable,
+    tokenizer: Decoder,
+    batches: Iterable[dict[str, Any]],
+    config: EvalConfig,
+    *,
+    setting: Setting = "forward",
+    execution: ExecutionConfig = ExecutionConfig(),
+    samples_per_dataset: int = 1,
+    progress: Callable[[int], None] | None = None,
+) -> Evaluation:
+    """Applies the protocol to `batches`, equal in shape.
+
+    A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
+    and valid (bool [B]: rows that are not padding). `setting` is what the model was trained for.
+    `progress` is told the windows done so far. Raises ConfigError if there is no window, or for a
+    model whose predictions are not finite.
+    """
+    mesh = make_mesh(execution.mesh)
+    evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
+    declared = declare_model(model, table, execution)
+    weights = jax.device_put(params, param_shardings(declared, mesh, execution.mesh))
+    decoder_weights = jax.device_put(tokenizer.params, NamedSharding(mesh, PartitionSpec()))
+
+    def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted]]]:
+        for batch in batches:
+            groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, batch_ways(mesh))
+            on_devices = _put({name: batch[name] for name in ARRAYS}, groups * rows, mesh)
+            with jax.set_mesh(mesh):
+                found = evaluator(weights, decoder_weights, on_devices)
+            yield batch, found
+
+    tables: list[WindowTable] = []
+    samples: dict[str, list[Sample]] = {}
+    for batch, (found, predicted) in one_ahead(dispatched()):
+        tables.append(_rows_of(batch, found))
+        for row in np.flatnonzero(batch["valid"]).tolist():
+            own = samples.setdefault(batch["dataset"][row], [])
+            if len(own) < samples_per_dataset:
+                # Read whole: rows picked on the devices would wait for the next batch.
+                random = None if predicted.random is None else np.asarray(predicted.random)[row]
+                own.append(Sample(batch["images"][row], np.asarray(predicted.tokens)[row], random))
+        if progress is not None:
+            progress(sum(map(len, tables)))
+    windows = join(tables)
+    return Evaluation(windows, summarise(windows, config.perplexity_group), make_clips(tokenizer, samples))
+
+
+@functools.lru_cache(maxsize=4)  # a second evaluation of the same shapes compiles nothing
+def make_evaluator(
+    model: ModelConfig,
+    table: EmbodimentTable,
+    config: EvalConfig,
+    setting: Setting,
+    execution: ExecutionConfig,
+    decode: Decode,
+    piece: int,
+) -> Callable[[Params, Params, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted]]:
+    """A jitted f(parameters, those of the tokenizer, batch with images) -> (metrics {name: [B]}, Predicted).
+
+    Runs under `jax.set_mesh`. Of B windows `plan_groups` says how many are in memory at a time; B is a
+    multiple of that. Raises ConfigError as `make_predictor`.
+    """
+    mesh = make_mesh(execution.mesh)
+    predict = make_predictor(model, table, config, setting, execution)
+
+    def compare(params: Params, predicted: Predicted, images: jax.Array) -> dict[str, jax.Array]:
+        return image_metrics(decode, piece, params, predicted, images, config)
+
+    def evaluate_group(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
+        batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
+        metrics, predicted = predict(params, batch)
+        compared = _on_each_device(compare, mesh)(decoder_params, predicted, batch["images"])
+        return metrics | compared, predicted
+
+    def evaluate_batch(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
+        groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, batch_ways(mesh))
+        return in_groups(lambda rows: evaluate_group(params, decoder_params, rows), batch, groups)
+
+    return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
+
+
+def batch_ways(mesh: Mesh) -> int:
+    """Devices that share a batch."""
+    return int(np.prod([mesh.shape[axis] for axis in RULES["B"]]))
+
+
+def plan_groups(rows: int, at_once: int, ways: int) -> tuple[int, int]:
+    """(groups, rows of each) of at most `at_once` rows per device, to hold `rows` with few left over."""
+    groups = -(-rows // (at_once * ways))
+    return groups, -(-rows // (groups * ways)) * ways
+
+
+def in_groups(function: Callable[[Any], Any], batch: Any, groups: int) -> Any:
+    """`function`, which maps rows to rows, over groups of a batch's rows, one group after the other.
+
+    Group g has rows g, g + groups, ...: every device keeps the rows it has.
+    """
+    if groups == 1:
+        return function(batch)
+    split = jax.tree.map(lambda x: rearrange(x, "(b g) ... -> g b ...", g=groups), batch)
+    return jax.tree.map(lambda x: rearrange(x, "g b ... -> (b g) ..."), jax.lax.map(function, split))
+
+
+def one_ahead(items: Iterable[T]) -> Iterator[T]:
+    """The same items, each when the next one has been made."""
+    waiting: list[T] = []
+    for item in items:
+        waiting.append(item)
+        if len(waiting) == 2:
+            yield waiting.pop(0)
+    yield from waiting
+
+
+def _on_each_device(function: Callable[..., Any], mesh: Mesh) -> Callable[..., Any]:
+    """`function` (parameters, rows, rows) -> rows, applied by every device to its own rows.
+
+    The compiler would not split loops over pieces of a batch by itself.
+    """
+    if batch_ways(mesh) == 1:
+        return function
+    whole, rows = PartitionSpec(), PartitionSpec(RULES["B"])
+    return jax.shard_map(function, mesh=mesh, in_specs=(whole, rows, rows), out_specs=rows)
+
+
+def _put(batch: dict[str, np.ndarray], rows: int, mesh: Mesh) -> dict[str, jax.Array]:
+    """A batch, the same in every process, over the devices; its last row is repeated up to `rows`."""
+    sharding = batch_sharding(mesh)
+
+    def put(x: np.ndarray) -> jax.Array:
+        padded = np.concatenate([x, np.repeat(x[-1:], rows - len(x), axis=0)])
+        return jax.make_array_from_callback(padded.shape, sharding, lambda index: padded[index])
+
+    return {name: put(np.asarray(x)) for name, x in batch.items()}
+
+
+def _rows_of(batch: dict[str, Any], found: dict[str, jax.Array]) -> WindowTable:
+    """The windows of a batch, without its padding. Waits for the devices. Raises ConfigError."""
+    valid = np.flatnonzero(batch["valid"])
+    columns = {name: np.asarray(x)[valid] for name, x in found.items()}
+    dataset = np.asarray(batch["dataset"], str)[valid]
+    finite = columns.pop("finite")
+    require(
+        bool(finite.all()),
+        f"predicted latents are not finite ({', '.join(sorted(set(dataset[~finite])))}); did the model diverge?",
+    )
+    episode, start = (np.asarray(batch[name], np.int64)[valid] for name in ("episode", "start"))
+    return WindowTable(dataset, episode, start, {m: np.asarray(x, np.float64) for m, x in columns.items()})

@@ -1,0 +1,120 @@
+"""Predicted tokens as images, beside the recorded ones: decoded and compared where they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import EvalConfig, require
+from hma_jax.evaluation.metrics import psnr, ssim
+from hma_jax.evaluation.protocol import Predicted
+from hma_jax.model.params import Params
+
+Decode = Callable[[Params, jax.Array], jax.Array]
+"""Pure: (parameters, ids [B, S] or latents [B, S, C]) -> uint8 [B, height, width, 3]."""
+
+
+class Decoder(Protocol):
+    """The half of a tokenizer that evaluation needs (`tokenizers.base.Tokenizer`)."""
+
+    @property
+    def params(self) -> Params: ...
+    @property
+    def piece(self) -> int:
+        """Images that a device decodes at a time."""
+        ...
+
+    def decode_uint8_fn(self, params: Params, tokens: jax.Array) -> jax.Array:
+        """Pure: ids [B, S] or latents [B, S, C] -> uint8 [B, height, width, 3]."""
+        ...
+
+    def decode(self, tokens: np.ndarray) -> np.ndarray:
+        """The same on the host."""
+        ...
+
+
+def image_metrics(
+    decode: Decode, piece: int, params: Params, predicted: Predicted, images: jax.Array, config: EvalConfig
+) -> dict[str, jax.Array]:
+    """Per window [B]; `images` are those recorded, uint8 [B, T, height, width, 3].
+
+    `finite`, bool [B], says whether the tokens are numbers at all: images of latents that are not mean
+    nothing.
+    """
+    made = predicted.tokens.shape[1]
+    tokens = jnp.concatenate([predicted.tokens, predicted.random_last], axis=1)
+    decoded = decode_in_pieces(decode, piece, params, tokens.reshape(-1, *tokens.shape[2:]))
+    decoded = decoded.reshape(*tokens.shape[:2], *decoded.shape[1:])
+    require(
+        decoded.shape[2:] == images.shape[2:],
+        f"the tokenizer decodes images of {decoded.shape[2:]}, recorded are {images.shape[2:]}; "
+        "evaluate with the tokenizer that the token store was made with",
+    )
+    shown, random_last = decoded[:, :made], decoded[:, made:]
+    first = config.first_predicted
+    future, last = images[:, first:], images[:, -1]
+    # The image that a model has before it which repeats the last one it is given.
+    before = images[:, first - 1 : -1] if config.context == "recorded" else images[:, first - 1 : first]
+    # Under recorded actions and random ones in one array: equal images get equal numbers, to the last bit.
+    of_last = psnr(jnp.concatenate([shown[:, -1:], random_last], axis=1), _beside(last, 1 + random_last.shape[1]))
+    of_last = jax.lax.optimization_barrier(of_last)
+    psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
+    return {
+        "psnr": psnr(shown, future).mean(1),
+        "psnr_last": psnr_last,
+        "psnr_random": psnr_random.mean(1),
+        "delta_psnr": (psnr_last[:, None] - psnr_random).mean(1),
+        "psnr_copy": psnr(jnp.broadcast_to(before, future.shape), future).mean(1),
+        "ssim": ssim(shown, future).mean(1),
+        "finite": jnp.isfinite(tokens).all(tuple(range(1, tokens.ndim))),
+    }
+
+
+def _beside(images: jax.Array, count: int) -> jax.Array:
+    """[B, ...] -> [B, count, ...]"""
+    return jnp.broadcast_to(images[:, None], (len(images), count, *images.shape[1:]))
+
+
+def decode_in_pieces(decode: Decode, piece: int, params: Params, tokens: jax.Array) -> jax.Array:
+    """Images of tokens [n, ...], `piece` of them at a time; memory does not grow with n."""
+    count = len(tokens)
+    if count <= piece:
+        return decode(params, tokens)
+    missing = -count % piece
+    padded = jnp.pad(tokens, [(0, missing)] + [(0, 0)] * (tokens.ndim - 1))
+    images = jax.lax.map(lambda x: decode(params, x), padded.reshape(-1, piece, *tokens.shape[1:]))
+    return images.reshape(-1, *images.shape[2:])[:count]
+
+
+class Sample(NamedTuple):
+    """A window to look at, on the host."""
+
+    images: np.ndarray  # recorded, uint8 [T, height, width, 3]
+    tokens: np.ndarray  # predicted under the recorded actions, of the last n frames [n, S (, C)]
+    random: np.ndarray | None  # under random actions
+
+
+def make_clips(decoder: Decoder, samples: Mapping[str, Sequence[Sample]]) -> dict[str, dict[str, np.ndarray]]:
+    """{dataset: {true, predicted and, where made, random: uint8 [samples, T, height, width, 3]}}.
+
+    A predicted clip begins with the recorded images up to its first predicted one.
+    """
+    tokens = [x for own in samples.values() for s in own for x in (s.tokens, s.random) if x is not None]
+    if not tokens:
+        return {}
+    decoded = decoder.decode(np.concatenate(tokens))  # in one call: decoders take many images at a time
+    pieces = iter(np.split(decoded, np.cumsum([len(x) for x in tokens])[:-1]))
+    clips: dict[str, dict[str, list[np.ndarray]]] = {}
+    for name, own in samples.items():
+        for sample in own:
+            kinds = clips.setdefault(name, {"true": [], "predicted": [], "random": []})
+            kinds["true"].append(sample.images)
+            for kind, made in (("predicted", sample.tokens), ("random", sample.random)):
+                if made is not None:
+                    given = sample.images[: len(sample.images) - len(made)]
+                    kinds[kind].append(np.concatenate([given, next(pieces)]))
+    return {name: {kind: np.stack(x) for kind, x in kinds.items() if x} for name, kinds in clips.items()}

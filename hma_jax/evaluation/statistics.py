@@ -1,0 +1,117 @@
+"""Means with standard errors, and what is derived from them: errors count episodes, not windows.
+
+Windows of one episode share scene, task and lighting, so that two of them say less than two windows
+of different episodes. Every error here is clustered: the deviations of one episode's windows are
+added up before they are squared. Reference: Cameron and Miller 2015, "A Practitioner's Guide to
+Cluster-Robust Inference", for a regression on a constant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hma_jax.config import require
+from hma_jax.evaluation.metrics import group_means, official_perplexity
+
+
+@dataclass(frozen=True)
+class Stat:
+    """A mean over `n` values with its standard error (nan where there is no telling)."""
+
+    mean: float
+    sem: float
+    n: int
+    episodes: int = 0  # that the values are windows of; 0: the values are independent of each other
+
+    @property
+    def clusters(self) -> int:
+        """Independent groups of values that the error counts."""
+        return self.episodes or self.n
+
+
+class Estimate(NamedTuple):
+    """A statistic of a dataset's windows, and to first order what each window does to it.
+
+    Were the windows others, the statistic would be about `value` + mean of their `influence`. Estimates
+    of the same windows can be subtracted: what windows do to both of them then cancels.
+    """
+
+    value: float
+    influence: np.ndarray  # [n], of mean 0
+
+    def minus(self, other: Estimate) -> Estimate:
+        with np.errstate(invalid="ignore"):  # of two infinite perplexities nothing is known
+            return Estimate(self.value - other.value, self.influence - other.influence)
+
+
+def estimate_mean(values: Any) -> Estimate:
+    """Of a 1-D collection. Raises ConfigError for an empty one."""
+    x = np.asarray(values, np.float64).ravel()
+    require(len(x) > 0, "no values to average")
+    mean = float(np.mean(x))
+    return Estimate(mean, x - mean)
+
+
+def estimate_perplexity(losses: Any, group: int) -> Estimate:
+    """`official_perplexity` of windows in batches of `group`. Its influence is that of the corpus
+    perplexity: a dataset may hold too few batches to estimate one from their scatter."""
+    return _exponential(official_perplexity(*group_means(losses, group)), losses)
+
+
+def estimate_corpus_perplexity(losses: Any) -> Estimate:
+    """exp of the mean loss over all windows (infinite beyond what a float holds); influence by the
+    delta method."""
+    with np.errstate(over="ignore"):
+        return _exponential(float(np.exp(np.mean(np.asarray(losses, np.float64)))), losses)
+
+
+def _exponential(value: float, losses: Any) -> Estimate:
+    with np.errstate(invalid="ignore"):
+        return Estimate(value, value * estimate_mean(losses).influence)
+
+
+def stat_of(estimate: Estimate, episode_n: Any = None) -> Stat:
+    """An estimate with its standard error; `episode_n` says which episode each window is of.
+
+    sem^2 = G / (G - 1) sum_g (sum_{i in g} u_i)^2 / n^2 over G episodes g, with influences u. G / (G - 1) is
+    the correction for few episodes. nan with one episode: its windows cannot say how episodes differ.
+    Without `episode_n` every value is an episode of its own, which is the usual standard error.
+    """
+    u, n = estimate.influence, len(estimate.influence)
+    if episode_n is not None:
+        require(n == len(episode_n), f"{n} values but {len(episode_n)} episode numbers")
+        _, which = np.unique(np.asarray(episode_n), return_inverse=True)
+        u = np.bincount(which, weights=u)
+    groups = len(u)
+    sem = math.sqrt(groups / (groups - 1) * float(np.sum(u**2))) / n if groups > 1 else math.nan
+    return Stat(estimate.value, sem, n, 0 if episode_n is None else groups)
+
+
+def mean_and_sem(values: Any, episode_n: Any = None) -> Stat:
+    """Mean of a 1-D collection with its standard error (`stat_of`)."""
+    return stat_of(estimate_mean(values), episode_n)
+
+
+def stratified(stats: Iterable[Stat]) -> Stat:
+    """Mean over datasets, every dataset counting equally: sem = sqrt(sum sem^2) / D.
+
+    The datasets are fixed, not a sample of possible datasets: only the episodes drawn within
+    each contribute error. A dataset of one episode cannot know its own error; its mean is taken to
+    scatter as that of one episode of the others does on average. `n` and `episodes` count those of all.
+    """
+    stats = list(stats)
+    require(len(stats) > 0, "no datasets to average over")
+    known = [s.sem**2 * s.clusters for s in stats if not math.isnan(s.sem)]  # variance of one episode
+    typical = sum(known) / len(known) if known else math.nan
+    squares = [typical / s.clusters if math.isnan(s.sem) else s.sem**2 for s in stats]
+    return Stat(
+        mean=sum(s.mean for s in stats) / len(stats),
+        sem=math.sqrt(sum(squares)) / len(stats),
+        n=sum(s.n for s in stats),
+        episodes=sum(s.episodes for s in stats),
+    )

@@ -1,0 +1,83 @@
+"""Means per dataset with their errors, and differences between two models, from tables of windows."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+from hma_jax.config import require
+from hma_jax.evaluation.statistics import (
+    Estimate,
+    Stat,
+    estimate_corpus_perplexity,
+    estimate_mean,
+    estimate_perplexity,
+    stat_of,
+    stratified,
+)
+from hma_jax.evaluation.windows import WindowTable
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Every metric of every dataset."""
+
+    datasets: dict[str, dict[str, Stat]] = field(default_factory=dict)
+
+    def over(self, names: Iterable[str]) -> dict[str, Stat]:
+        """Each metric averaged over the named datasets, all counting equally."""
+        chosen = [self.datasets[name] for name in names]
+        require(len(chosen) > 0, "no datasets to average an evaluation over")
+        return {metric: stratified(d[metric] for d in chosen) for metric in chosen[0]}
+
+    @property
+    def overall(self) -> dict[str, Stat]:
+        return self.over(self.datasets)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {n: {m: dataclasses.asdict(s) for m, s in d.items()} for n, d in self.datasets.items()}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Summary:
+        return cls({n: {m: Stat(**s) for m, s in d.items()} for n, d in values.items()})
+
+
+def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
+    """Means over the windows of each dataset, and its perplexities; errors clustered by episode.
+
+    `perplexity_group` is the number of windows per exp(mean loss) of the official perplexity.
+    """
+    found = {}
+    for name in windows.datasets:
+        own = windows.of(name)
+        found[name] = {m: stat_of(e, own.episode) for m, e in _estimates(own, perplexity_group).items()}
+    return Summary(found)
+
+
+def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> Summary:
+    """`a` minus `b`, window by window, on the datasets and metrics that both have.
+
+    What makes a window hard for both models cancels, so that the error is that of the difference and
+    not of the two means; it is clustered by episode. Raises ConfigError if they share no dataset, or if
+    the windows of one that they share are not the same.
+    """
+    shared = [name for name in a.datasets if name in b.datasets]
+    require(len(shared) > 0, "two evaluations without a common dataset cannot be compared")
+    found = {}
+    for name in shared:
+        mine = a.of(name)
+        ours, theirs = (_estimates(x, perplexity_group) for x in (mine, b.of(name).matched_to(mine)))
+        found[name] = {m: stat_of(e.minus(theirs[m]), mine.episode) for m, e in ours.items() if m in theirs}
+    return Summary(found)
+
+
+def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimate]:
+    """Of one dataset: the mean of each metric, and for discrete tokens the perplexities."""
+    estimates = {metric: estimate_mean(column) for metric, column in windows.metrics.items()}
+    if "cross_entropy" in windows.metrics:
+        losses = windows.metrics["cross_entropy"]
+        estimates["perplexity"] = estimate_perplexity(losses, perplexity_group)
+        estimates["perplexity_corpus"] = estimate_corpus_perplexity(losses)
+    return estimates

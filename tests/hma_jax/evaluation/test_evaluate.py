@@ -1,0 +1,272 @@
+"""The protocol over batches: what is measured, on which windows, where, and with how much memory."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig, SamplerConfig
+from hma_jax.evaluation import evaluate as module
+from hma_jax.evaluation.evaluate import Evaluation, evaluate, in_groups, make_evaluator, one_ahead, plan_groups
+from hma_jax.evaluation.images import decode_in_pieces
+from hma_jax.evaluation.metrics import psnr, ssim
+from hma_jax.evaluation.protocol import evaluation_inputs
+from hma_jax.generation import rollout
+from hma_jax.model.embodiments import Embodiment
+from hma_jax.model.hma import declare_model
+from hma_jax.training.adapt import add_embodiments
+from tests.hma_jax.evaluation.fakes import SIZE, GreyTokenizer, make_batches
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config
+
+DECODE = DecodeConfig(2, temperature=0.5, sampler=SamplerConfig(steps=3))  # every kind of random number is drawn
+EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=3)
+CONFIG = model_config()
+TOKENIZER = GreyTokenizer()  # one for all: an evaluator is compiled for a tokenizer
+
+
+@pytest.fixture(scope="module")
+def params():
+    return lively_params(CONFIG)[1]
+
+
+def run(params, config=CONFIG, settings=EVAL, execution=ExecutionConfig(), **kwargs) -> Evaluation:
+    batches = make_batches(config, **kwargs)
+    return evaluate(params, config, TABLE, TOKENIZER, batches, settings, execution=execution)
+
+
+def test_metrics_cover_the_valid_windows_of_each_dataset(params):
+    result = run(params, each=5)  # in three batches: one of both datasets, the last padded
+    assert result.windows.datasets == ("pusher", "arm")
+    assert result.windows.names == [
+        (name, number // 2, number % 2 * 12) for name in ("pusher", "arm") for number in range(5)
+    ]
+    stats = result.summary.datasets
+    assert all((s["psnr"].n, s["psnr"].episodes) == (5, 3) for s in stats.values())
+    assert (result.summary.overall["delta_psnr"].n, result.summary.overall["delta_psnr"].episodes) == (10, 6)
+    pusher, arm = (stats[n]["ssim"].mean for n in ("pusher", "arm"))
+    assert result.summary.overall["ssim"].mean == pytest.approx((pusher + arm) / 2)
+
+
+def test_images_are_compared_as_the_host_would(params):
+    """The rollout of the library, decoded by the tokenizer's own `decode`, in float64."""
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    result = evaluate(params, CONFIG, TABLE, TOKENIZER, iter([batch]), EVAL)
+
+    @jax.jit
+    def roll_out(params, batch):
+        sequences, keys = evaluation_inputs(batch, TABLE, EVAL)
+        hma = declare_model(CONFIG, TABLE).merge(params)
+        return rollout(hma, batch["tokens"][:, :2], sequences, batch["embodiment"], keys, DECODE)
+
+    made = roll_out(params, {k: batch[k] for k in ("tokens", "actions", "embodiment", "episode", "start")})
+    images = TOKENIZER.decode(np.asarray(made).reshape(-1, CONFIG.tokens)).reshape(4, 4, 4, SIZE, SIZE, 3)
+    true, last = batch["images"][:, 2:], batch["images"][:, -1]
+    random = np.stack([psnr(images[:, r, -1], last) for r in (1, 2, 3)], axis=1)
+    want = {
+        "psnr": psnr(images[:, 0], true).mean(1),
+        "psnr_last": psnr(images[:, 0, -1], last),
+        "psnr_random": random.mean(1),
+        "delta_psnr": psnr(images[:, 0, -1], last) - random.mean(1),
+        "psnr_copy": psnr(np.repeat(batch["images"][:, 1:2], 4, axis=1), true).mean(1),
+        "ssim": ssim(images[:, 0], true).mean(1),
+    }
+    for metric, values in want.items():
+        np.testing.assert_allclose(result.windows.metrics[metric], values, rtol=0, atol=1e-5, err_msg=metric)
+
+
+NEWCOMERS = (
+    Embodiment("humanoid", 26, 3, (0.1,) * 26, (2.0,) * 26),  # wider than anyone before
+    Embodiment("film", 0, 1, (), ()),  # no actions at all
+)
+
+
+@pytest.mark.parametrize(
+    "diffusion",
+    [pytest.param(None, id="discrete"), pytest.param(DIFFUSION, id="continuous", marks=pytest.mark.slow)],
+)
+def test_new_robots_change_no_number_of_the_old_ones(diffusion):
+    """Random actions, decoding, likelihood and policy: all random numbers are a window's own."""
+    config = model_config(diffusion=diffusion)
+    _, params = lively_params(config)
+    wider, table = add_embodiments(params, config, TABLE, NEWCOMERS, seed=3)
+    inputs, found = [], []
+    for weights, robots in ((params, TABLE), (wider, table)):
+        batches = list(make_batches(config, names=("base", "arm"), each=4, table=robots))
+        arrays = {k: jnp.asarray(batches[1][k]) for k in ("actions", "embodiment", "episode", "start")}
+        sequences, _ = jax.jit(lambda a, robots=robots: evaluation_inputs(a, robots, EVAL))(arrays)
+        inputs.append(sequences[..., : TABLE.action_width])
+        found.append(evaluate(weights, config, robots, TOKENIZER, batches, EVAL, setting="full").windows)
+    np.testing.assert_array_equal(*inputs)
+    old, new = found
+    assert old.names == new.names and "action_error" in old.metrics
+    for metric, column in old.metrics.items():
+        np.testing.assert_allclose(new.metrics[metric], column, rtol=1e-4, atol=1e-4, err_msg=metric)
+
+
+def test_latents_that_are_no_numbers_are_not_decoded_into_images():
+    config = model_config(diffusion=DIFFUSION)
+    broken = jax.tree.map(lambda x: x * jnp.nan, lively_params(config)[1])
+    batches = make_batches(config, names=("arm",), each=4)
+    with pytest.raises(ConfigError, match=r"predicted latents are not finite \(arm\); did the model diverge"):
+        evaluate(broken, config, TABLE, TOKENIZER, batches, EVAL, setting="full")
+
+
+def test_a_model_deaf_to_actions_has_no_delta_psnr(params):
+    """Common random numbers: only actions may make a difference."""
+    deaf = jax.tree.map(lambda x: x, params)
+    deaf["stem"]["out"] = jax.tree.map(jnp.zeros_like, params["stem"]["out"])
+    for settings in (EVAL, replace(EVAL, context="recorded")):
+        assert run(deaf, settings=settings).summary.overall["delta_psnr"].mean == 0
+    assert run(params).summary.datasets["arm"]["delta_psnr"].sem > 0
+
+
+def test_an_untrained_model_has_the_perplexity_of_the_vocabulary():
+    overall = run(declare_model(CONFIG, TABLE).init(0)).summary.overall
+    assert overall["perplexity"].mean == pytest.approx(CONFIG.vocab_size, rel=0.02)
+    assert overall["perplexity_corpus"].mean <= overall["perplexity"].mean
+
+
+def test_samples_show_true_predicted_and_randomly_driven_clips(params):
+    result = run(params)
+    (batch, *_) = make_batches(CONFIG)
+    clip = result.samples["pusher"]
+    assert {k: v.shape for k, v in clip.items()} == {
+        k: (1, CONFIG.frames, SIZE, SIZE, 3) for k in ("true", "predicted", "random")
+    }
+    np.testing.assert_array_equal(clip["true"][0], batch["images"][0])
+    np.testing.assert_array_equal(clip["true"][:, :2], clip["predicted"][:, :2])
+    score = psnr(clip["predicted"][0, 2:], clip["true"][0, 2:]).mean()
+    assert score == pytest.approx(result.windows.metrics["psnr"][0], abs=1e-5)
+    assert set(result.samples) == {"pusher", "arm"}
+
+
+def test_after_recorded_frames_every_frame_but_the_first_is_predicted(params):
+    recorded, generated = (run(params, settings=replace(EVAL, context=c)) for c in ("recorded", "generated"))
+    clip = recorded.samples["arm"]
+    assert set(clip) == {"true", "predicted"}
+    assert clip["predicted"].shape[1] == CONFIG.frames
+    same, other = (e.windows.metrics["cross_entropy"] for e in (recorded, generated))
+    np.testing.assert_allclose(same, other, rtol=1e-5)  # the likelihood is that of recorded frames in both
+    assert recorded.summary.overall["delta_psnr"].sem > 0
+
+
+def test_windows_longer_than_the_model_s_are_continued_past_it(params):
+    def judge(batches, settings):
+        return evaluate(params, CONFIG, TABLE, TOKENIZER, batches, settings)
+
+    (long,) = make_batches(model_config(frames=9), names=("arm",), each=4)
+    exact, streamed = (
+        judge([long], replace(EVAL, decode=DecodeConfig(1, slide=slide))) for slide in ("exact", "streaming")
+    )
+    clips = [e.samples["arm"]["predicted"] for e in (exact, streamed)]
+    assert clips[0].shape[1] == 9
+    np.testing.assert_array_equal(clips[0][:, : CONFIG.frames], clips[1][:, : CONFIG.frames])
+    short = {k: v[:, : CONFIG.frames] if k in ("tokens", "actions", "images") else v for k, v in long.items()}
+    want = judge([short], EVAL).summary.overall["cross_entropy"].mean
+    assert exact.summary.overall["cross_entropy"].mean == pytest.approx(want, rel=1e-6)
+    with pytest.raises(ConfigError, match="windows have the model's 6 frames, got 9"):
+        judge([long], replace(EVAL, context="recorded"))
+
+
+def test_what_cannot_be_evaluated_is_refused(params):
+    with pytest.raises(ConfigError, match="leaves nothing to predict"):
+        evaluate(params, CONFIG, TABLE, TOKENIZER, [], EvalConfig(prompt_frames=6))
+    with pytest.raises(ConfigError, match="the evaluation has no windows"):
+        evaluate(params, CONFIG, TABLE, TOKENIZER, [], EVAL)
+    (batch,) = make_batches(CONFIG, names=("arm",), each=4)
+    with pytest.raises(ConfigError, match=r"decodes images of \(8, 8, 3\), recorded are \(7, 8, 3\)"):
+        evaluate(params, CONFIG, TABLE, TOKENIZER, [batch | {"images": batch["images"][:, :, 1:]}], EVAL)
+
+
+# --- Groups, order, memory --------------------------------------------------------------------
+
+
+def agree(got, want):
+    """Tables of the same windows in other programs: equal but for rounding."""
+    assert got.names == want.names
+    for metric, column in want.metrics.items():
+        np.testing.assert_allclose(got.metrics[metric], column, rtol=1e-5, atol=1e-5, err_msg=metric)
+
+
+def test_a_window_s_numbers_depend_on_neither_batch_nor_row_nor_neighbours(params):
+    together = run(params, each=5).windows
+    alone = run(params, names=("arm",), each=3).windows
+    agree(together.rows(np.asarray([together.names.index(name) for name in alone.names])), alone)
+
+
+def test_how_many_windows_are_in_memory_changes_no_number(params):
+    """A batch of 4 in two groups of 2."""
+    agree(run(params, execution=ExecutionConfig(windows_at_once=3)).windows, run(params).windows)
+
+
+@pytest.mark.parametrize(
+    ("rows", "at_once", "ways", "plan"),
+    [
+        (12, 4, 1, (3, 4)), (9, 4, 1, (3, 3)), (5, 8, 1, (1, 5)),
+        (5, 8, 4, (1, 8)), (32, 2, 8, (2, 16)), (1, 4, 2, (1, 2)),
+    ],
+)  # fmt: skip
+def test_groups_hold_all_rows_and_few_others(rows, at_once, ways, plan):
+    groups, each = plan_groups(rows, at_once, ways)
+    assert (groups, each) == plan
+    assert each % ways == 0 and each <= at_once * ways and rows <= groups * each < rows + groups * ways
+
+
+def test_rows_keep_their_order_through_groups():
+    batch = {"x": jnp.arange(12), "y": jnp.arange(24.0).reshape(12, 2)}
+    seen = in_groups(lambda rows: {"sum": rows["x"] + rows["y"].sum(1)}, batch, groups=3)
+    np.testing.assert_array_equal(seen["sum"], batch["x"] + batch["y"].sum(1))
+
+
+def test_images_decoded_in_pieces_are_those_decoded_together():
+    tokens = jnp.arange(7 * 9).reshape(7, 9)
+    whole, pieces = (
+        decode_in_pieces(GreyTokenizer().decode_uint8_fn, piece, GreyTokenizer.params, tokens) for piece in (64, 3)
+    )
+    np.testing.assert_array_equal(whole, pieces)
+    assert len(np.unique(whole)) == 7
+
+
+def test_the_next_batch_is_dispatched_before_numbers_are_read(params, monkeypatch):
+    events = []
+
+    class Number:
+        def __init__(self, value, batch):
+            self.value, self.batch = value, batch
+
+        def __array__(self, dtype=None, copy=None):
+            events.append(f"read {self.batch}")
+            return np.asarray(self.value, dtype)
+
+    def make_logging_evaluator(*args):
+        evaluator = make_evaluator(*args)
+
+        def call(*args):
+            number = sum("dispatch" in e for e in events)
+            events.append(f"dispatch {number}")
+            metrics, predicted = evaluator(*args)
+            return {name: Number(x, number) for name, x in metrics.items()}, predicted
+
+        return call
+
+    monkeypatch.setattr(module, "make_evaluator", make_logging_evaluator)
+    run(params, each=6)
+    order = list(dict.fromkeys(events))
+    assert order == ["dispatch 0", "dispatch 1", "read 0", "dispatch 2", "read 1", "read 2"]
+    assert list(one_ahead([])) == [] and list(one_ahead([5])) == [5]
+
+
+def test_memory_is_that_of_the_windows_at_once_not_of_the_batch(params):
+    """Rollouts of all windows together would need a multiple of this."""
+
+    def temporary_bytes(rows, at_once):
+        execution, decoder = ExecutionConfig(windows_at_once=at_once), GreyTokenizer(piece=4)
+        quick = replace(EVAL, decode=DecodeConfig(1))
+        evaluator = make_evaluator(CONFIG, TABLE, quick, "forward", execution, decoder.decode_uint8_fn, decoder.piece)
+        (batch,) = make_batches(CONFIG, names=("arm",), batch=rows, each=rows)
+        compiled = evaluator.lower(params, decoder.params, {k: batch[k] for k in module.ARRAYS}).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert temporary_bytes(32, 2) < 0.15 * temporary_bytes(32, 32)

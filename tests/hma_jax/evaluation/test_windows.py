@@ -1,0 +1,112 @@
+"""Tables of windows, on disk and summed up, and two models on the same windows."""
+
+import gzip
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError
+from hma_jax.evaluation.statistics import mean_and_sem
+from hma_jax.evaluation.summary import Summary, paired_difference, summarise
+from hma_jax.evaluation.windows import FILE, WindowTable, join
+
+
+def make_table(name: str = "arm", seed: int = 0, episodes: int = 8, each: int = 3) -> WindowTable:
+    """Two metrics; windows of an episode resemble each other."""
+    rng = np.random.default_rng(seed)
+    n = episodes * each
+    psnr = 20 + np.repeat(rng.normal(size=episodes), each) + 0.1 * rng.normal(size=n)
+    return WindowTable(
+        np.full(n, name),
+        np.repeat(np.arange(episodes) * 7, each),
+        np.tile(np.arange(each) * 12, episodes),
+        {"psnr": psnr, "cross_entropy": np.abs(rng.normal(size=n))},
+    )
+
+
+def test_a_table_survives_the_disk_to_the_last_bit(tmp_path):
+    table = join([make_table("arm", 0), make_table("base", 1)])
+    table.metrics["psnr"][:3] = [math.nan, math.inf, np.float32(0.1)]
+    table.save(tmp_path / FILE)
+    again = WindowTable.load(tmp_path / FILE)
+    assert again.names == table.names and again.datasets == ("arm", "base")
+    for metric, column in table.metrics.items():
+        np.testing.assert_array_equal(again.metrics[metric], column)
+    (tmp_path / "more").mkdir()
+    again.save(tmp_path / "more" / FILE)
+    assert (tmp_path / "more" / FILE).read_bytes() == (tmp_path / FILE).read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["more", FILE]
+
+
+def test_any_program_reads_it_as_a_csv(tmp_path):
+    make_table(episodes=1, each=2).save(tmp_path / FILE)
+    head, first, second = gzip.decompress((tmp_path / FILE).read_bytes()).decode().splitlines()
+    assert head == "dataset,episode,start,psnr,cross_entropy"
+    assert first.startswith("arm,0,0,") and second.startswith("arm,0,12,")
+
+
+def test_a_damaged_table_is_named(tmp_path):
+    make_table().save(tmp_path / FILE)
+    whole = (tmp_path / FILE).read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    foreign = gzip.compress(b"a,b,c\n1,2,3\n")
+    for content in (b"", b"csv", whole[:-20], bytes(flipped), foreign):
+        (tmp_path / FILE).write_bytes(content)
+        with pytest.raises(ConfigError, match=f"{FILE}: no table of windows can be read"):
+            WindowTable.load(tmp_path / FILE)
+    with pytest.raises(ConfigError, match="no table"):
+        WindowTable.load(tmp_path / "absent")
+
+
+def test_all_means_follow_from_the_table():
+    table = join([make_table("arm", 0), make_table("base", 1, episodes=4)])
+    summary = summarise(table, perplexity_group=4)
+    own = table.of("base")
+    assert summary.datasets["base"]["psnr"] == mean_and_sem(own.metrics["psnr"], own.episode)
+    losses = own.metrics["cross_entropy"]
+    groups = [np.exp(losses[i : i + 4].mean()) for i in range(0, 12, 4)]
+    assert summary.datasets["base"]["perplexity"].mean == pytest.approx(np.mean(groups))
+    assert summary.datasets["base"]["perplexity_corpus"].mean == pytest.approx(np.exp(losses.mean()))
+    overall = summary.overall["psnr"]
+    assert overall.mean == pytest.approx(np.mean([s["psnr"].mean for s in summary.datasets.values()]))
+    assert (overall.n, overall.episodes) == (36, 12)
+    assert Summary.from_dict(summary.to_dict()) == summary
+
+
+def test_a_difference_is_taken_window_by_window_whatever_their_order():
+    a = join([make_table("arm", 0), make_table("base", 1), make_table("mine", 2)])
+    shift = {name: column + 0.5 for name, column in a.metrics.items()}
+    b = replace(a, metrics=shift).rows(np.random.default_rng(0).permutation(len(a)))
+    theirs = b.rows(np.flatnonzero(b.dataset != "mine"))
+    difference = paired_difference(theirs, a, 1)
+    assert set(difference.datasets) == {"arm", "base"}
+    for stats in difference.datasets.values():
+        assert stats["psnr"].mean == pytest.approx(0.5) and stats["psnr"].sem < 1e-12
+        assert (stats["psnr"].n, stats["psnr"].episodes) == (24, 8)
+
+
+def test_a_difference_has_the_error_of_the_differences_by_episode():
+    a, b = make_table(seed=0), make_table(seed=1)
+    found = paired_difference(a, b, 1).datasets["arm"]
+    want = mean_and_sem(a.metrics["psnr"] - b.metrics["psnr"], a.episode)
+    assert found["psnr"].mean == pytest.approx(want.mean) and found["psnr"].sem == pytest.approx(want.sem)
+    # Perplexities: the delta method on both at once, here against the scatter under small changes.
+    losses = [t.metrics["cross_entropy"] for t in (a, b)]
+    assert found["perplexity_corpus"].mean == pytest.approx(np.exp(losses[0].mean()) - np.exp(losses[1].mean()))
+    slopes = [np.exp(x.mean()) * x for x in losses]
+    assert found["perplexity_corpus"].sem == pytest.approx(mean_and_sem(slopes[0] - slopes[1], a.episode).sem)
+
+
+def test_other_windows_or_other_datasets_are_not_compared():
+    a = make_table()
+    with pytest.raises(ConfigError, match=r"only one of two evaluations has window \('arm', 0, 0\) \(and 1 others\)"):
+        paired_difference(a, a.rows(np.arange(2, len(a))), 1)
+    with pytest.raises(ConfigError, match="without a common dataset"):
+        paired_difference(a, make_table("base"), 1)
+    with pytest.raises(ConfigError, match="no windows"):
+        join([])
+    with pytest.raises(ConfigError, match="differ in length"):
+        replace(a, episode=a.episode[1:])
