@@ -90,7 +90,7 @@ class Trunk(nnx.Module):
         """Runs all blocks.
 
         `visible` [T, T_past + T] says which frames each frame's temporal attention may see.
-        The cache of the first `remember` new frames is returned, None of none.
+        The cache of the first `remember` new frames is returned; None if `remember` is 0.
         """
         block_def, layers = nnx.split(self.blocks)
 
