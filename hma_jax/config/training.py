@@ -13,7 +13,7 @@ Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 
 @dataclass(frozen=True)
 class MaskingConfig:
-    """Training-time masking and corruption (reference sections 1.9 and 2.3)."""
+    """Training-time masking and corruption (reference sections 1.9 and 2.3, paper section 3.5)."""
 
     setting: Setting = "forward"
     action_loss_weight: float = 0.5
@@ -22,6 +22,10 @@ class MaskingConfig:
     # A frame's mask rate is cos(pi/2 u) with u uniform from here to 1. DIFFERS: the release calls
     # it the minimum mask ratio, but a larger value lowers the largest rate.
     mask_angle_min: float = 0.0
+    # The schedule of paper section 3.5, which the release lacks: the least mask rate of a frame, and how
+    # far it rises over the window; at 1 the last frame is wholly masked.
+    min_ratio: float = 0.0
+    horizon_gain: float = 0.0
     # Continuous variant: mask whole patches. DIFFERS: the release masks single cells, so that
     # patches are partly masked in training and never at inference; `cell` is as released.
     mask_unit: Literal["patch", "cell"] = "patch"
@@ -33,7 +37,8 @@ class MaskingConfig:
     action_leak: Literal["none", "conditioning", "all"] = "none"
 
     def __post_init__(self):
-        for name in ("non_mlm_ratio", "mask_angle_min", "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
+        shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain")
+        for name in (*shares, "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")

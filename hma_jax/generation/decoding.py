@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from hma_jax.config import DecodeConfig, ModelConfig, require
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
-from hma_jax.objective.diffusion import make_process, respace, sample_with_key
+from hma_jax.objective.diffusion import sample_with_key
+from hma_jax.objective.process import make_process, sampling_process
 
 
 class Frame(NamedTuple):
@@ -144,7 +145,7 @@ def _decode_latents(model: HMA, z: jax.Array, look: Look, key_B: jax.Array, deco
 def denoise(model: HMA, z: jax.Array, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     """Latents [B, n, C] under conditions z [B, n, D]."""
     config = model.config.diffusion
-    process = respace(make_process(config.steps), decode.sampler.steps)
+    process = sampling_process(make_process(config.steps), decode.sampler)
     shape = (*z.shape[:-1], config.token_channels)
     network = lambda x, t: model.denoiser(x, t, z)  # noqa: E731
     return sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)

@@ -46,14 +46,15 @@ def frame_flops(
 def sampler_flops(config: ModelConfig, decode: DecodeConfig) -> float:
     """The denoiser's part of one frame; 0 for ids.
 
-    Every token is drawn once or, with `resample`, again at each look after the one that unmasked it.
+    Every token is drawn once or, with `resample`, again at each look after the one that unmasked it. Every kind of
+    sampler evaluates the denoiser once per step.
     """
     if config.diffusion is None:
         return 0.0
     drawn = config.tokens
     if decode.resample:
         drawn = sum(config.tokens - masked for masked in masked_counts(config, decode.unmask_steps))
-    return decode.sampler.steps * denoiser_flops(config, drawn)
+    return decode.sampler.steps * denoiser_flops(config, drawn, own_steps=False)
 
 
 def rollout_flops(

@@ -11,7 +11,8 @@ from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
 from hma_jax.generation.teacher import beside
 from hma_jax.model.hma import HMA, Outputs
-from hma_jax.objective.diffusion import make_process, respace, sample_with_key
+from hma_jax.objective.diffusion import sample_with_key
+from hma_jax.objective.process import make_process, sampling_process
 
 
 def predict_actions(
@@ -92,7 +93,7 @@ def _sample_actions(
     """Normalised chunks [B, T, U]. Each value has random numbers of its own: those of a robot do not depend
     on U, which others decide."""
     config, width = model.config.diffusion, model.table.action_width
-    process = respace(make_process(config.steps), decode.sampler.steps)
+    process = sampling_process(make_process(config.steps), decode.sampler)
     shape = (*features_BTD.shape[:2], width)
     value = 2**16 * jnp.arange(shape[1])[:, None] + jnp.arange(width)
     keys = jax.vmap(lambda key: jax.vmap(jax.vmap(lambda n: jax.random.fold_in(key, n)))(value))(key_B)

@@ -45,11 +45,16 @@ def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: f
     return 2.0 * frames * (config.layers * (p * per_token + per_frame) + stem + ends)
 
 
-def denoiser_flops(config: ModelConfig, tokens: int) -> float:
-    """One evaluation of the denoiser on so many tokens."""
+def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True) -> float:
+    """One evaluation of the denoiser on so many tokens.
+
+    `own_steps`: each token is at a step of its own, as in training. In sampling all are at the same one, and what
+    is made of it once for all tokens and examples is not counted.
+    """
     d, w, c = config.width, config.diffusion.width, config.diffusion.token_channels
     blocks = config.diffusion.depth * 5 * w * w
-    return 2.0 * tokens * ((TIME_FEATURES + w + d + c) * w + blocks + 2 * w * w + 2 * w * c)
+    time = (TIME_FEATURES + w) * w if own_steps else 0
+    return 2.0 * tokens * (time + (d + c) * w + blocks + 2 * w * w + 2 * w * c)
 
 
 def train_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float:

@@ -125,7 +125,8 @@ class ActionDenoiser(nnx.Module):
         self.robots = stack(lambda: Denoiser(config, table.action_width, dtype, "U"), table.size, axis="E")
 
     def __call__(self, x_BTU: jax.Array, time_BT: jax.Array, z_BTD: jax.Array, slice_B: jax.Array) -> jax.Array:
-        """Normalised, noised chunks -> float32 [B, T, 2 U], noise first."""
+        """Normalised, noised chunks -> float32 [B, T, 2 U], noise first. `time_BT` may have axes of size 1."""
+        time_BT = jnp.broadcast_to(time_BT, (len(x_BTU), time_BT.shape[1]))
         graphdef, params = nnx.split(self.robots)
         own = jax.tree.map(lambda p: take_by_robot(p.astype(self.dtype), slice_B), params)
         return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)

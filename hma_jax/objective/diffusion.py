@@ -1,20 +1,17 @@
-"""The mathematics of diffusion over continuous vectors: process, training terms, sampling.
+"""The mathematics of diffusion over continuous vectors: training terms and sampling, given a noising process.
 
-A cosine noising process with epsilon prediction and learned-range variance (reference sections
-2.4 and 2.5). The denoising network is an argument everywhere: network(x_t [..., C], t [...]) ->
-[..., 2 C], the predicted noise and then the variance, where t is int32 and counts steps of the
-original process also when a respaced one is run. Which tokens are noised, at which t, and how
-their losses are weighted is the caller's business, and so are the parameters.
-
-Tables are float64 numpy, computation is float32.
+Epsilon prediction and learned-range variance (reference sections 2.4 and 2.5). The denoising
+network is an argument everywhere: network(x_t [..., C], t [...]) -> [..., 2 C], the predicted noise
+and then the variance, where t is int32 and counts steps of the original process also when a respaced
+one is run. In sampling, where all vectors are at the same step, the axes of t have size 1. Which
+tokens are noised, at which t, and how their losses are weighted is the caller's business, and so are
+the parameters. Computation is float32.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -22,94 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import SamplerConfig, require
+from hma_jax.objective.process import Process, multistep
 
 Network = Callable[[jax.Array, jax.Array], jax.Array]
 
 
-# --- The process -----------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)  # compared and hashed by identity: a static argument
-class Process:
-    """Tables of one noising process, one entry per step; index 0 is the cleanest.
-
-    x_t = sqrt(abar_t) x0 + sqrt(1 - abar_t) eps. The posterior q(x_{t-1} | x_t, x0) has mean
-    posterior_x0 * x0 + posterior_xt * x_t.
-    """
-
-    betas: np.ndarray
-    log_betas: np.ndarray
-    alphas_cumprod: np.ndarray  # abar
-    alphas_cumprod_prev: np.ndarray  # abar one step cleaner; 1 at index 0
-    clean_from_xt: np.ndarray  # x0 = clean_from_xt * x_t - clean_from_eps * eps
-    clean_from_eps: np.ndarray
-    posterior_x0: np.ndarray
-    posterior_xt: np.ndarray
-    posterior_log_variance_clipped: np.ndarray  # the variance at index 0 is 0: index 1 stands in
-    timestep_map: np.ndarray  # int: the step of the original process
-
-    @property
-    def steps(self) -> int:
-        return len(self.betas)
-
-
-def _from_betas(betas: np.ndarray, timestep_map: np.ndarray) -> Process:
-    abar = np.cumprod(1.0 - betas)
-    abar_prev = np.append(1.0, abar[:-1])
-    variance = betas * (1.0 - abar_prev) / (1.0 - abar)
-    return Process(
-        betas=betas,
-        log_betas=np.log(betas),
-        alphas_cumprod=abar,
-        alphas_cumprod_prev=abar_prev,
-        clean_from_xt=np.sqrt(1.0 / abar),
-        clean_from_eps=np.sqrt(1.0 / abar - 1.0),
-        posterior_x0=betas * np.sqrt(abar_prev) / (1.0 - abar),
-        posterior_xt=(1.0 - abar_prev) * np.sqrt(1.0 - betas) / (1.0 - abar),
-        posterior_log_variance_clipped=np.log(np.append(variance[1], variance[1:])),
-        timestep_map=timestep_map,
-    )
-
-
-@functools.cache
-def make_process(steps: int) -> Process:
-    """The cosine process: abar(u) = cos^2(pi/2 (u + 0.008) / 1.008), betas at most 0.999."""
-    require(steps >= 2, f"a noising process needs at least 2 steps, got {steps}")
-
-    def abar(u: float) -> float:
-        return math.cos((u + 0.008) / 1.008 * math.pi / 2) ** 2
-
-    betas = [min(1 - abar((i + 1) / steps) / abar(i / steps), 0.999) for i in range(steps)]
-    return _from_betas(np.array(betas), np.arange(steps))
-
-
-@functools.cache
-def respace(process: Process, count: int) -> Process:
-    """The process that visits `count` steps of `process`, evenly spaced from first to last.
-
-    Positions are summed up in floating point and then rounded, as released, so that ties fall
-    the same way.
-    """
-    require(
-        2 <= count <= process.steps,
-        f"cannot visit {count} steps of a noising process of {process.steps}; "
-        f"set sampler.steps between 2 and {process.steps}",
-    )
-    stride = (process.steps - 1) / (count - 1)
-    position, chosen = 0.0, []
-    for _ in range(count):
-        chosen.append(round(position))
-        position += stride
-    abar = process.alphas_cumprod[chosen]
-    return _from_betas(1.0 - abar / np.append(1.0, abar[:-1]), process.timestep_map[chosen])
+# --- What the network says -------------------------------------------------------------------
 
 
 def _at(table: np.ndarray, t: jax.Array) -> jax.Array:
     """table[t] in float32 with an axis for the channels: t [...] -> [..., 1]."""
     return jnp.asarray(table, jnp.float32)[t][..., None]
-
-
-# --- What the network says -------------------------------------------------------------------
 
 
 class Prediction(NamedTuple):
@@ -258,15 +178,21 @@ def _run(
     """From the last index of the process down to 0; noise_at(index) -> [..., C]."""
     require(
         process.steps == sampler.steps,
-        f"sampler.steps is {sampler.steps} but the process has {process.steps}; use respace(process, steps)",
+        f"sampler.steps is {sampler.steps} but the process has {process.steps}; use sampling_process(process, sampler)",
     )
+    solver = multistep(process)
 
-    def step(x: jax.Array, index: jax.Array) -> tuple[jax.Array, Trajectory | None]:
-        t = jnp.full(x.shape[:-1], index)
+    def step(carry: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[tuple, Trajectory | None]:
+        x, before = carry
+        # Every vector is at the same step: what the network makes of the step alone, it makes once.
+        t = jnp.full((1,) * (x.ndim - 1), index)
         predicted = _predict(network, x, t, process)
         from_xt, from_eps = _at(process.clean_from_xt, index), _at(process.clean_from_eps, index)
         x0 = jnp.clip(from_xt * x - from_eps * predicted.eps, -clip, clip)
-        if sampler.kind == "ddim":
+        if sampler.kind == "dpm++":
+            ahead = x0 + _at(solver.lead, index) * (x0 - before)
+            x = _at(solver.keep, index) * x + _at(solver.mix, index) * ahead
+        elif sampler.kind == "ddim":
             eps = (from_xt * x - x0) / from_eps  # what the clipped x0 leaves
             cleaner = process.alphas_cumprod_prev
             x = _at(np.sqrt(cleaner), index) * x0 + _at(np.sqrt(1.0 - cleaner), index) * eps
@@ -275,8 +201,8 @@ def _run(
             if sampler.noisy_steps:
                 scale = jnp.where(index > 0, sampler.temperature, 0.0)
                 x += scale * jnp.exp(0.5 * predicted.log_variance) * noise_at(index)
-        return x, Trajectory(x, x0) if trajectory else None
+        return (x, x0), Trajectory(x, x0) if trajectory else None
 
     x = jnp.asarray(noise_init, jnp.float32) * (sampler.temperature if sampler.scale_initial_noise else 1.0)
-    x, visited = jax.lax.scan(step, x, jnp.arange(process.steps - 1, -1, -1))
+    (x, _), visited = jax.lax.scan(step, (x, jnp.zeros_like(x)), jnp.arange(process.steps - 1, -1, -1))
     return (x, visited) if trajectory else x

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from hma_jax.config import DiffusionConfig, MaskingConfig
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
-from hma_jax.objective.diffusion import diffusion_loss, make_process
+from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.masking import Masked
+from hma_jax.objective.process import make_process
 
 SAID_FROM = 1
 """The first frame that can have targets: frame 0 is never masked."""

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.model.embodiments import EmbodimentTable
@@ -106,17 +107,33 @@ def corrupt(
     return compose(jnp.where(replace, draws.noise_TSQ, ids), config.factor_vocab)
 
 
+def min_mask_ratio(frames: int, masking: MaskingConfig) -> np.ndarray:
+    """[T]: the least mask rate of each frame, 0 as released (paper section 3.5).
+
+    The paper says that there is a minimum ratio and that a cosine schedule masks more tokens at later steps of
+    the training horizon. The formula is ours: from `min_ratio` the minimum rises by `horizon_gain` of what is left
+    to 1, along 1 - cos(pi/2 t / (T - 1)).
+    """
+    rise = 1.0 - np.cos(np.pi / 2 * np.arange(frames) / max(frames - 1, 1))
+    return masking.min_ratio + (1.0 - masking.min_ratio) * masking.horizon_gain * rise
+
+
 def mask_tokens(
     u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array, masking: MaskingConfig
 ) -> jax.Array:
     """bool like `u_mask` [T, ...]: a frame's rate is cos(pi/2 u), its mean 2 / pi for u over [0, 1).
 
-    Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3).
+    Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3). A minimum m
+    that is not 0 makes the rate m + (1 - m) cos(pi/2 u) (`min_mask_ratio`).
     """
     angle = masking.mask_angle_min + (1 - masking.mask_angle_min) * u_rate_T
+    rate = jnp.cos(jnp.pi / 2 * angle)
+    least = min_mask_ratio(len(u_rate_T), masking).astype(np.float32)
+    if least.any():
+        rate = least + (1 - least) * rate
     late_T = jnp.arange(len(u_rate_T)) >= first_masked
     shape = (-1, *(1,) * (u_mask.ndim - 1))
-    return late_T.reshape(shape) & (u_mask < jnp.cos(jnp.pi / 2 * angle).reshape(shape))
+    return late_T.reshape(shape) & (u_mask < rate.reshape(shape))
 
 
 def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Array:

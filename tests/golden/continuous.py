@@ -12,7 +12,8 @@ import numpy as np
 from hma_jax.config import SamplerConfig
 from hma_jax.generation.decoding import Frame, choose_patches, commit, masked_counts
 from hma_jax.model.frames import mask_cells, patchify, unpatchify
-from hma_jax.objective.diffusion import diffusion_loss, make_process, respace, sample
+from hma_jax.objective.diffusion import diffusion_loss, sample
+from hma_jax.objective.process import make_process, sampling_process
 from tests.golden.case import Case, norms
 
 
@@ -63,7 +64,7 @@ def make_sampler(case: Case, head: Callable, temperature: float, trajectory: boo
     config = case.run.model.diffusion
     # As released, temperature multiplies the noise of the steps only.
     sampler = SamplerConfig(steps=steps, temperature=temperature, scale_initial_noise=False)
-    process = respace(make_process(config.steps), steps)
+    process = sampling_process(make_process(config.steps), sampler)
 
     @jax.jit
     def run(params, condition, start, noises):

@@ -20,7 +20,7 @@ from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.frames import compose, factorise, patchify, unpatchify
 from hma_jax.model.heads import timestep_embedding
 from hma_jax.model.hma import declare_model
-from hma_jax.objective.diffusion import Process, make_process, respace
+from hma_jax.objective.process import Process, make_process, respace
 from hma_jax.training.optimizer import make_schedule
 from tests.golden.case import Case, Finding
 

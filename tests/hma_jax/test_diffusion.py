@@ -1,8 +1,9 @@
-"""Diffusion where the right answer is known: Gaussian data, for which the best network is a formula."""
+"""Diffusion where the right answer is known: Gaussian data and mixtures, for which the best network is a formula."""
 
 from __future__ import annotations
 
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +13,8 @@ import pytest
 from hma_jax.config import ConfigError, SamplerConfig
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.heads import timestep_embedding
-from hma_jax.objective.diffusion import (
-    Process,
-    diffusion_loss,
-    make_process,
-    respace,
-    sample,
-    sample_with_key,
-)
+from hma_jax.objective.diffusion import diffusion_loss, sample, sample_with_key
+from hma_jax.objective.process import Process, make_process, respace, respace_by_log_snr, sampling_process
 
 FULL = make_process(1000)
 MEAN, STD = np.array([2.0, -1.0, 0.3], np.float32), 0.6
@@ -47,7 +42,7 @@ def gaussian_network(process: Process, mean=MEAN):
 
 
 def drawn(sampler: SamplerConfig, rows: int = 20_000, seed: int = 0) -> np.ndarray:
-    process = respace(FULL, sampler.steps)
+    process = sampling_process(FULL, sampler)
     network = gaussian_network(process)
     draw = jax.jit(lambda key: sample_with_key(network, key, (rows, 3), process, sampler, CLIP))
     return np.asarray(draw(jax.random.key(seed)))
@@ -87,6 +82,23 @@ def test_respacing_keeps_the_noise_level_of_every_step_it_visits():
 def test_a_process_cannot_be_respaced_to_any_length(count: int):
     with pytest.raises(ConfigError, match="between 2 and 1000"):
         respace(FULL, count)
+
+
+@pytest.mark.parametrize("count", [2, 8, 10, 12, 100])
+def test_spacing_by_log_snr_is_even_from_the_cleanest_step_to_where_the_signal_is_lost(count):
+    short = respace_by_log_snr(FULL, count)
+    assert short.timestep_map[0] == 0
+    np.testing.assert_allclose(short.log_snr[[0, -1]], [5.0475, -4.0], atol=0.05)
+    if count <= 12:  # with more, neighbouring steps of the process lie further apart than asked for
+        np.testing.assert_allclose(np.diff(short.log_snr), -9.05 / (count - 1), atol=0.2)
+
+
+@pytest.mark.parametrize("size", [2, 3, 20, 1000])
+def test_spacing_by_log_snr_visits_every_step_at_most_once(size):
+    process = make_process(size)
+    for count in {2, min(12, size), size - 1, size} - {1}:
+        chosen = respace_by_log_snr(process, count).timestep_map
+        assert len(chosen) == count and np.all(np.diff(chosen) > 0) and chosen[-1] < size
 
 
 # --- Training terms --------------------------------------------------------------------------
@@ -236,6 +248,77 @@ def test_samples_have_the_mean_and_spread_of_the_data(kind, steps, spread):
     assert np.all(np.abs(np.corrcoef(samples.T) - np.eye(3)) < 0.03)
 
 
+WEIGHTS, CENTRES = np.array([0.5, 0.3, 0.2]), np.array([[1.5, 0.0], [-1.0, 0.5], [0.0, -1.5]])
+STDS = np.array([0.1, 0.3, 0.2])
+
+
+def mixture_network(x_t, t):
+    """The exact prediction of the noise for a mixture of Gaussians; the variance is the posterior's and beta's mean."""
+    a = jnp.asarray(FULL.alphas_cumprod, jnp.float32)[t][..., None]
+    spread = a * STDS**2 + 1 - a  # [..., 3], of x_t
+    distance = x_t[..., None, :] - jnp.sqrt(a)[..., None] * CENTRES
+    log_p = jnp.log(WEIGHTS) - jnp.sum(distance**2, -1) / (2 * spread) - jnp.log(spread)  # of two dimensions
+    score = jax.nn.softmax(log_p, -1)[..., None] * distance / spread[..., None]
+    eps = jnp.sqrt(1 - a) * jnp.sum(score, -2)
+    return jnp.concatenate([eps, jnp.zeros_like(eps)], -1)
+
+
+def from_mixture(sampler: SamplerConfig, rows: int = 20_000) -> np.ndarray:
+    process = sampling_process(FULL, sampler)
+    draw = jax.jit(lambda key: sample_with_key(mixture_network, key, (rows, 2), process, sampler, CLIP))
+    return np.asarray(draw(jax.random.key(0)))
+
+
+def moments(x: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(mean [2], spread [2], share of each component [3], spread within each [3]) of samples [n, 2]."""
+    score = np.sum((x[:, None] - CENTRES) ** 2, -1) / (2 * STDS**2) + 2 * np.log(STDS) - np.log(WEIGHTS)
+    nearest = np.argmin(score, axis=1)
+    within = [(x[nearest == k] - CENTRES[k]).std() for k in range(3)]
+    return x.mean(0), x.std(0), np.bincount(nearest, minlength=3) / len(x), np.array(within)
+
+
+@pytest.mark.parametrize("steps", [8, 10, 12])
+def test_a_few_steps_of_dpm_have_the_moments_of_a_mixture_and_of_100_ancestral_steps(steps):
+    found = moments(from_mixture(SamplerConfig("dpm++", steps)))
+    mean = WEIGHTS @ CENTRES
+    spread = np.sqrt(WEIGHTS @ (CENTRES**2 + STDS[:, None] ** 2) - mean**2)
+    for want in (mean, spread, WEIGHTS, STDS), moments(from_mixture(SamplerConfig())):
+        np.testing.assert_allclose(found[0], want[0], atol=0.05)
+        np.testing.assert_allclose(found[1], want[1], rtol=0.1)
+        np.testing.assert_allclose(found[2], want[2], atol=0.02)
+        np.testing.assert_allclose(found[3], want[3], rtol=0.1)
+
+
+@pytest.mark.parametrize("steps", [8, 10, 12])
+def test_a_few_steps_of_dpm_have_the_spread_of_wide_and_of_narrow_data(steps):
+    samples = drawn(SamplerConfig("dpm++", steps))
+    np.testing.assert_allclose(samples.mean(0), MEAN, atol=0.05)
+    np.testing.assert_allclose(samples.std(0), STD, rtol=0.06)
+
+
+def test_dpm_is_the_multistep_formula_of_second_order():
+    """By hand, in float64 (Lu et al. 2022, algorithm 2), with a network that always points the same way."""
+    process = respace_by_log_snr(FULL, 5)
+    x, before, stride_before = np.array([[0.3, -0.2]]), None, None
+    told = np.array([[0.5, -1.5]])
+    network = lambda x_t, t: jnp.concatenate([jnp.asarray(told) * (1 + x_t), jnp.zeros((1, 2))], -1)  # noqa: E731
+    _, visited = sample(network, x, None, process, SamplerConfig("dpm++", 5), CLIP, True)
+    keep, spread = np.sqrt(process.alphas_cumprod), np.sqrt(1 - process.alphas_cumprod)
+    for step, index in enumerate([4, 3, 2, 1, 0]):
+        clean = np.clip((x - spread[index] * told * (1 + x)) / keep[index], -CLIP, CLIP)
+        if index == 0:
+            x = clean
+        else:
+            stride = np.log(keep / spread)[index - 1] - np.log(keep / spread)[index]
+            ahead = clean
+            if before is not None:
+                r = stride_before / stride
+                ahead = (1 + 1 / (2 * r)) * clean - 1 / (2 * r) * before
+            x = spread[index - 1] / spread[index] * x - keep[index - 1] * np.expm1(-stride) * ahead
+            before, stride_before = clean, stride
+        np.testing.assert_allclose(visited.x[step], x, rtol=1e-3, atol=1e-4)
+
+
 def test_ddim_nears_the_spread_of_the_data_with_more_steps():
     lost = [1 - ddim_spread(steps) / STD for steps in (5, 10, 100, 1000)]
     assert lost == sorted(lost, reverse=True)
@@ -256,11 +339,11 @@ def test_the_learned_variance_decides_the_spread_of_ancestral_samples():
     assert np.all(draw(jax.random.key(0)).std(0) < 0.02)
 
 
-@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
-def test_temperature_0_depends_on_the_condition_alone(kind):
+@pytest.mark.parametrize("kind, near", [("ddpm", 1e-3), ("ddim", 1e-3), ("dpm++", 0.03)])
+def test_temperature_0_depends_on_the_condition_alone(kind, near):
     one, other = (drawn(SamplerConfig(kind, 20, temperature=0.0), 4, seed) for seed in (0, 1))
     np.testing.assert_array_equal(one, other)
-    np.testing.assert_allclose(one, np.broadcast_to(MEAN, one.shape), atol=1e-3)
+    np.testing.assert_allclose(one, np.broadcast_to(MEAN, one.shape), atol=near)
 
 
 def test_temperature_0_as_released_still_depends_on_the_initial_noise():
@@ -280,10 +363,10 @@ def test_temperature_0_as_released_still_depends_on_the_initial_noise():
     np.testing.assert_array_equal(sample(network, start, None, process, ours, CLIP), [[0], [0]])
 
 
-@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
-def test_spread_is_proportional_to_temperature(kind):
-    """For Gaussian data sampling is linear in the noise."""
-    process = respace(FULL, 20)
+@pytest.mark.parametrize("kind, near", [("ddpm", 1e-3), ("ddim", 1e-3), ("dpm++", 0.03)])
+def test_spread_is_proportional_to_temperature(kind, near):
+    """For Gaussian data sampling is linear in the noise; `dpm++` starts where the mean already shows."""
+    process = sampling_process(FULL, SamplerConfig(kind, 20))
     network = gaussian_network(process)
     noise = np.random.default_rng(0).normal(size=(21, 8, 3)).astype(np.float32)
     whole, half = (
@@ -291,10 +374,10 @@ def test_spread_is_proportional_to_temperature(kind):
         for v in (1.0, 0.5)
     )
     assert np.abs(whole - MEAN).max() > 0.5
-    np.testing.assert_allclose(half - MEAN, (whole - MEAN) / 2, atol=1e-3)
+    np.testing.assert_allclose(half - MEAN, (whole - MEAN) / 2, atol=near)
 
 
-@pytest.mark.parametrize("kind", ["ddpm", "ddim"])
+@pytest.mark.parametrize("kind", ["ddpm", "ddim", "dpm++"])
 def test_predicted_clean_vectors_are_clipped_and_the_last_is_the_sample(kind):
     process = respace(FULL, 20)
     network = gaussian_network(process, mean=np.array([5.0, -5.0, 0.0], np.float32))
@@ -348,7 +431,7 @@ def test_the_network_is_told_steps_of_the_original_process():
 
     sample(network, jnp.zeros((2, 3)), None, process, SamplerConfig("ddim", 5), CLIP).block_until_ready()
     jax.effects_barrier()
-    assert told == [[step, step] for step in process.timestep_map[::-1]]
+    assert told == [[step] for step in process.timestep_map[::-1]]
 
 
 def test_samples_of_an_example_do_not_depend_on_its_neighbours():
@@ -379,8 +462,9 @@ def test_what_cannot_be_sampled_is_refused():
     with pytest.raises(ConfigError, match="first axes"):
         keys = jax.random.split(jax.random.key(0), 3)
         sample_with_key(network, keys, (2, 3), process, SamplerConfig(steps=5), CLIP)
-    with pytest.raises(ConfigError, match="no effect on ddim"):
-        SamplerConfig("ddim", temperature=0.5, scale_initial_noise=False)
+    for kind in ("ddim", "dpm++"):
+        with pytest.raises(ConfigError, match=f"no effect on {re.escape(kind)}"):
+            SamplerConfig(kind, temperature=0.5, scale_initial_noise=False)
 
 
 def test_sampler_settings_survive_json():

@@ -132,7 +132,7 @@ def test_a_frame_counts_every_look_and_every_sampler_step(kind, looks):
 
 
 @pytest.mark.parametrize("resample", [False, True])
-@pytest.mark.parametrize("sampler", [SamplerConfig("ddpm", 5), SamplerConfig("ddim", 12)])
+@pytest.mark.parametrize("sampler", [SamplerConfig("ddpm", 5), SamplerConfig("ddim", 12), SamplerConfig("dpm++", 8)])
 def test_the_denoiser_counts_the_tokens_that_it_sees_at_every_step(resample, sampler):
     """Without the trunk's part: the difference of two numbers of steps."""
     case = Case(diffusion=DIFFUSION)
@@ -140,7 +140,8 @@ def test_the_denoiser_counts_the_tokens_that_it_sees_at_every_step(resample, sam
     fewer = dataclasses.replace(decode, sampler=dataclasses.replace(sampler, steps=2))
     more, less = (counted(ways(case, d)["fill"], case.params) for d in (decode, fewer))
     assert more - less == sampler_flops(case.config, decode) - sampler_flops(case.config, fewer)
-    assert sampler_flops(case.config, decode) == sampler.steps * denoiser_flops(case.config, 19 if resample else 9)
+    drawn = denoiser_flops(case.config, 19 if resample else 9, own_steps=False)
+    assert sampler_flops(case.config, decode) == sampler.steps * drawn
     assert sampler_flops(Case().config, decode) == 0
 
 

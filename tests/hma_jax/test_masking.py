@@ -1,4 +1,5 @@
 import dataclasses
+import zlib
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import masked_loss
-from hma_jax.objective.masking import mask_batch
+from hma_jax.objective.masking import mask_batch, mask_tokens
 from hma_jax.training.step import find_presence, init_state, make_train_step
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
 
@@ -85,6 +86,45 @@ def test_robots_without_actions_or_video_targets_train_what_they_can(setting: st
         assert np.asarray(masked.targets_TS)[film].any()
     if setting != "forward":
         assert np.asarray(masked.action_targets_T)[blind].any()
+
+
+@pytest.mark.parametrize("diffusion, digest", [(None, 1553994923), (DIFFUSION, 988358124)])
+def test_without_a_schedule_masks_are_bit_for_bit_those_of_before_there_was_one(diffusion, digest):
+    """Recorded at commit 5cf0343."""
+    _, masked = masked_batch(model_config(diffusion=diffusion), MaskingConfig())
+    assert zlib.crc32(np.packbits(np.asarray(masked.masked)).tobytes()) == digest
+
+
+@pytest.mark.parametrize("least, gain", [(0.0, 0.0), (0.3, 0.0), (0.0, 0.8), (0.25, 0.5)])
+def test_the_mean_mask_ratio_of_each_frame_follows_the_schedule_of_the_paper(least, gain):
+    """Paper section 3.5: a minimum, and by a cosine more at later frames."""
+    masking = MaskingConfig(min_ratio=least, horizon_gain=gain)
+    frames, windows, tokens = 8, 4000, 64
+
+    @jax.jit
+    def ratios(key):
+        u_rate, u_mask = jax.random.uniform(key, (windows, frames)), (windows, frames, tokens)
+        u_mask = jax.random.uniform(jax.random.fold_in(key, 1), u_mask)
+        return jax.vmap(lambda r, m: mask_tokens(r, m, jnp.int32(1), masking))(u_rate, u_mask).mean(-1)
+
+    found = np.asarray(ratios(jax.random.key(0)))
+    floor = np.array([least + (1 - least) * gain * (1 - np.cos(np.pi / 2 * t / 7)) for t in range(1, 8)])
+    assert not found[:, 0].any()
+    np.testing.assert_allclose(found[:, 1:].mean(0), floor + (1 - floor) * 2 / np.pi, atol=0.02)
+    assert np.all(found[:, 1:].min(0) > floor - 0.25)  # what 64 draws leave of the minimum
+
+
+def test_a_whole_horizon_gain_masks_the_last_frame_wholly():
+    for config in (model_config(), model_config(diffusion=DIFFUSION)):
+        _, masked = masked_batch(config, MaskingConfig(horizon_gain=1.0))
+        share = np.asarray(masked.masked).reshape(64, config.frames, -1).mean(-1)
+        assert np.all(share[:, -1] == 1) and 0 < share[:, 1].min() < 1
+
+
+@pytest.mark.parametrize("name", ["min_ratio", "horizon_gain"])
+def test_a_mask_schedule_outside_its_range_is_refused(name):
+    with pytest.raises(ConfigError, match=f"masking.{name} must lie in"):
+        MaskingConfig(**{name: 1.1})
 
 
 def losses(config, masking, changes=None, table=TABLE):
