@@ -22,7 +22,7 @@ from hma_jax.config import EvalConfig, ModelConfig
 from hma_jax.evaluation.evaluate import evaluate
 from hma_jax.evaluation.summary import paired_difference
 
-SAMPLER_STEPS = (100, 50, 25, 12, 8, 4)
+SAMPLER_STEPS = {"ddpm": (100, 50, 25, 12, 8, 4), "ddim": (100, 50, 25, 12, 8, 4), "dpm++": (12, 10, 8)}
 LOOKS = (8, 4, 2, 1)
 
 
@@ -61,8 +61,8 @@ def decodings(model: ModelConfig, config: EvalConfig, frames: int) -> dict[str, 
         return {f"M = {m}": changed(unmask_steps=m) for m in LOOKS if m <= model.tokens}
     return {
         f"{kind} {steps}": changed(sampler=replace(config.decode.sampler, kind=kind, steps=steps))
-        for kind in ("ddpm", "ddim")
-        for steps in SAMPLER_STEPS
+        for kind, counts in SAMPLER_STEPS.items()
+        for steps in counts
         if steps <= model.diffusion.steps
     }
 
@@ -127,7 +127,7 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
             panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
         ):
             kinds = dict.fromkeys(row.decoding.split()[0] for row in rows)
-            for kind, colour, lift in zip(kinds, COLOURS.values(), (5, -12), strict=False):
+            for kind, colour, lift in zip(kinds, COLOURS.values(), (5, -12, 12), strict=False):
                 ours = [r for r in rows if r.decoding.split()[0] == kind]
                 time, value, sem = ([getattr(r, f) for r in ours] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(

@@ -227,7 +227,7 @@ def _subject(bench: Bench, remat: Remat = "products") -> Subject:
 def _decode(decode: Decode) -> DecodeConfig:
     from hma_jax.config import DecodeConfig, SamplerConfig
 
-    return DecodeConfig(decode.unmask_steps, sampler=SamplerConfig(steps=decode.sampler_steps))
+    return DecodeConfig(decode.unmask_steps, sampler=SamplerConfig(decode.sampler, decode.sampler_steps))
 
 
 def _finish(

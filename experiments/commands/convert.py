@@ -10,6 +10,7 @@ from experiments.commands.study import wrote
 from experiments.progress import console
 
 if TYPE_CHECKING:
+    from hma_jax.config.evaluation import SamplerKind
     from hma_jax.training.train import Run
 
 
@@ -74,6 +75,7 @@ def to_stablehlo(
     unmask_steps: int,
     temperature: float,
     sampler_steps: int,
+    sampler: SamplerKind,
     platforms: tuple[str, ...],
 ) -> None:
     from hma_jax.config import DecodeConfig, SamplerConfig
@@ -81,8 +83,8 @@ def to_stablehlo(
     from hma_jax.training.train import load_run
 
     require_free(out)
-    sampler = SamplerConfig(steps=sampler_steps, temperature=temperature)
-    decode = DecodeConfig(unmask_steps, temperature, sampler=sampler)
+    latents = SamplerConfig(sampler, sampler_steps, temperature)
+    decode = DecodeConfig(unmask_steps, temperature, sampler=latents)
     config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
     loaded = load_run(run)
     write_stablehlo(loaded, out, config)

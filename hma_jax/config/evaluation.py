@@ -7,6 +7,8 @@ from typing import Literal
 
 from hma_jax.config.base import require
 
+SamplerKind = Literal["ddpm", "ddim", "dpm++"]
+
 
 @dataclass(frozen=True)
 class SamplerConfig:
@@ -18,7 +20,7 @@ class SamplerConfig:
     what the condition implies.
     """
 
-    kind: Literal["ddpm", "ddim", "dpm++"] = "ddpm"
+    kind: SamplerKind = "ddpm"
     steps: int = 100  # evaluations of the denoiser; 8 to 12 will do for dpm++
     temperature: float = 1.0
     # DIFFERS: the release multiplies the noise of the steps only, so that at "temperature 0" its

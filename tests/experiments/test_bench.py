@@ -174,7 +174,8 @@ def test_decodings_vary_what_the_model_leaves_open():
     assert list(decodings(ids, EvalConfig(), 12)) == ["M = 8", "M = 4", "M = 2", "M = 1"]
     assert list(decodings(ids, EvalConfig(), 24)) == ["exact", "streaming"]
     samplers = decodings(latents, EvalConfig(), 12)
-    assert list(samplers)[:2] == ["ddpm 100", "ddpm 50"] and "ddim 4" in samplers
+    assert list(samplers)[:2] == ["ddpm 100", "ddpm 50"] and {"ddim 4", "dpm++ 8"} < set(samplers)
+    assert samplers["dpm++ 8"].decode.sampler.kind == "dpm++"
 
 
 @pytest.mark.slow
