@@ -15,14 +15,16 @@ class SamplerConfig:
     """How clean vectors are drawn (`diffusion.sample`).
 
     `ddpm` is ancestral sampling, as released; `ddim` (eta 0), as the paper states, draws nothing
-    after the initial noise; nor does `dpm++`, DPM-Solver++(2M) (Lu et al. 2022), which needs the
-    fewest steps for the spread that samples should have. `temperature` multiplies noise; 0 leaves
-    what the condition implies.
+    after the initial noise. `dpm++`, DPM-Solver++(2M) (Lu et al. 2022), needs the fewest steps for
+    the spread that samples should have. `temperature` multiplies noise; 0 leaves what the condition
+    implies.
     """
 
     kind: SamplerKind = "ddpm"
     steps: int = 100  # evaluations of the denoiser; 8 to 12 will do for dpm++
     temperature: float = 1.0
+    # Of dpm++: how much fresh noise its steps draw, from 0 (none) to 1 (as much as ancestral ones).
+    eta: float = 0.5
     # DIFFERS: the release multiplies the noise of the steps only, so that at "temperature 0" its
     # samples still depend on the random numbers they start from; False: as released.
     scale_initial_noise: bool = True
@@ -30,8 +32,9 @@ class SamplerConfig:
     def __post_init__(self):
         require(self.steps >= 2, f"sampler.steps must be at least 2, got {self.steps}")
         require(self.temperature >= 0, f"sampler.temperature must not be negative, got {self.temperature}")
+        require(0.0 <= self.eta <= 1.0, f"sampler.eta must lie in [0, 1], got {self.eta}")
         require(
-            self.kind == "ddpm" or self.scale_initial_noise or self.temperature == 1,
+            self._draws or self.scale_initial_noise or self.temperature == 1,
             f"sampler.temperature has no effect on {self.kind} without scale_initial_noise; "
             "set scale_initial_noise or leave the temperature at 1",
         )
@@ -39,7 +42,11 @@ class SamplerConfig:
     @property
     def noisy_steps(self) -> bool:
         """Whether the steps after the first need random numbers."""
-        return self.kind == "ddpm" and self.temperature > 0
+        return self._draws and self.temperature > 0
+
+    @property
+    def _draws(self) -> bool:
+        return self.kind == "ddpm" or (self.kind == "dpm++" and self.eta > 0)
 
 
 @dataclass(frozen=True)

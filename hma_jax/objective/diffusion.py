@@ -180,7 +180,7 @@ def _run(
         process.steps == sampler.steps,
         f"sampler.steps is {sampler.steps} but the process has {process.steps}; use sampling_process(process, sampler)",
     )
-    solver = multistep(process)
+    solver = multistep(process, sampler.eta)
 
     def step(carry: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[tuple, Trajectory | None]:
         x, before = carry
@@ -192,6 +192,8 @@ def _run(
         if sampler.kind == "dpm++":
             ahead = x0 + _at(solver.lead, index) * (x0 - before)
             x = _at(solver.keep, index) * x + _at(solver.mix, index) * ahead
+            if sampler.noisy_steps:
+                x += sampler.temperature * _at(solver.fresh, index) * noise_at(index)
         elif sampler.kind == "ddim":
             eps = (from_xt * x - x0) / from_eps  # what the clipped x0 leaves
             cleaner = process.alphas_cumprod_prev

@@ -137,7 +137,7 @@ def sampling_process(process: Process, sampler: SamplerConfig) -> Process:
 
 
 class Multistep(NamedTuple):
-    """One step of DPM-Solver++(2M) is x <- keep * x + mix * (x0 + lead * (x0 - x0 of the step before)).
+    """One step of DPM-Solver++(2M): x <- keep * x + mix * (x0 + lead * (x0 - x0 of the step before)) + fresh * noise.
 
     One entry per step of the process, as in `Process`.
     """
@@ -145,19 +145,26 @@ class Multistep(NamedTuple):
     keep: np.ndarray
     mix: np.ndarray
     lead: np.ndarray
+    fresh: np.ndarray
 
 
 @functools.cache
-def multistep(process: Process) -> Multistep:
-    """The coefficients of second order, with the clean vector as what is predicted (Lu et al. 2022, algorithm 2).
+def multistep(process: Process, eta: float) -> Multistep:
+    """The coefficients of second order, with the clean vector as what is predicted (Lu et al. 2022).
 
-    The first step has no step before it, and the last goes to a noise of zero, which the logarithm cannot reach:
-    these two are of first order, and the last one returns its clean vector.
+    `eta` 0 solves the ordinary differential equation, 1 the stochastic one of ancestral sampling; between them that
+    with `eta` times its diffusion rate. The first step has no step before it, and the last goes to a noise of zero,
+    which the logarithm cannot reach: these two are of first order, and the last one returns its clean vector.
     """
     cleaner = process.alphas_cumprod_prev
-    keep = np.sqrt((1.0 - cleaner) / (1.0 - process.alphas_cumprod))
     stride = process.log_snr[:-1] - process.log_snr[1:]  # from index i + 1 to i
-    decay = np.append(0.0, np.exp(-stride))
+    forgotten = np.append(0.0, np.exp(-eta * stride))
+    decay = np.append(0.0, np.exp(-(1.0 + eta) * stride))
     lead = np.zeros(process.steps)
     lead[1:-1] = stride[:-1] / (2.0 * stride[1:])
-    return Multistep(keep, np.sqrt(cleaner) * (1.0 - decay), lead)
+    return Multistep(
+        keep=np.sqrt((1.0 - cleaner) / (1.0 - process.alphas_cumprod)) * forgotten,
+        mix=np.sqrt(cleaner) * (1.0 - decay),
+        lead=lead,
+        fresh=np.sqrt((1.0 - cleaner) * (1.0 - forgotten**2)),
+    )

@@ -275,9 +275,9 @@ def moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x.mean(0), x.std(0), np.bincount(np.argmin(score, axis=1), minlength=3) / len(x)
 
 
-@pytest.mark.parametrize("steps", [8, 10, 12])
-def test_a_few_steps_of_dpm_have_the_moments_of_a_mixture_and_of_100_ancestral_steps(steps):
-    found = moments(from_mixture(SamplerConfig("dpm++", steps)))
+@pytest.mark.parametrize("steps, eta", [(8, 0.0), (10, 0.0), (12, 0.0), (10, 0.5), (12, 0.5)])
+def test_a_few_steps_of_dpm_have_the_moments_of_a_mixture_and_of_100_ancestral_steps(steps, eta):
+    found = moments(from_mixture(SamplerConfig("dpm++", steps, eta=eta)))
     mean = WEIGHTS @ CENTRES
     spread = np.sqrt(WEIGHTS @ (CENTRES**2 + STDS[:, None] ** 2) - mean**2)
     for want in (mean, spread, WEIGHTS), moments(from_mixture(SamplerConfig())):
@@ -291,7 +291,7 @@ def test_dpm_starts_where_an_error_of_the_network_does_no_harm():
     vector 200 wrong, cut off at the clip, and the next step, far away and deterministic, keeps its share of that."""
     start = jnp.asarray(np.random.default_rng(0).normal(size=(200, 3)), jnp.float32)
     moved = {}
-    for sampler in (SamplerConfig("ddim", 25), SamplerConfig("dpm++", 10)):
+    for sampler in (SamplerConfig("ddim", 25), SamplerConfig("dpm++", 10, eta=0.0)):
         process = sampling_process(FULL, sampler)
         exact = gaussian_network(process)
         wrong = lambda x, t, exact=exact: exact(x, t) + jnp.repeat(jnp.array([0.01, 0.0]), 3)  # noqa: E731
@@ -300,32 +300,37 @@ def test_dpm_starts_where_an_error_of_the_network_does_no_harm():
     assert moved["ddim"] > 0.2 and moved["dpm++"] < 0.05, moved
 
 
+@pytest.mark.parametrize("eta", [0.0, 0.5])
 @pytest.mark.parametrize("steps", [8, 10, 12])
-def test_a_few_steps_of_dpm_have_the_spread_of_wide_and_of_narrow_data(steps):
-    samples = drawn(SamplerConfig("dpm++", steps))
+def test_a_few_steps_of_dpm_have_the_mean_and_spread_of_gaussian_data(steps, eta):
+    samples = drawn(SamplerConfig("dpm++", steps, eta=eta))
     np.testing.assert_allclose(samples.mean(0), MEAN, atol=0.05)
     np.testing.assert_allclose(samples.std(0), STD, rtol=0.06)
 
 
-def test_dpm_is_the_multistep_formula_of_second_order():
-    """By hand, in float64 (Lu et al. 2022, algorithm 2), with a network that always points the same way."""
-    process = respace_by_log_snr(FULL, 5)
-    x, before, stride_before = np.array([[0.3, -0.2]]), None, None
+@pytest.mark.parametrize("eta", [0.0, 0.5, 1.0])
+def test_dpm_is_the_multistep_formula_of_second_order(eta):
+    """By hand, in float64 (Lu et al. 2022, algorithm 2, and its stochastic form), with a simple network."""
+    process, sampler = respace_by_log_snr(FULL, 5), SamplerConfig("dpm++", 5, temperature=0.7, eta=eta)
+    noise = np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32)
     told = np.array([[0.5, -1.5]])
     network = lambda x_t, t: jnp.concatenate([jnp.asarray(told) * (1 + x_t), jnp.zeros((1, 2))], -1)  # noqa: E731
-    _, visited = sample(network, x, None, process, SamplerConfig("dpm++", 5), CLIP, True)
-    keep, spread = np.sqrt(process.alphas_cumprod), np.sqrt(1 - process.alphas_cumprod)
+    _, visited = sample(network, noise[0], noise[1:] if eta else None, process, sampler, CLIP, True)
+    signal, spread = np.sqrt(process.alphas_cumprod), np.sqrt(1 - process.alphas_cumprod)
+    x, before, stride_before = 0.7 * noise[0].astype(np.float64), None, None
     for step, index in enumerate([4, 3, 2, 1, 0]):
-        clean = np.clip((x - spread[index] * told * (1 + x)) / keep[index], -CLIP, CLIP)
+        clean = np.clip((x - spread[index] * told * (1 + x)) / signal[index], -CLIP, CLIP)
         if index == 0:
             x = clean
         else:
-            stride = np.log(keep / spread)[index - 1] - np.log(keep / spread)[index]
+            stride = np.log(signal / spread)[index - 1] - np.log(signal / spread)[index]
             ahead = clean
             if before is not None:
                 r = stride_before / stride
                 ahead = (1 + 1 / (2 * r)) * clean - 1 / (2 * r) * before
-            x = spread[index - 1] / spread[index] * x - keep[index - 1] * np.expm1(-stride) * ahead
+            x = spread[index - 1] / spread[index] * np.exp(-eta * stride) * x
+            x = x - signal[index - 1] * np.expm1(-(1 + eta) * stride) * ahead
+            x = x + 0.7 * spread[index - 1] * np.sqrt(-np.expm1(-2 * eta * stride)) * noise[1 + step]
             before, stride_before = clean, stride
         np.testing.assert_allclose(visited.x[step], x, rtol=1e-3, atol=1e-4)
 
@@ -475,7 +480,13 @@ def test_what_cannot_be_sampled_is_refused():
         sample_with_key(network, keys, (2, 3), process, SamplerConfig(steps=5), CLIP)
     for kind in ("ddim", "dpm++"):
         with pytest.raises(ConfigError, match=f"no effect on {re.escape(kind)}"):
-            SamplerConfig(kind, temperature=0.5, scale_initial_noise=False)
+            SamplerConfig(kind, temperature=0.5, scale_initial_noise=False, eta=0.0)
+
+
+@pytest.mark.parametrize("eta", [-0.1, 1.1])
+def test_an_eta_outside_its_range_is_refused(eta):
+    with pytest.raises(ConfigError, match="sampler.eta must lie in"):
+        SamplerConfig("dpm++", 10, eta=eta)
 
 
 def test_sampler_settings_survive_json():
