@@ -100,7 +100,7 @@ def to_stablehlo(
         unmask_steps: Passes over each new frame.
         temperature: 0 takes what is most likely, 1 draws as the model says.
         sampler_steps: Steps of the diffusion sampler; of no effect on discrete models.
-        sampler: The diffusion sampler; dpm++ needs 8 to 12 steps.
+        sampler: The diffusion sampler; dpm++ needs 10 to 12 steps.
         platforms: Where the program can run.
     """
     commands.to_stablehlo(

@@ -21,9 +21,10 @@ class SamplerConfig:
     """
 
     kind: SamplerKind = "ddpm"
-    steps: int = 100  # evaluations of the denoiser; 8 to 12 will do for dpm++
+    steps: int = 100  # evaluations of the denoiser; 10 to 12 will do for dpm++
     temperature: float = 1.0
-    # Of dpm++: how much fresh noise its steps draw, from 0 (none) to 1 (as much as ancestral ones).
+    # Of dpm++: how much fresh noise its steps draw, from 0 (none) to 1 (as much as ancestral ones). 0 suits
+    # an exact network best; a trained one errs, and noise corrects it (docs/performance.md).
     eta: float = 0.5
     # DIFFERS: the release multiplies the noise of the steps only, so that at "temperature 0" its
     # samples still depend on the random numbers they start from; False: as released.
