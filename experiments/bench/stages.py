@@ -15,8 +15,8 @@ from typing import Any
 
 from experiments.bench.models import Subject, make_subject
 
-SAMPLER_STEPS = 100
-FEW_SAMPLER_STEPS = 10
+RELEASED = ("ddpm", 100)
+FEW = ("dpm++", 10)
 
 
 def stages() -> dict[str, Callable[[], Any]]:
@@ -28,7 +28,7 @@ def stages() -> dict[str, Callable[[], Any]]:
         "step": lambda: _step()(),
         "continuous fill": lambda: _frames("base-continuous")["fill"](),
         "continuous slide": lambda: _frames("base-continuous")["slide"](),
-        "continuous few": lambda: _frames("base-continuous", FEW_SAMPLER_STEPS)["fill"](),
+        "continuous few": lambda: _frames("base-continuous", FEW)["fill"](),
     }
 
 
@@ -38,7 +38,7 @@ def _subject(name: str) -> Subject:
 
 
 @cache
-def _frames(name: str, sampler_steps: int = SAMPLER_STEPS) -> dict[str, Callable[[], Any]]:
+def _frames(name: str, sampler: tuple[str, int] = RELEASED) -> dict[str, Callable[[], Any]]:
     """A pass over the window, and one frame while the window fills and when it slides."""
     import jax
     import jax.numpy as jnp
@@ -50,7 +50,7 @@ def _frames(name: str, sampler_steps: int = SAMPLER_STEPS) -> dict[str, Callable
     subject = _subject(name)
     declared, batch, weights = subject.declared, subject.batch(1), subject.inference_params
     size, keys = subject.config.frames, jax.random.split(jax.random.key(0), 1)
-    decode = DecodeConfig(2, sampler=SamplerConfig(steps=sampler_steps, temperature=0.0))
+    decode = DecodeConfig(2, sampler=SamplerConfig(*sampler))
     past, newest = batch["tokens"][:, :-1], batch["tokens"][:, -2]
 
     def window(params: Any) -> Window:

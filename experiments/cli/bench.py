@@ -200,7 +200,7 @@ def release(
         python: An interpreter with what the release imports: torch, einops, mup, transformers,
             huggingface_hub, scipy.
         stages: Some of: forward, fill, slide, step, "continuous fill", "continuous slide",
-            "continuous few" (10 sampler steps against the release's 100). All if not given.
+            "continuous few" (10 evaluations by dpm++ against the release's 100). All if not given.
         turns: Timed turns of every stage, after one untimed.
         out: Directory for the record.
     """
