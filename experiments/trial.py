@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
+from experiments.run_options import UNWATCHED, RunOptions
 from experiments.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, TrainConfig
 from hma_jax.config.json import stable_hash, to_dict
@@ -32,10 +33,7 @@ if TYPE_CHECKING:
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
     from hma_jax.tokenizers.base import Tokenizer
-    from hma_jax.training.loop import FitResult, LoopOptions
-
-CHECKPOINTS = 5
-"""Saved per training run, evenly spread: what an interrupted trial resumes from."""
+    from hma_jax.training.loop import FitResult
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(phase, done, total)."""
@@ -114,27 +112,36 @@ def train_trial(
     run_dir: Path,
     *,
     execution: ExecutionConfig = ExecutionConfig(),
+    options: RunOptions = UNWATCHED,
     progress: Progress = lambda *_: None,
     table: EmbodimentTable | None = None,
     initial: Params | None = None,
     origin: dict[str, Any] | None = None,
-    options: LoopOptions | None = None,
 ) -> FitResult:
     """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
-
-    `options` say how often it is saved; CHECKPOINTS times unless given.
 
     A model that is not new has a `table` of its own (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.
     """
     import jax
 
-    from data_pipelines.loading.loader import make_loader
+    from data_pipelines.loading.loader import LoaderConfig, make_loader
+    from hma_jax.config.json import from_dict
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
+    from hma_jax.training.validation import Validation
 
     store, loader = materials.store, loader_of(trial)
     table = table or store.embodiment_table(trial.datasets)
+    checkpoint_every, validate_every = options.steps_between(trial.train.steps)
+
+    def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
+        return provenance | {"loader": to_dict(from_dict(LoaderConfig, provenance["loader"]))}
+
+    def report(step: int, steps: int, values: dict[str, float]) -> None:
+        held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
+        progress(f"training{held_out}", step, steps)
+
     return train_model(
         trial.model,
         table,
@@ -151,10 +158,33 @@ def train_trial(
             "loader": to_dict(loader),
             **({"origin": origin} if origin else {}),
         },
+        modernise_provenance=modernise,
         initial=initial,
-        options=options or LoopOptions(checkpoint_every=max(trial.train.steps // CHECKPOINTS, 1)),
-        progress=lambda step, steps, _: progress("training", step, steps),
+        options=LoopOptions(
+            checkpoint_every=checkpoint_every,
+            checkpoint_minutes=options.checkpoint_minutes,
+            keep_checkpoints=options.keep_checkpoints,
+            skip_damaged=options.skip_damaged,
+        ),
+        validation=Validation(validate_every, lambda: validation_batches(trial, materials, table))
+        if validate_every
+        else None,
+        progress=report,
     )
+
+
+def validation_batches(trial: Trial, materials: Materials, table: EmbodimentTable) -> Iterator[dict[str, Any]]:
+    """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
+    import jax
+
+    from data_pipelines.loading.evalset import eval_batches
+
+    rows = trial.train.batch // jax.process_count()
+    own = slice(jax.process_index() * rows, (jax.process_index() + 1) * rows)
+    for name in trial.evaluated:
+        for whole in eval_batches(materials.store, table, materials.manifest, trial.train.batch, (name,)):
+            yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid")}
+            break  # the next dataset; one without windows has no batch
 
 
 def evaluate_on(
@@ -217,7 +247,7 @@ def run_trial(
     trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress)
 
     subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
-    evaluation = evaluate_on(trial.evaluated, trained.state.params, *subject, execution=execution, progress=progress)
+    evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)
     untrained = None
     if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
         fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))

@@ -12,4 +12,19 @@ throughout, in signatures, parameter axes and tensor names:
     C latent channels   P tokens per frame in the trunk (S + K)
 """
 
+from importlib import import_module
+from typing import Any
+
 __version__ = "0.1.0"
+
+PUBLIC = {"load_model": "hma_jax.training.runs"}
+"""Names that this package offers, and where they live. Each is imported when it is first asked for: a program that
+only reads configurations does not wait for JAX."""
+
+__all__ = ["PUBLIC", *PUBLIC]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in PUBLIC:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; it offers {', '.join(PUBLIC)}")
+    return getattr(import_module(PUBLIC[name]), name)

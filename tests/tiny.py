@@ -40,6 +40,10 @@ def model_config(**changes) -> ModelConfig:
     return ModelConfig(**(settings | changes))
 
 
+SMALLER = dict(width=8, layers=1, heads=2, frames=3, tokens=4, action_tokens=1, factor_vocab=4)
+"""model_config(**SMALLER): where what is computed does not matter. Tests that share it share its compiled step."""
+
+
 def train_config(**changes) -> TrainConfig:
     settings = dict(
         steps=6, batch=8, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=2)

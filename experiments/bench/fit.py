@@ -21,12 +21,10 @@ from hma_jax.kernels.attention import backend_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_window
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import Declared, is_spec
+from hma_jax.model.params import Declared
 from hma_jax.runtime.sharding import audit_sharding, batch_sharding, make_mesh, plan_sharding
-from hma_jax.training.optimizer import init_adam
-from hma_jax.training.state import TrainState
+from hma_jax.training.state import TrainState, state_shapes
 from hma_jax.training.step import make_train_step
-from hma_jax.training.train import state_shardings
 
 COLLECTIVES = ("all-gather", "all-reduce", "reduce-scatter", "all-to-all", "collective-permute")
 LOCAL = "local"
@@ -122,16 +120,7 @@ def abstract_inputs(
     mesh: Mesh,
 ) -> tuple[TrainState, dict[str, jax.ShapeDtypeStruct]]:
     """State and batch of the training step: shapes, types and shardings, no arrays."""
-    params = jax.tree.map(
-        lambda spec: jax.ShapeDtypeStruct(spec.shape, jnp.float32), declared.specs, is_leaf=is_spec
-    )
-    moments = jax.eval_shape(lambda p: init_adam(p, table.size), params)
-    whole = TrainState(jax.ShapeDtypeStruct((), jnp.int32), params, moments)
-
-    def place(sharding: Any, part: Any) -> Any:
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), part)
-
-    state = jax.tree.map(place, state_shardings(declared, mesh, mesh_config), whole)
+    state = state_shapes(declared, table, mesh, mesh_config, average=train.ema_decay > 0)
     shape = (train.batch, model.frames, model.tokens)
     tokens = (shape, jnp.int32)
     if model.diffusion:

@@ -6,14 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments.presets import CPU, CPU_CONTINUOUS
 from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, require
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import Declared, Params
+from hma_jax.model.params import Declared, Params, inference_params
 
 BASE = ModelConfig(action_heads=False)
 EXECUTION = ExecutionConfig(remat="products")
@@ -43,9 +42,8 @@ class Subject:
 
     @property
     def inference_params(self) -> Params:
-        """Matrices in the type they are used in: in bfloat16 a pass reads half the bytes."""
-        dtype = jnp.dtype(self.execution.dtype)
-        return jax.tree.map(lambda x: x.astype(dtype) if x.ndim > 1 else x, self.params)
+        """Matrices in the type they are used in."""
+        return inference_params(self.declared, self.params, self.execution.dtype)
 
     def batch(self, rows: int, frames: int | None = None) -> dict[str, Any]:
         """tokens [B, T, S (, C)], actions [B, T, U], embodiment [B], mixing all robots."""

@@ -81,7 +81,7 @@ class BenchRecord:
 
 def make_record(kind: str, subject: str, command: str, **fields: Any) -> BenchRecord:
     """A record of this machine, now."""
-    from hma_jax.model.flops import peak_flops
+    from hma_jax.runtime.devices import peak_flops
 
     return BenchRecord(
         kind,

@@ -80,7 +80,8 @@ def _step() -> Callable[[], Any]:
     import jax
 
     from hma_jax.config import TrainConfig
-    from hma_jax.training.step import init_state, make_train_step
+    from hma_jax.training.state import init_state
+    from hma_jax.training.step import make_train_step
 
     subject = _subject("base")
     train, batch = TrainConfig(batch=1), subject.batch(1)

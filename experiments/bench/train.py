@@ -16,7 +16,8 @@ from hma_jax.model.flops import pass_flops, train_flops_per_window
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.masking import mask_batch
-from hma_jax.training.step import init_state, make_train_step
+from hma_jax.training.state import init_state
+from hma_jax.training.step import make_train_step
 
 
 def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:

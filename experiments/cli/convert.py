@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
 from experiments.commands import convert as commands
+from hma_jax.config import Weights
 from hma_jax.config.evaluation import SamplerKind
 
 convert_app = SubcommandApp()
@@ -36,7 +37,7 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
 
 
 @convert_app.command(name="to-official")
-def to_official(run: Positional[Path], out: Path) -> None:
+def to_official(run: Positional[Path], out: Path, weights: Weights = "auto") -> None:
     """Write a run as a checkpoint that the official PyTorch release loads.
 
     What came from the release and was not trained since goes back byte for byte. Anything else is
@@ -47,19 +48,21 @@ def to_official(run: Positional[Path], out: Path) -> None:
     Args:
         run: Directory of the training run.
         out: Directory to write: config.json and model.safetensors.
+        weights: The last weights, their moving average, or the average where there is one.
     """
-    commands.to_official(run, out)
+    commands.to_official(run, out, weights)
 
 
 @convert_app.command(name="to-safetensors")
-def to_safetensors(run: Positional[Path], out: Path) -> None:
+def to_safetensors(run: Positional[Path], out: Path, weights: Weights = "auto") -> None:
     """Write a run's weights for any framework, with a JSON description of every array.
 
     Args:
         run: Directory of the training run.
         out: Directory to write: model.json and model.safetensors.
+        weights: The last weights, their moving average, or the average where there is one.
     """
-    commands.to_safetensors(run, out)
+    commands.to_safetensors(run, out, weights)
 
 
 @convert_app.command(name="from-safetensors")
@@ -85,6 +88,7 @@ def to_stablehlo(
     sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100,
     sampler: SamplerKind = "ddpm",
     platforms: tuple[Platform, ...] = ("cpu", "cuda", "tpu"),
+    weights: Weights = "auto",
 ) -> None:
     """Write generation as a program that runs with JAX alone, without this project.
 
@@ -102,6 +106,7 @@ def to_stablehlo(
         sampler_steps: Steps of the diffusion sampler; of no effect on discrete models.
         sampler: The diffusion sampler; dpm++ needs 10 to 12 steps.
         platforms: Where the program can run.
+        weights: The last weights, their moving average, or the average where there is one.
     """
     commands.to_stablehlo(
         run,
@@ -114,4 +119,5 @@ def to_stablehlo(
         sampler_steps=sampler_steps,
         sampler=sampler,
         platforms=platforms,
+        weights=weights,
     )

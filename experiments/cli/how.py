@@ -41,7 +41,3 @@ class OneModel:
     """Directory of the training run. Resumed if it exists."""
     trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Trajectories of each robot, chosen by hash: the same as in a sweep over trajectories."""
-    checkpoint_every: Annotated[
-        int | None, arg(name="checkpoint-every", metavar="STEPS", help_behavior_hint="(default: a fifth of all)")
-    ] = None
-    """Steps from one checkpoint to the next; 0: only at the end and when interrupted."""

@@ -11,8 +11,9 @@ from experiments.cli.how import How, OneModel, Remake
 from experiments.commands import model as model_commands
 from experiments.commands import study as commands
 from experiments.commands import tokenize as tokenize_commands
+from experiments.run_options import RunOptions
 from experiments.setting import UNSET, Where, make_setting
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, Weights
 
 Axis = Literal["datasets", "trajectories", "width", "settings", "conditioning", "lr"]
 
@@ -90,7 +91,10 @@ def tokenize(
 
 
 def train(
-    where: OmitArgPrefixes[Where], one: OmitArgPrefixes[OneModel], remake: OmitArgPrefixes[Remake]
+    where: OmitArgPrefixes[Where],
+    one: OmitArgPrefixes[OneModel],
+    options: OmitArgPrefixes[RunOptions],
+    remake: OmitArgPrefixes[Remake],
 ) -> None:
     """Train one model: the study's reference trial, on all trajectories unless told otherwise.
 
@@ -99,21 +103,17 @@ def train(
     Args:
         where: Study, data, output directory and settings.
         one: How this model is trained; no sweep reads it.
+        options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
     """
-    model_commands.train(
-        make_setting(where),
-        one.run,
-        trajectories=one.trajectories,
-        checkpoint_every=one.checkpoint_every,
-        replace=remake.replace,
-    )
+    model_commands.train(make_setting(where), one.run, options, trajectories=one.trajectories, replace=remake.replace)
 
 
 def adapt(
     source: Annotated[Positional[Path], arg(metavar="RUN")],
     where: OmitArgPrefixes[Where],
     one: OmitArgPrefixes[OneModel],
+    options: OmitArgPrefixes[RunOptions],
     remake: OmitArgPrefixes[Remake],
     everything: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
@@ -126,6 +126,7 @@ def adapt(
         source: Directory of the training run that knows the other robots.
         where: The study with the new datasets. Give --tokenizer: the one of the trained model.
         one: How the new robots are trained.
+        options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
         everything: Train the whole model, not the new robots' own parameters alone.
     """
@@ -133,21 +134,24 @@ def adapt(
         make_setting(where),
         source,
         one.run,
-        everything,
+        options,
+        everything=everything,
         trajectories=one.trajectories,
-        checkpoint_every=one.checkpoint_every,
         replace=remake.replace,
     )
 
 
-def evaluate(run: Annotated[Positional[Path], arg(metavar="RUN")], where: OmitArgPrefixes[Where]) -> None:
+def evaluate(
+    run: Annotated[Positional[Path], arg(metavar="RUN")], where: OmitArgPrefixes[Where], weights: Weights = "auto"
+) -> None:
     """Evaluate a trained model on the frozen windows of a study.
 
     Args:
         run: Directory of the training run.
         where: The study whose windows, tokenizer and protocol are used.
+        weights: The last weights, their moving average (train.ema_decay), or the average where there is one.
     """
-    model_commands.evaluate(make_setting(where), run)
+    model_commands.evaluate(make_setting(where), run, weights)
 
 
 def report(out: Path) -> None:

@@ -84,9 +84,9 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     from experiments.commands.model import check_fits, require_prepared
     from experiments.rows import write_csv
     from experiments.trial import open_materials
-    from hma_jax.training.train import load_run
+    from hma_jax.training.runs import load_model
 
-    trained = load_run(run)
+    trained = load_model(run).run
     require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)

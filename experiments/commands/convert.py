@@ -10,8 +10,9 @@ from experiments.commands.study import wrote
 from experiments.progress import console
 
 if TYPE_CHECKING:
+    from hma_jax.config import Weights
     from hma_jax.config.evaluation import SamplerKind
-    from hma_jax.training.train import Run
+    from hma_jax.training.runs import Run
 
 
 def from_official(checkpoint: Path, out: Path) -> None:
@@ -26,13 +27,13 @@ def from_official(checkpoint: Path, out: Path) -> None:
     wrote(out, then=f"hma convert to-safetensors {_quoted(out)} --out DIR (or to-stablehlo, to-official)")
 
 
-def to_official(run: Path, out: Path) -> None:
+def to_official(run: Path, out: Path, weights: Weights) -> None:
     from hma_jax.convert import loads_in_release, require_free, write_official
     from hma_jax.convert.official import read_config
-    from hma_jax.training.train import load_run
+    from hma_jax.training.runs import load_run
 
     require_free(out)
-    loaded = load_run(run)
+    loaded = load_run(run, weights)
     for remark in write_official(loaded, out):
         console.print(f"note: {remark}", markup=False, soft_wrap=True)
     _describe(loaded)
@@ -43,12 +44,12 @@ def to_official(run: Path, out: Path) -> None:
     wrote(out, then=again)
 
 
-def to_safetensors(run: Path, out: Path) -> None:
+def to_safetensors(run: Path, out: Path, weights: Weights) -> None:
     from hma_jax.convert import require_free, write_neutral
-    from hma_jax.training.train import load_run
+    from hma_jax.training.runs import load_run
 
     require_free(out)
-    loaded = load_run(run)
+    loaded = load_run(run, weights)
     write_neutral(loaded, out)
     _describe(loaded)
     back = f"hma convert from-safetensors {_quoted(out)} --out RUN"
@@ -77,16 +78,17 @@ def to_stablehlo(
     sampler_steps: int,
     sampler: SamplerKind,
     platforms: tuple[str, ...],
+    weights: Weights,
 ) -> None:
     from hma_jax.config import DecodeConfig, SamplerConfig
     from hma_jax.convert import ProgramConfig, require_free, write_stablehlo
-    from hma_jax.training.train import load_run
+    from hma_jax.training.runs import load_run
 
     require_free(out)
     latents = SamplerConfig(sampler, sampler_steps, temperature)
     decode = DecodeConfig(unmask_steps, temperature, sampler=latents)
     config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
-    loaded = load_run(run)
+    loaded = load_run(run, weights)
     write_stablehlo(loaded, out, config)
     _describe(loaded)
     wrote(out, then=f"read {_quoted(out / 'model.json')} for the program's inputs and outputs")

@@ -13,12 +13,13 @@ from experiments.preparing.made_from import Step
 from experiments.progress import console, step, tidy_table
 from experiments.setting import Setting, short
 from experiments.sweep import reference_trial
-from hma_jax.config import ConfigError, require
+from hma_jax.config import ConfigError, Weights, require
 
 if TYPE_CHECKING:
+    from experiments.run_options import RunOptions
     from experiments.trial import Materials, Trial
     from hma_jax.tokenizers.base import Tokenizer
-    from hma_jax.training.train import Run
+    from hma_jax.training.runs import Run
 
 
 SHOWN = (
@@ -31,34 +32,34 @@ windows.csv.gz those of every window."""
 def train(
     setting: Setting,
     run: Path | None,
+    options: RunOptions,
     *,
     trajectories: int | None = None,
-    checkpoint_every: int | None = None,
     replace: Step | None = None,
 ) -> None:
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot."""
-    _check(trajectories, checkpoint_every)
+    _check(trajectories, options)
     _prepare(setting, replace)
     trial = _single_trial(setting, trajectories)
-    _train(setting, trial, run or setting.workspace.root / "model", checkpoint_every)
+    _train(setting, trial, run or setting.workspace.root / "model", options)
 
 
 def adapt(
     setting: Setting,
     source: Path,
     run: Path | None,
-    everything: bool,
+    options: RunOptions,
     *,
+    everything: bool = False,
     trajectories: int | None = None,
-    checkpoint_every: int | None = None,
     replace: Step | None = None,
 ) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.trial import open_materials
     from hma_jax.training.adapt import add_embodiments
-    from hma_jax.training.train import load_run
+    from hma_jax.training.runs import load_run
 
-    _check(trajectories, checkpoint_every)
+    _check(trajectories, options)
     _prepare(setting, replace)
     study, materials = setting.study, open_materials(setting.workspace)
     trained = load_run(source)
@@ -75,16 +76,15 @@ def adapt(
         train=dataclasses.replace(study.train, seed=seed, only=only),
     )
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
-    start = {"table": table, "initial": params, "origin": {"step": trained.step, "provenance": trained.provenance}}
-    _train(setting, trial, run or setting.workspace.root / "model", checkpoint_every, **start)
+    origin = {"step": trained.step, "provenance": trained.provenance}
+    del trained  # its arrays are not needed while the new model trains
+    where = run or setting.workspace.root / "model"
+    _train(setting, trial, where, options, table=table, initial=params, origin=origin)
 
 
-def _check(trajectories: int | None, checkpoint_every: int | None) -> None:
+def _check(trajectories: int | None, options: RunOptions) -> None:
+    options.check()
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
-    require(
-        checkpoint_every is None or checkpoint_every >= 0,
-        f"--checkpoint-every must not be negative, got {checkpoint_every}; 0 saves at the end and when interrupted",
-    )
 
 
 def _prepare(setting: Setting, replace: Step | None) -> None:
@@ -100,21 +100,18 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
     return dataclasses.replace(reference_trial(study, study.seeds[0]), max_trajectories=trajectories)
 
 
-def _train(setting: Setting, trial: Trial, run: Path, checkpoint_every: int | None, **start: Any) -> None:
-    from experiments.trial import CHECKPOINTS, open_materials, train_trial
-    from hma_jax.training.loop import LoopOptions
+def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
+    from experiments.trial import open_materials, train_trial
 
     materials, steps = open_materials(setting.workspace), trial.train.steps
     say_data(trial, materials)
-    if checkpoint_every is None:
-        checkpoint_every = max(steps // CHECKPOINTS, 1)
     with step(f"train width {trial.model.width} for {steps:,} steps of {trial.train.batch} windows") as update:
         result = train_trial(
             trial,
             materials,
             run,
             execution=setting.study.execution,
-            options=LoopOptions(checkpoint_every=checkpoint_every),
+            options=options,
             progress=lambda phase, done, total: update(done, total, phase),
             **start,
         )
@@ -140,12 +137,12 @@ def say_data(trial: Trial, materials: Materials) -> None:
         console.print(f"note: not trained on {name}: {reason}", markup=False, soft_wrap=True)
 
 
-def evaluate(setting: Setting, run: Path) -> None:
+def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
     from experiments.trial import evaluate_on, open_materials, write_evaluation
     from hma_jax.evaluation.windows import FILE
-    from hma_jax.training.train import load_run
+    from hma_jax.training.runs import load_model
 
-    trained = load_run(run)
+    trained = load_model(run, setting.study.execution, weights).run
     require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)
@@ -167,7 +164,8 @@ def evaluate(setting: Setting, run: Path) -> None:
         )
     summary = evaluation.summary
     metrics = [m for m in SHOWN if m in summary.overall]
-    table = tidy_table(f"{short(run)}, step {trained.step:,}", "dataset", *metrics)
+    which = ", averaged weights" if trained.weights == "ema" else ""
+    table = tidy_table(f"{short(run)}, step {trained.step:,}{which}", "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
         table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
     console.print(table)

@@ -26,8 +26,8 @@ from experiments.preparing.made_from import (
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import console, step
 from experiments.provenance import source_hash
+from experiments.run_options import CHECKPOINTS
 from experiments.study import Study
-from experiments.trial import CHECKPOINTS
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, TokenizerConfig, require
 from hma_jax.config.json import to_dict

@@ -19,7 +19,7 @@ from hma_jax.config.pretrained_tokenizers import (
     TokenGrid,
 )
 from hma_jax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
-from hma_jax.config.training import MaskingConfig, OptimizerConfig, Setting, TrainConfig
+from hma_jax.config.training import MaskingConfig, OptimizerConfig, Setting, TrainConfig, Weights
 
 __all__ = [
     "AnyTokenizerConfig",
@@ -46,5 +46,6 @@ __all__ = [
     "TokenizerConfig",
     "TokenizerTrainConfig",
     "TrainConfig",
+    "Weights",
     "require",
 ]

@@ -11,6 +11,11 @@ Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
 
 
+Weights = Literal["auto", "last", "ema"]
+"""Which weights of a run: the last ones, their moving average, or (`auto`) the average where the run
+keeps one (`TrainConfig.ema_decay`)."""
+
+
 @dataclass(frozen=True)
 class MaskingConfig:
     """Training-time masking and corruption (reference sections 1.9 and 2.3, paper section 3.5)."""
@@ -84,7 +89,9 @@ class TrainConfig:
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
     only: tuple[str, ...] = ()  # train these robots' own parameters and nothing else; (): everything
+    ema_decay: float = 0.0  # of a moving average of the weights, kept beside them; 0: none
 
     def __post_init__(self):
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"train.batch must be at least 1, got {self.batch}")
+        require(0 <= self.ema_decay < 1, f"train.ema_decay must lie in [0, 1), got {self.ema_decay}")

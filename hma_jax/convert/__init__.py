@@ -1,6 +1,6 @@
 """Checkpoints to and from other formats: the official release's, safetensors, StableHLO.
 
-Models meet in a `training.train.Run`: readers return one, writers take one. Readers of pretrained
+Models meet in a `training.runs.Run`: readers return one, writers take one. Readers of pretrained
 tokenizers return one that `tokenizers.io` saves.
 """
 

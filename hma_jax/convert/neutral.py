@@ -22,7 +22,7 @@ from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec
-from hma_jax.training.train import Run, describe_run
+from hma_jax.training.runs import Run, describe_run
 
 FORMAT, VERSION = "hma-jax", 1
 DESCRIPTION, WEIGHTS = "model.json", "model.safetensors"

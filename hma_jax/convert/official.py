@@ -34,7 +34,7 @@ from hma_jax.convert.tensors import Stored, read_safetensors, write_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.training.train import Run
+from hma_jax.training.runs import Run
 
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")

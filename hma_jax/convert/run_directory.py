@@ -1,4 +1,4 @@
-"""A run directory from a converted model: what `training.train.load_run` reads and training resumes."""
+"""A run directory from a converted model: what `training.runs.load_run` reads and training resumes."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from hma_jax.convert.aside import written_aside
 from hma_jax.model.params import Use
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.optimizer import AdamState
+from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState
-from hma_jax.training.train import Run, describe_run
 
 
 def write_run(run: Run, directory: Path) -> None:
@@ -34,4 +34,5 @@ def fresh_state(run: Run) -> TrainState:
     moments = [jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), params) for _ in range(2)]
     shared = {use: np.zeros((), np.int32) for use in get_args(Use)}
     robots = {use: np.zeros(run.table.size, np.int32) for use in get_args(Use)}
-    return TrainState(np.zeros((), np.int32), params, AdamState(*moments, shared, robots))
+    ema = params if run.train.ema_decay else None
+    return TrainState(np.zeros((), np.int32), params, AdamState(*moments, shared, robots), ema)

@@ -28,7 +28,7 @@ from hma_jax.convert.tensors import write_safetensors
 from hma_jax.generation import rollout
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.training.train import Run
+from hma_jax.training.runs import Run
 
 FORMAT, VERSION = "hma-jax-stablehlo", 1
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")

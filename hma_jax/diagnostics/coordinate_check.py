@@ -23,8 +23,8 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.objective.losses import draw_noise
 from hma_jax.objective.masking import Masked, mask_batch
-from hma_jax.training.state import TrainState
-from hma_jax.training.step import Batch, init_state, make_train_step
+from hma_jax.training.state import TrainState, init_state
+from hma_jax.training.step import Batch, make_train_step
 
 
 class Size(NamedTuple):

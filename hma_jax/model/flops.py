@@ -1,4 +1,4 @@
-"""Floating-point operations by formula, and the peak of known devices.
+"""Floating-point operations by formula.
 
 Model FLOPs: two per multiply-add of a matrix product, causal attention counted half, nothing
 for recomputation under remat and nothing for element-wise work. XLA's own count is not used:
@@ -6,8 +6,6 @@ it counts the body of a scan once.
 """
 
 from __future__ import annotations
-
-import jax
 
 from hma_jax.config import ModelConfig
 from hma_jax.model.embodiments import EmbodimentTable
@@ -60,25 +58,3 @@ def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True) -> 
 def train_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float:
     """Forward and backward: three times the forward pass."""
     return 3.0 * forward_flops_per_window(config, table)
-
-
-PEAK_FLOPS = {
-    "NVIDIA H100": (989e12, 495e12),
-    "NVIDIA H200": (989e12, 495e12),
-    "NVIDIA A100": (312e12, 156e12),
-    "TPU v4": (275e12, 275e12),
-    "TPU v5 lite": (197e12, 197e12),
-    "TPU v5p": (459e12, 459e12),
-    "TPU v6 lite": (918e12, 918e12),
-}
-"""Dense peak per device by the start of its kind, from the makers' data sheets: of products of bfloat16, and of
-float32 as JAX multiplies it by default, which is TF32 on NVIDIA and one bfloat16 pass on TPU."""
-
-
-def peak_flops(dtype: str) -> float | None:
-    """Of products of `dtype`, on all this program's devices together; None where the kind is unknown (CPUs)."""
-    kind = jax.devices()[0].device_kind
-    for prefix, (bfloat16, float32) in PEAK_FLOPS.items():
-        if kind.startswith(prefix):
-            return (bfloat16 if dtype == "bfloat16" else float32) * jax.device_count()
-    return None

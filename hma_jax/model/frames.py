@@ -63,7 +63,7 @@ class TokenEmbed(nnx.Module):
 
     def __init__(self, config: ModelConfig):
         q, v, d = config.factors, config.factor_vocab, config.width
-        self.tables = param((q, v, d), ("Q", "V", "D"), normal(1.0), role="vector")
+        self.tables = param((q, v, d), ("Q", "V", "D"), normal(1.0), role="vector", precise=True)
         self.mask = param((d,), ("D",), zeros, role="vector")
 
     def __call__(self, ids: jax.Array, masked: jax.Array | None, dtype: jnp.dtype) -> jax.Array:
@@ -112,7 +112,7 @@ class Condition(nnx.Module):
         init = trunk_init(config, width, width)
         self.linear = Linear((width, width), ("D", "D_out"), init=init, role="hidden")
         self.norm = LayerNorm(width, eps=FINE_EPS)
-        self.positions = param(shape, ("T", "S", "D"), normal(0.02), role="vector")
+        self.positions = param(shape, ("T", "S", "D"), normal(0.02), role="vector", precise=True)
 
     def __call__(self, x_BTSD: jax.Array, positions_T: jax.Array) -> jax.Array:
         """[B, T, S, D] of frames at window positions `positions_T` -> float32 of that shape."""

@@ -21,6 +21,7 @@ import numpy as np
 from flax import nnx
 
 from hma_jax.config import require
+from hma_jax.runtime.sharding import place
 
 Params = Any
 """A nested dict of arrays, the structure of `Declared.specs`."""
@@ -50,6 +51,7 @@ class ParamSpec:
     decay: bool
     init: Initializer
     use: Use = "always"
+    precise: bool = False  # used in float32, whatever type the model computes in
 
     @property
     def embodiment_axis(self) -> int | None:
@@ -68,13 +70,15 @@ def param(
     *,
     role: Role,
     decay: bool = True,
+    precise: bool = False,
 ) -> nnx.Param:
     """Declares one float32 parameter. `axes` names each dimension of `shape` (None: unnamed).
 
     No array is made here: `Declared.init` makes them all.
     """
     require(len(shape) == len(axes), f"a parameter of shape {shape} needs {len(shape)} axes, got {axes}")
-    return nnx.Param(jnp.zeros(shape, jnp.float32), axes=axes, init=init, role=role, decay=decay, use="always")
+    about = {"axes": axes, "init": init, "role": role, "decay": decay, "use": "always", "precise": precise}
+    return nnx.Param(jnp.zeros(shape, jnp.float32), **about)
 
 
 def bias(shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
@@ -138,18 +142,28 @@ class Declared:
     specs: Params  # nested dict of ParamSpec
 
     def init(self, seed: int, shardings: Params | None = None) -> Params:
-        """Arrays for every declaration.
+        """Arrays for every declaration, laid out by `shardings` (default: on the default device).
 
         Each is a function of (seed, its path) alone, made on the host: adding a parameter does
-        not change the others, nothing is compiled, and a mesh does not matter.
+        not change the others, nothing is compiled, and a mesh does not matter. One is drawn at a
+        time and placed shard by shard, so that no device ever holds a whole copy of what is split.
         """
 
-        def make(path: tuple[Any, ...], spec: ParamSpec) -> np.ndarray:
+        def make(path: tuple[Any, ...], spec: ParamSpec, sharding: jax.sharding.Sharding | None = None) -> jax.Array:
             words = np.frombuffer(hashlib.sha256(path_name(path).encode()).digest(), np.uint32)
-            return spec.init(np.random.default_rng([seed, *words.tolist()]), spec.shape)
+            return place(spec.init(np.random.default_rng([seed, *words.tolist()]), spec.shape), sharding)
 
-        arrays = jax.tree.map_with_path(make, self.specs, is_leaf=is_spec)
-        return jax.device_put(arrays, shardings)
+        given = () if shardings is None else (shardings,)
+        return jax.tree.map_with_path(make, self.specs, *given, is_leaf=is_spec)
+
+    def shapes(self, shardings: Params | None = None) -> Params:
+        """What `init` would return, without making it: a tree of jax.ShapeDtypeStruct."""
+
+        def describe(spec: ParamSpec, sharding: jax.sharding.Sharding | None = None) -> jax.ShapeDtypeStruct:
+            return jax.ShapeDtypeStruct(spec.shape, jnp.float32, sharding=sharding)
+
+        given = () if shardings is None else (shardings,)
+        return jax.tree.map(describe, self.specs, *given, is_leaf=is_spec)
 
     def merge(self, params: Params) -> nnx.Module:
         """The module around `params`; call it inside the traced function."""
@@ -186,6 +200,17 @@ def merge(graphdef: nnx.GraphDef, params: Params) -> nnx.Module:
     return nnx.merge(graphdef, nnx.from_flat_state(flat))
 
 
+def inference_params(declared: Declared, params: Params, dtype: str) -> Params:
+    """Parameters as generation and evaluation use them: matrices in `dtype`, cast once, so that in
+    bfloat16 a pass reads half the bytes. What is computed is the same: vectors, and matrices that are
+    used in float32 (`ParamSpec.precise`), stay as they are."""
+
+    def cast(spec: ParamSpec, x: jax.Array) -> jax.Array:
+        return x if x.ndim < 2 or spec.precise else x.astype(dtype)
+
+    return jax.tree.map(cast, declared.specs, params, is_leaf=is_spec)
+
+
 def path_name(path: tuple[Any, ...]) -> str:
     """'trunk/blocks/spatial/qkv' from a jax key path."""
     return "/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path)
@@ -193,6 +218,5 @@ def path_name(path: tuple[Any, ...]) -> str:
 
 def _spec(variable: nnx.Param) -> ParamSpec:
     shape = tuple(variable.get_value().shape)
-    return ParamSpec(
-        shape, tuple(variable.axes), variable.role, variable.decay, variable.init, variable.use
-    )
+    v = variable
+    return ParamSpec(shape, tuple(v.axes), v.role, v.decay, v.init, v.use, v.precise)

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import jax
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, Sharding
 
 from hma_jax.config import ConfigError, MeshConfig
 
@@ -146,6 +146,14 @@ def param_shardings(declared: Declarations, mesh: Mesh, config: MeshConfig) -> A
     layouts = {d.name: NamedSharding(mesh, d.partition) for d in plan_sharding(declared, mesh, config)}
     treedef = jax.tree.structure(declared.specs, is_leaf=lambda leaf: hasattr(leaf, "axes"))
     return jax.tree.unflatten(treedef, list(layouts.values()))
+
+
+def place(array: np.ndarray, sharding: Sharding | None) -> jax.Array:
+    """A host array on devices, shard by shard: each gets its own part and never more. Without a
+    sharding, on the default device."""
+    if sharding is None:
+        return jax.device_put(array)
+    return jax.make_array_from_callback(array.shape, sharding, lambda index: array[index])
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:

@@ -15,16 +15,17 @@ import numpy as np
 import optax
 
 from hma_jax.config import TokenizerConfig, TokenizerTrainConfig
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.params import Declared, Params
+from hma_jax.runtime.devices import default_device
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
 from hma_jax.tokenizers.continuous import make_continuous
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.network import from_pixels
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
-from hma_jax.training.loop import LoopOptions, Progress, fit
-from hma_jax.training.state import TrainState
+from hma_jax.training.loop import LoopOptions, Progress, Start, fit
+from hma_jax.training.state import FINITE, TrainState, all_finite, with_sharding
 
 
 def train_tokenizer(
@@ -44,16 +45,24 @@ def train_tokenizer(
     CheckpointError when `run_dir` holds a run of another configuration or other images.
     """
     declared = declare_tokenizer(config)
-    params = declared.init(train.seed)
-    state = TrainState(jnp.zeros((), jnp.int32), params, make_optimizer(train, declared).init(params))
-    meta = {"tokenizer": to_dict(config), "train": to_dict(train), "provenance": provenance or {}}
+    optimizer = make_optimizer(train, declared)
+
+    def make_state() -> TrainState:
+        params = declared.init(train.seed)
+        return TrainState(jnp.zeros((), jnp.int32), params, jax.jit(optimizer.init)(params))
+
+    device = jax.sharding.SingleDeviceSharding(default_device())
+    shapes = declared.shapes()
+    shapes = TrainState(jax.ShapeDtypeStruct((), jnp.int32), shapes, jax.eval_shape(optimizer.init, shapes))
+    described = {"tokenizer": to_dict(config), "train": to_dict(train), "provenance": provenance or {}}
     result = fit(
         jax.jit(make_train_step(config, train, declared), donate_argnums=0),
-        state,
+        with_sharding(shapes, device),
+        make_state,
         make_batches,
         steps=train.steps,
         run_dir=run_dir,
-        meta=meta,
+        about=Start(described, modernise=_modernise),
         options=options,
         progress=progress,
     )
@@ -64,6 +73,12 @@ def train_tokenizer(
         tokenizer = make_continuous(config, result.state.params, make_batches(0))
     save_tokenizer(tokenizer, run_dir)
     return tokenizer
+
+
+def _modernise(described: dict[str, Any]) -> dict[str, Any]:
+    """A description that an earlier version wrote: fields that it lacks take today's default."""
+    parts = {"tokenizer": TokenizerConfig, "train": TokenizerTrainConfig}
+    return described | {name: to_dict(from_dict(kind, described[name])) for name, kind in parts.items()}
 
 
 def make_optimizer(train: TokenizerTrainConfig, declared: Declared) -> optax.GradientTransformation:
@@ -118,6 +133,7 @@ def make_train_step(
         grads, metrics = gradient(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
         params = optax.apply_updates(state.params, updates)
+        metrics |= {FINITE + "gradient": all_finite(grads), FINITE + "update": all_finite(params)}
         return TrainState(state.step + 1, params, opt_state), metrics
 
     return step

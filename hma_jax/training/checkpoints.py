@@ -1,36 +1,62 @@
 """Checkpoints: whole or absent, on any mesh, and never mistaken for another run's.
 
-Orbax (v1) writes asynchronously into a temporary directory and renames. Beside the arrays
-every checkpoint carries `meta`, the JSON description of the run (configurations, embodiment
-table, data provenance); restoring under another description is refused by name.
+Orbax (v1) writes asynchronously into a temporary directory and renames. Each field of a state is an item
+of its own, so that parameters are read without moments. Beside them every checkpoint carries the JSON
+description of its run (configurations, embodiment table, data provenance); restoring under another
+description is refused by name. Once a checkpoint is finished, its files are listed with their hashes, and
+whoever reads it checks them.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+import math
+import os
+import re
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import jax
 from orbax.checkpoint import v1 as ocp
 
-from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
+from hma_jax.training.hashes import write_list
+from hma_jax.training.reading import (
+    CheckpointError,
+    find_damage,
+    hush_orbax,
+    list_steps,
+    load_items,
+    read_description,
+)
+
+Description = dict[str, Any]
+log = logging.getLogger(__name__)
 
 
-class CheckpointError(ConfigError):
-    """A checkpoint that is missing, unreadable or belongs to another configuration."""
+class SaveError(OSError):
+    """Something of a run could not be written. Its last finished checkpoint is kept."""
 
 
 class Checkpoints:
     """The checkpoints of one run. Use as a context manager: leaving waits for pending saves."""
 
-    def __init__(self, directory: Path, meta: dict[str, Any], keep: int = 2):
-        """Raises CheckpointError if `directory` cannot be written."""
+    def __init__(
+        self,
+        directory: Path,
+        meta: Description,
+        keep: int = 2,
+        modernise: Callable[[Description], Description] = lambda described: described,
+    ):
+        """`modernise` brings a description that an earlier version wrote to the form of `meta`.
+
+        Raises CheckpointError if `directory` cannot be written.
+        """
         self.directory = Path(directory).absolute()
-        self.meta = meta
+        self.meta, self.keep, self.modernise = meta, keep, modernise
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -38,111 +64,174 @@ class Checkpoints:
                 f"cannot create the checkpoint directory {self.directory}: {error.strerror}; "
                 "choose another output directory"
             ) from error
-        with _log_silenced():
-            self._orbax = ocp.training.Checkpointer(
-                self.directory,
-                preservation_policy=ocp.training.preservation_policies.LatestN(keep),
-                # A save cut short by a kill leaves a temporary directory; drop it.
-                cleanup_tmp_directories=True,
-            )
+        self._orbax: ocp.training.Checkpointer | None = None
+        self._background = ThreadPoolExecutor(1, "checkpoint")
+        self._pending: tuple[int, Future[None]] | None = None
+        self._bytes = 0  # of the state that was saved last
 
     def __enter__(self) -> Checkpoints:
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self._orbax.close()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.wait()
+        except SaveError as error:
+            if kind is None:
+                raise
+            log.warning("%s", error)  # what went wrong before is the news
+        finally:
+            self._background.shutdown()
+            self._close_orbax()
 
     @property
     def latest_step(self) -> int | None:
-        latest = self._orbax.latest
-        return None if latest is None else latest.step
+        return max(list_steps(self.directory), default=None)
+
+    # --- Saving ------------------------------------------------------------------------------
 
     def save(self, step: int, state: Any) -> None:
-        """Starts an asynchronous save; the arrays are copied before this returns."""
-        # Without `force` Orbax drops a save that comes while the previous one is being written.
-        self._orbax.save_async(step, state, custom_metadata=self.meta, force=True)
+        """Starts an asynchronous save of a named tuple, an item per field that is not None; the arrays
+        are copied before this returns.
+
+        Raises SaveError if this save or the one before it could not be written.
+        """
+        self.wait()
+        items = {name: item for name, item in state._asdict().items() if item is not None}
+        self._bytes = sum(x.nbytes for x in jax.tree.leaves(items))
+        try:
+            # Without `force` Orbax may decide that this step need not be saved.
+            response = self._writer().save_checkpointables_async(
+                step, items, custom_metadata=self.meta, force=True
+            )
+        except Exception as error:
+            raise self._failed(step, error) from error
+        self._pending = step, self._background.submit(self._finish, step, response)
+
+    def raise_failure(self) -> None:
+        """Raises the SaveError of a save that has failed since; does not wait for one that is under way."""
+        if self._pending is not None and self._pending[1].done():
+            self.wait()
 
     def wait(self) -> None:
-        self._orbax.wait()
+        """Until the last save is finished and listed. Raises SaveError if it could not be written."""
+        if self._pending is None:
+            return
+        (step, future), self._pending = self._pending, None
+        try:
+            future.result()
+        except Exception as error:
+            raise self._failed(step, error) from error
 
-    def restore(self, like: Any, ignore: tuple[str, ...] = ()) -> Any:
-        """The latest state, laid out as the arrays of `like` are.
+    def _writer(self) -> ocp.training.Checkpointer:
+        """Made for the first save: what it finds by then is what this run goes on from."""
+        if self._orbax is None:
+            hush_orbax()
+            self._orbax = ocp.training.Checkpointer(
+                self.directory,
+                preservation_policy=ocp.training.preservation_policies.LatestN(self.keep),
+                # A save cut short by a kill leaves a temporary directory; drop it.
+                cleanup_tmp_directories=True,
+            )
+        return self._orbax
 
-        `ignore` lists fields of `meta` ('train.steps') that may differ. Raises CheckpointError
-        naming every other difference, or if the files are damaged.
+    def _finish(self, step: int, response: Any) -> None:
+        """In the background: waits for Orbax, then lists what it wrote."""
+        response.result()
+        if jax.process_index() == 0:
+            write_list(self.directory / str(step))
+
+    def _failed(self, step: int, error: Exception) -> SaveError:
+        """The error to raise for a failed save. What it left half-written is removed by the next start."""
+        self._close_orbax()
+        latest = self.latest_step
+        reason = _reason(error)
+        if latest is None:
+            again = "it starts again, there is no checkpoint yet"
+        else:
+            again = f"it goes on from step {latest}, the last whole checkpoint"
+        return SaveError(
+            f"the checkpoint of step {step} could not be written to {self.directory}: {reason}. "
+            f"{self._space()}See that there is space and permission to write, then give the same command again: {again}"
+        )
+
+    def _space(self) -> str:
+        try:
+            free = shutil.disk_usage(self.directory).free
+        except OSError:  # the directory itself is gone
+            return ""
+        return f"It takes about {_size(self._bytes)}, and {_size(free)} are free there. "
+
+    def _close_orbax(self) -> None:
+        orbax, self._orbax = self._orbax, None
+        if orbax is not None:
+            try:
+                orbax.close()
+            except Exception as error:  # of the save that failed, which `wait` has raised already
+                log.debug("closing the checkpoints at %s: %s", self.directory, error)
+
+    # --- Restoring ---------------------------------------------------------------------------
+
+    def restore(self, shapes: Any, ignore: tuple[str, ...] = (), skip_damaged: bool = False) -> tuple[int, Any]:
+        """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say.
+
+        `ignore` lists fields of the description ('train.steps') that may differ. With `skip_damaged`,
+        checkpoints after the newest whole one are moved to `damaged` beside this directory. Raises
+        CheckpointError naming every other difference, or the file that is damaged.
         """
+        if skip_damaged:
+            self._set_damaged_aside()
         step = self.latest_step
         if step is None:
             raise CheckpointError(f"no checkpoint under {self.directory}")
-        with _reading(self.directory / str(step)):
-            saved = self._orbax.metadata(step).custom_metadata or {}
+        checkpoint = self.directory / str(step)
+        saved = read_description(checkpoint)
         if saved.keys() != self.meta.keys():
             raise CheckpointError(
                 f"the checkpoint at {self.directory} (step {step}) is of another kind of run: it describes "
                 f"{', '.join(sorted(saved)) or 'nothing'}, not {', '.join(sorted(self.meta))}; use a new "
                 "output directory"
             )
-        changes = [line for line in diff(saved, self.meta) if line.split(":")[0] not in ignore]
+        changes = [line for line in diff(self.modernise(saved), self.meta) if line.split(":")[0] not in ignore]
         if changes:
             raise CheckpointError(
                 f"the checkpoint at {self.directory} (step {step}) was made by another "
                 "configuration; use a new output directory or restore these fields:\n  "
                 + "\n  ".join(changes)
             )
-        abstract = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=x.sharding), like
-        )
-        with _reading(self.directory / str(step)):
-            return self._orbax.load(step, abstract)
+        wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
+        return step, type(shapes)(**load_items(checkpoint, wanted))
 
-
-@contextmanager
-def _reading(checkpoint: Path) -> Iterator[None]:
-    """Whatever Orbax raises for a damaged file (types of four libraries) becomes a CheckpointError."""
-    try:
-        with _log_silenced():
-            yield
-    except Exception as error:
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise CheckpointError(
-            f"the checkpoint {checkpoint} cannot be read ({reason[:160]}); if its files are damaged, remove "
-            "this directory to go on from an earlier checkpoint"
-        ) from error
-
-
-@contextmanager
-def _log_silenced() -> Iterator[None]:
-    """Orbax quotes damaged files in its log, whole."""
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-
-
-def read_checkpoint(directory: Path) -> tuple[int, Any, dict[str, Any]]:
-    """(step, state as nested dicts of arrays on the default device, meta) of the latest one.
-
-    Raises CheckpointError if there is none or it is damaged.
-    """
-    directory = Path(directory).absolute()
-    if not directory.is_dir():
-        raise CheckpointError(f"no checkpoints at {directory}; give the directory of a training run")
-    with _log_silenced():
-        opened = ocp.training.Checkpointer(directory)
-    with opened as orbax:
-        if orbax.latest is None:
-            raise CheckpointError(f"no finished checkpoint under {directory}; resume its training first")
-        step = orbax.latest.step
-        with _reading(directory / str(step)):
-            metadata = orbax.metadata(step)
-            if metadata.metadata is None:
-                raise ValueError("the description of its arrays is damaged")
-            # Saved on one mesh, read on whatever this process has: put everything on one device.
-            device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-            abstract = jax.tree.map(
-                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), metadata.metadata
+    def _set_damaged_aside(self) -> None:
+        damaged = []
+        for step in reversed(list_steps(self.directory)):
+            damage = find_damage(self.directory / str(step))
+            if damage is None:
+                break
+            damaged.append((step, damage))
+        else:
+            raise CheckpointError(
+                f"no checkpoint under {self.directory} is whole; train again in a new output directory"
             )
-            return step, orbax.load(step, abstract), metadata.custom_metadata or {}
+        for step, damage in damaged:
+            aside = self.directory.parent / "damaged" / str(step)
+            while aside.exists():
+                aside = aside.with_name(f"{aside.name}-again")
+            aside.parent.mkdir(exist_ok=True)
+            os.replace(self.directory / str(step), aside)
+            log.warning("the checkpoint of step %d is damaged (%s) and was moved to %s", step, damage, aside)
+
+
+def _size(count: int) -> str:
+    """A number of bytes as people say it: '7.34 GB'."""
+    power = min(int(math.log10(max(count, 1)) / 3), 4)
+    return f"{count / 1000**power:.3g} {('bytes', 'kB', 'MB', 'GB', 'TB')[power]}"
+
+
+def _reason(error: Exception) -> str:
+    """One line: what the operating system said, where that can be told."""
+    code = re.search(r"os_error_code='(\d+)'", str(error))
+    if code:
+        return os.strerror(int(code[1]))
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return " ".join(f"{type(error).__name__}: {error}".split())[:160]

@@ -4,39 +4,38 @@ Any model trains here; what differs is the step function. The loop dispatches st
 before it reads the metrics of step n, so the device never waits for the log.
 
 Files of a run directory:
-    metrics.jsonl   one line per step, deterministic fields only: a run that was killed and
-                    resumed leaves the same bytes as one that was not
-    timing.jsonl    seconds, throughput, utilisation: whatever depends on the machine
-    tensorboard/    the same for TensorBoard
-    checkpoints/    see `checkpoints`
+    metrics.jsonl     one line per step, deterministic fields only: a run that was killed and
+                      resumed leaves the same bytes as one that was not
+    validation.jsonl  what the run was watched on, every so many steps; the same holds
+    timing.jsonl      seconds, throughput, utilisation: whatever depends on the machine
+    execution.jsonl   one line per start of the run: from which step, how and on what it is computed
+    tensorboard/      the same for TensorBoard
+    checkpoints/      see `checkpoints`; damaged/ holds those that were passed over
+    .lock             held by the process that trains, see `claim`
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import jax
-from tensorboardX import SummaryWriter
 
-from hma_jax.config import ConfigError
-from hma_jax.training.checkpoints import Checkpoints
-
-Progress = Callable[[int, int, dict[str, float]], None]
-"""Called as progress(step, steps, metrics) after every step."""
+from hma_jax.training.checkpoints import Checkpoints, Description
+from hma_jax.training.claim import claimed
+from hma_jax.training.log import Progress, RunLog
+from hma_jax.training.state import FINITE
 
 
 class DivergedError(RuntimeError):
-    """The loss became infinite or NaN. The last good checkpoint is kept."""
+    """A loss, gradient or update became infinite or NaN. The last good checkpoint is kept."""
 
 
 class Interrupted(RuntimeError):
@@ -45,165 +44,174 @@ class Interrupted(RuntimeError):
 
 @dataclass(frozen=True)
 class LoopOptions:
-    """How a run is observed and saved; nothing here changes its result."""
+    """How a run is observed and saved; nothing here changes its result.
 
-    checkpoint_every: int = 0  # steps; 0: only at the end and when interrupted
+    The state is saved at the end, when interrupted, and every so many steps and minutes (0: never).
+    """
+
+    checkpoint_every: int = 0  # steps
+    checkpoint_minutes: float = 0.0  # since the last save
+    keep_checkpoints: int = 2  # the newest ones
+    skip_damaged: bool = False  # go on from the newest checkpoint that is whole
     log_every: int = 10  # steps between lines of timing.jsonl
     flops_per_step: float = 0.0  # by formula, for achieved FLOP/s; 0: unknown
     peak_flops: float | None = None  # of all devices together, for MFU
-    may_change: tuple[str, ...] = ()  # fields of meta that a resumed run may change
+    may_change: tuple[str, ...] = ()  # fields of the description that a resumed run may change
+    clock: Callable[[], float] = time.perf_counter  # seconds
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Something measured of the state every `every` steps and after the last, written to validation.jsonl."""
+
+    every: int
+    measure: Callable[[Any], Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a run says of itself when it starts."""
+
+    description: Description  # what it is: compared with the checkpoint's
+    execution: Mapping[str, Any] = field(default_factory=dict)  # how it is computed: recorded only
+    # Brings a description that an earlier version wrote to today's form.
+    modernise: Callable[[Description], Description] = lambda described: described
 
 
 @dataclass(frozen=True)
 class FitResult:
     state: Any
     losses: list[float]  # one per step, from the first step of the run
-    seconds: float  # spent in steps by this process, compilation excluded
+    seconds: float  # spent in steps by this process, without compiling and validating
     compile_seconds: float
     resumed_from: int
 
 
 def fit(
     step_fn: Callable[[Any, Any], tuple[Any, dict[str, jax.Array]]],
-    state: Any,
+    shapes: Any,
+    make_state: Callable[[], Any],
     make_batches: Callable[[int], Iterator[Any]],
     *,
     steps: int,
     run_dir: Path,
-    meta: dict[str, Any],
+    about: Start,
     put_batch: Callable[[Any], Any] = jax.device_put,
     options: LoopOptions = LoopOptions(),
+    watch: Watch | None = None,
     progress: Progress | None = None,
 ) -> FitResult:
     """Runs `step_fn` until `steps`, resuming from the latest checkpoint in `run_dir`.
 
     `step_fn(state, batch) -> (state, metrics)` is a jitted pure function that donates its
-    state; `metrics` holds scalars, one of them 'loss'. `make_batches(start)` yields host
-    batches from step `start` on. Raises DivergedError, Interrupted, CheckpointError.
+    state, a named tuple; `metrics` holds scalars, one of them 'loss', and checks (`state.FINITE`).
+    `shapes` are the state's, with shardings; `make_state()` is called only when nothing is restored,
+    so that there never are two. `make_batches(start)` yields host batches from step `start` on.
+    Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy.
     """
-    run_dir = Path(run_dir)
-    with Checkpoints(run_dir / "checkpoints", meta) as checkpoints, _stop_requests() as stop:
-        start = 0
-        if checkpoints.latest_step is not None:
-            state = checkpoints.restore(state, options.may_change)
-            start = checkpoints.latest_step
-        log = _Log(run_dir, start, steps, options, progress)
-        if start >= steps:
-            return FitResult(state, log.losses, 0.0, 0.0, start)
+    run_dir, clock = Path(run_dir), options.clock
+    # One writer per run: the others of a program with several processes leave the lock alone.
+    with (
+        claimed(run_dir) if jax.process_index() == 0 else nullcontext(),
+        Checkpoints(
+            run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise
+        ) as checkpoints,
+        _stop_requests() as stop,
+    ):
+        if checkpoints.latest_step is None:
+            start, state = 0, make_state()
+        else:
+            start, state = checkpoints.restore(shapes, options.may_change, options.skip_damaged)
+        log = RunLog(
+            run_dir,
+            start,
+            steps,
+            every=options.log_every,
+            flops_per_step=options.flops_per_step,
+            peak_flops=options.peak_flops,
+            clock=clock,
+            progress=progress,
+        )
+        with closing(log):
+            if start >= steps:
+                return FitResult(state, log.losses, 0.0, 0.0, start)
+            log.write_start(_describe_start(start, about.execution))
+            batches = make_batches(start)
+            batch = put_batch(next(batches))
+            began = clock()
+            compiled = step_fn.lower(state, batch).compile()
+            compile_seconds = clock() - began
 
-        batches = make_batches(start)
-        batch = put_batch(next(batches))
-        began = time.perf_counter()
-        compiled = step_fn.lower(state, batch).compile()
-        compile_seconds = time.perf_counter() - began
-
-        began = time.perf_counter()
-        pending: tuple[int, dict[str, jax.Array]] | None = None
-        for step in range(start + 1, steps + 1):
-            state, metrics = compiled(state, batch)
-            if step < steps:
-                batch = put_batch(next(batches))
-            if pending is not None:
-                log.write(*pending)
-            pending = (step, metrics)
-            due = options.checkpoint_every and step % options.checkpoint_every == 0
-            if due or step == steps or stop.is_set():
-                log.write(*pending)  # a diverged step must not become a checkpoint
-                pending = None
-                log.flush()
-                checkpoints.save(step, state)
-                if stop.is_set() and step < steps:
+            began = saved = clock()
+            watching = 0.0  # seconds
+            log.start_clock(start)
+            pending: tuple[int, dict[str, jax.Array]] | None = None
+            for step in range(start + 1, steps + 1):
+                state, metrics = compiled(state, batch)
+                if step < steps:
+                    batch = put_batch(next(batches))
+                if pending is not None:
+                    _report(log, *pending)
+                pending = (step, metrics)
+                checkpoints.raise_failure()
+                last, stopping = step == steps, stop.is_set()
+                to_watch = watch is not None and (last or step % watch.every == 0)
+                to_save = last or stopping or _is_due(step, clock() - saved, options)
+                if to_watch or to_save:
+                    _report(log, *pending)  # a diverged step is neither watched nor saved
+                    pending = None
+                if to_watch:
+                    before = clock()
+                    log.write_validation(step, watch.measure(state))
+                    log.discount(clock() - before)
+                    watching += clock() - before
+                if to_save:
+                    log.flush()
+                    checkpoints.save(step, state)
+                    saved = clock()
+                if stopping and not last:
                     checkpoints.wait()
-                    log.close()
                     raise Interrupted(
                         f"stopped at step {step} of {steps}; the same command resumes from {run_dir}"
                     )
-        jax.block_until_ready(state)
-        seconds = time.perf_counter() - began
-        checkpoints.wait()
-        log.close()
+            jax.block_until_ready(state)
+            seconds = clock() - began - watching
+            checkpoints.wait()
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 
 
-class _Log:
-    """Writes what a run reports; drops lines of steps that a killed run did not save."""
-
-    def __init__(
-        self, run_dir: Path, start: int, steps: int, options: LoopOptions, progress: Progress | None
-    ):
-        self.steps, self.options, self.progress = steps, options, progress
-        kept = _keep_until(run_dir / "metrics.jsonl", start)
-        self.losses = [record["loss"] for record in kept]
-        if len(kept) != start:
-            raise ConfigError(
-                f"{run_dir / 'metrics.jsonl'} has {len(kept)} of the {start} steps of its "
-                "checkpoint; the run directory was edited: use a new one"
-            )
-        _keep_until(run_dir / "timing.jsonl", start)
-        self.metrics_file = open(run_dir / "metrics.jsonl", "a")
-        self.timing_file = open(run_dir / "timing.jsonl", "a")
-        self.board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=start + 1)
-        self.mark = (time.perf_counter(), start)
-
-    def write(self, step: int, metrics: dict[str, jax.Array]) -> None:
-        values = {name: float(value) for name, value in jax.device_get(metrics).items()}
-        if not math.isfinite(values["loss"]):
-            self.close()
-            raise DivergedError(
-                f"the loss is {values['loss']} at step {step}; lower the learning rate or "
-                "lengthen the warm-up (the last checkpoint is kept)"
-            )
-        self.losses.append(values["loss"])
-        self.metrics_file.write(json.dumps({"step": step, **values}) + "\n")
-        if step % self.options.log_every == 0 or step == self.steps:
-            self._write_timing(step)
-            for name, value in values.items():
-                self.board.add_scalar(name, value, step)
-        if self.progress is not None:
-            self.progress(step, self.steps, values)
-
-    def _write_timing(self, step: int) -> None:
-        now = time.perf_counter()
-        per_step = (now - self.mark[0]) / (step - self.mark[1])
-        self.mark = (now, step)
-        record = {"step": step, "seconds_per_step": per_step}
-        if self.options.flops_per_step:
-            record["flops_per_second"] = self.options.flops_per_step / per_step
-            if self.options.peak_flops:
-                record["mfu"] = record["flops_per_second"] / self.options.peak_flops
-        self.timing_file.write(json.dumps(record) + "\n")
-        for name in record.keys() - {"step"}:
-            self.board.add_scalar(f"timing/{name}", record[name], step)
-
-    def flush(self) -> None:
-        """Makes every written line durable: a checkpoint must not outlive its log."""
-        for file in (self.metrics_file, self.timing_file):
-            file.flush()
-            os.fsync(file.fileno())
-
-    def close(self) -> None:
-        self.metrics_file.close()
-        self.timing_file.close()
-        self.board.close()
+def _report(log: RunLog, step: int, metrics: dict[str, jax.Array]) -> None:
+    """Writes a step's metrics. Raises DivergedError, and writes nothing, if it was not finite."""
+    read = jax.device_get(metrics)
+    values = {name: float(value) for name, value in read.items() if not name.startswith(FINITE)}
+    bad = [name.removeprefix(FINITE) for name, fine in read.items() if name.startswith(FINITE) and not fine]
+    advice = "lower the learning rate or lengthen the warm-up (the last checkpoint is kept)"
+    if not math.isfinite(values["loss"]):
+        raise DivergedError(f"the loss is {values['loss']} at step {step}; {advice}")
+    if bad:
+        which = " and the ".join(bad) + (" are" if len(bad) > 1 else " is")
+        raise DivergedError(f"the {which} not finite at step {step} (its loss is {values['loss']:.4g}); {advice}")
+    log.write(step, values)
 
 
-def _keep_until(path: Path, step: int) -> list[dict[str, Any]]:
-    """Cuts a JSONL file after `step`; the last line may be torn. Returns the records kept."""
-    if not path.exists():
-        return []
-    kept: list[dict[str, Any]] = []
-    for line in path.read_text().splitlines():
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError:
-            break  # torn by a kill; everything up to the checkpoint was flushed before it
-        if record["step"] > step:
-            break
-        kept.append(record)
-    aside = path.with_suffix(".tmp")
-    aside.write_text("".join(json.dumps(record) + "\n" for record in kept))
-    os.replace(aside, path)
-    return kept
+def _is_due(step: int, seconds: float, options: LoopOptions) -> bool:
+    """Whether to save after `step`, `seconds` after the last save."""
+    by_steps = options.checkpoint_every > 0 and step % options.checkpoint_every == 0
+    by_time = options.checkpoint_minutes > 0 and seconds >= 60 * options.checkpoint_minutes
+    return by_steps or by_time
+
+
+def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:
+    """A line of execution.jsonl."""
+    return {
+        "resumed_from": step,
+        "date": time.strftime("%Y-%m-%d %H:%M:%S %z"),
+        "execution": dict(execution),
+        "device": jax.devices()[0].device_kind,
+        "devices": jax.device_count(),
+        "processes": jax.process_count(),
+        "jax": jax.__version__,
+    }
 
 
 @contextmanager

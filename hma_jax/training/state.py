@@ -1,12 +1,25 @@
-"""What training carries from step to step."""
+"""What training carries from step to step, and how it is made: one of it, and no more.
+
+A checkpoint keeps each field of a state as an item of its own (`training.checkpoints`).
+"""
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
-from hma_jax.model.params import Params
+from hma_jax.config import MeshConfig
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.params import Declared, Params
+from hma_jax.runtime.sharding import param_shardings, place
+from hma_jax.training.optimizer import init_adam
+
+FINITE = "finite/"
+"""What the names of a step's checks begin with: metrics that are not logged, but stop a run if false."""
 
 
 class TrainState(NamedTuple):
@@ -15,3 +28,80 @@ class TrainState(NamedTuple):
     step: jax.Array
     params: Params
     opt_state: Any
+    ema: Params | None = None  # moving average of the parameters; None: not kept
+
+    @property
+    def weights(self) -> Params:
+        """What evaluation takes: the average where there is one."""
+        return self.params if self.ema is None else self.ema
+
+
+def init_state(
+    declared: Declared,
+    table: EmbodimentTable,
+    seed: int,
+    shapes: TrainState | None = None,
+    params: Params | None = None,
+) -> TrainState:
+    """The state before step 1, around a copy of `params` or freshly drawn ones.
+
+    It is laid out as `shapes` says (`state_shapes`; default: on the default device, without an
+    average). No device ever holds more than its part. `params` stay the caller's: training donates
+    its state, never them.
+    """
+    shapes = state_shapes(declared, table) if shapes is None else shapes
+    layout = None if shapes.step.sharding is None else jax.tree.map(lambda x: x.sharding, shapes)
+    if params is None:
+        params = declared.init(seed, layout and layout.params)
+    else:
+        params = jax.tree.map(lambda x, like: place(np.array(x), like.sharding), params, shapes.params)
+    make_rest = jax.jit(
+        lambda: (jnp.zeros((), jnp.int32), init_adam(shapes.params, table.size)),
+        out_shardings=layout and (layout.step, layout.opt_state),
+    )
+    step, opt_state = make_rest()
+    ema = None if shapes.ema is None else jax.tree.map(copy, params)
+    return TrainState(step, params, opt_state, ema)
+
+
+def all_finite(tree: Any) -> jax.Array:
+    """bool []: no NaN and no infinity anywhere."""
+    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
+
+
+def copy(x: jax.Array) -> jax.Array:
+    """A buffer of its own, laid out alike."""
+    return jax.device_put(x, x.sharding, may_alias=False)
+
+
+def state_shapes(
+    declared: Declared,
+    table: EmbodimentTable,
+    device_mesh: jax.sharding.Mesh | None = None,
+    mesh: MeshConfig = MeshConfig(),
+    average: bool = False,
+) -> TrainState:
+    """A state's shapes (jax.ShapeDtypeStruct) and, given a mesh, their shardings.
+
+    Moments and `average` (whether there is a moving average) lie as their parameters, counters on
+    every device.
+    """
+    params = declared.shapes(None if device_mesh is None else param_shardings(declared, device_mesh, mesh))
+    whole = None if device_mesh is None else NamedSharding(device_mesh, PartitionSpec())
+    counters = jax.eval_shape(lambda: init_adam(params, table.size))
+    return TrainState(
+        jax.ShapeDtypeStruct((), jnp.int32, sharding=whole),
+        params,
+        counters._replace(
+            first=params,
+            second=params,
+            count=with_sharding(counters.count, whole),
+            count_E=with_sharding(counters.count_E, whole),
+        ),
+        params if average else None,
+    )
+
+
+def with_sharding(shapes: Any, sharding: jax.sharding.Sharding | None) -> Any:
+    """A tree of shapes, each laid out by `sharding`."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)

@@ -12,41 +12,26 @@ from einops import rearrange
 
 from hma_jax.config import ModelConfig, TrainConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.params import Declared, Params, Use, is_spec
+from hma_jax.model.params import Declared, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, masked_loss
 from hma_jax.objective.masking import Masked, mask_batch
 from hma_jax.training import robots
+from hma_jax.training.average import update_average
 from hma_jax.training.optimizer import (
     Presence,
     apply_adamw,
     clip_by_global_norm,
-    init_adam,
     keep_own,
     learning_rate_multiplier,
     make_schedule,
     put_adam,
     take_adam,
 )
-from hma_jax.training.state import TrainState
+from hma_jax.training.state import FINITE, TrainState, all_finite
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
 embodiment int32 [B]."""
-
-
-def init_state(
-    declared: Declared,
-    table: EmbodimentTable,
-    seed: int,
-    shardings: TrainState | None = None,
-    params: Params | None = None,
-) -> TrainState:
-    """The state before step 1, laid out by `shardings` (default: on one device), around `params`
-    or freshly drawn ones."""
-    if params is None:
-        params = declared.init(seed, shardings and shardings.params)
-    state = TrainState(jnp.zeros((), jnp.int32), params, init_adam(params, table.size))
-    return jax.device_put(state, shardings)
 
 
 def make_train_step(
@@ -128,18 +113,16 @@ def make_train_step(
         grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
         rate = schedule(state.step)
         presence = find_presence(masked, batch["embodiment"], trained_E, model, everything=not config.only)
+        here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
         new, adam = apply_adamw(
-            grads,
-            take_adam(state.opt_state, specs, active),
-            own,
-            specs,
-            multipliers,
-            presence._replace(robots={use: here[active.robots_G] for use, here in presence.robots.items()}),
-            rate,
-            config.optimizer,
+            grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer
         )
         params = robots.put(state.params, new, specs, active)
         opt_state = put_adam(state.opt_state, adam, specs, active)
+        ema = None
+        if config.ema_decay:
+            average = update_average(robots.take(state.ema, specs, active), new, specs, here, config.ema_decay)
+            ema = robots.put(state.ema, average, specs, active)
         metrics = {"loss": total.tokens / counts.tokens}
         if masking.predicts_frames and not model.diffusion:
             metrics["accuracy"] = total.correct / counts.tokens
@@ -147,7 +130,8 @@ def make_train_step(
             metrics["action_loss"] = total.actions / counts.actions
             metrics["loss"] += masking.action_loss_weight * metrics["action_loss"]
         metrics |= {"grad_norm": norm, "learning_rate": rate}
-        return TrainState(state.step + 1, params, opt_state), metrics
+        metrics |= {FINITE + "gradient": jnp.isfinite(norm), FINITE + "update": all_finite(new)}
+        return TrainState(state.step + 1, params, opt_state, ema), metrics
 
     return step
 

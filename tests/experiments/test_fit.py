@@ -11,7 +11,7 @@ from experiments.cli.bench import Model
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.sharding import make_mesh
-from hma_jax.training.step import init_state
+from hma_jax.training.state import init_state
 from tests.tiny import TABLE, model_config, train_config
 
 

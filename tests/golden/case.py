@@ -22,7 +22,7 @@ from hma_jax.convert.table import official_parts, to_official
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
-from hma_jax.training.train import Run
+from hma_jax.training.runs import Run
 
 RTOL = 1e-4
 

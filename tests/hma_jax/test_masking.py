@@ -11,7 +11,8 @@ from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import masked_loss
 from hma_jax.objective.masking import mask_batch, mask_tokens
-from hma_jax.training.step import find_presence, init_state, make_train_step
+from hma_jax.training.state import init_state
+from hma_jax.training.step import find_presence, make_train_step
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
 
 MIXED = EmbodimentTable(

@@ -1,4 +1,3 @@
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +7,7 @@ import pytest
 from hma_jax.config import ConfigError, ExecutionConfig, ModelConfig, MupConfig
 from hma_jax.evaluation.metrics import factored_cross_entropy
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model.flops import forward_flops_per_window, peak_flops
+from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
 from hma_jax.model.hma import declare_model
 from tests.tiny import TABLE, lively_params, model_config, random_batch
@@ -18,14 +17,6 @@ def logits_of(config, declared, params, batch, actions=True):
     given = batch["actions"] if actions else None
     apply = jax.jit(lambda p, b: declared.merge(p)(b["tokens"], None, given, b["embodiment"]).said)
     return np.asarray(apply(params, batch))
-
-
-def test_the_peak_is_that_of_the_type_that_is_multiplied(monkeypatch):
-    monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind="NVIDIA H100 80GB HBM3")])
-    monkeypatch.setattr(jax, "device_count", lambda: 8)
-    assert peak_flops("bfloat16") == 8 * 989e12 and peak_flops("float32") == 8 * 495e12
-    monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(device_kind="cpu")])
-    assert peak_flops("float32") is None
 
 
 def test_factor_zero_holds_the_low_digits():

@@ -17,7 +17,8 @@ from hma_jax.config import (
 from hma_jax.diagnostics.coordinate_check import Size, check_coordinates, measure, slopes
 from hma_jax.model.hma import declare_model
 from hma_jax.training.optimizer import learning_rate_multiplier
-from hma_jax.training.step import init_state, make_train_step
+from hma_jax.training.state import init_state
+from hma_jax.training.step import make_train_step
 from tests.tiny import TABLE, model_config, random_batch, train_config
 
 BASE, WIDE = 32, 256

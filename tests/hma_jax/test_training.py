@@ -7,10 +7,12 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.config import ExecutionConfig, OptimizerConfig
+from hma_jax.config import ConfigError, ExecutionConfig, OptimizerConfig
+from hma_jax.model.hma import declare_model
 from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.loop import DivergedError, Interrupted, LoopOptions
-from hma_jax.training.train import load_run, train_model
+from hma_jax.training.runs import load_run
+from hma_jax.training.train import train_model
 from tests.tiny import TABLE, batches, model_config, train_config
 
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
@@ -167,7 +169,7 @@ def test_reading_a_directory_without_a_run_says_what_to_do(tmp_path: Path):
 def test_an_unwritable_run_directory_is_one_clear_message(tmp_path: Path):
     blocker = tmp_path / "file"
     blocker.write_text("")
-    with pytest.raises(CheckpointError, match="choose another output directory"):
+    with pytest.raises(ConfigError, match="choose another output directory"):
         train(blocker / "run")
 
 
@@ -181,3 +183,11 @@ def test_every_step_counts_robots_that_were_present(tmp_path: Path):
 
     state = train(tmp_path, make=only_pusher, config=dataclasses.replace(train_config(), steps=3)).state
     assert state.opt_state.count_E["always"].tolist() == [3, 0, 0]
+
+
+def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):
+    given = declare_model(model_config(), TABLE).init(7)
+    before = [np.array(x) for x in jax.tree.leaves(given)]
+    result = train(tmp_path, initial=given)
+    assert not any(x.is_deleted() for x in jax.tree.leaves(given))
+    assert equal_trees(given, before) and not equal_trees(given, result.state.params)

@@ -24,7 +24,8 @@ from hma_jax.convert import (
 from hma_jax.convert.table import flat
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.generation import rollout
-from hma_jax.training.train import Run, load_run, train_model
+from hma_jax.training.runs import Run, load_run
+from hma_jax.training.train import train_model
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
 from tests.tiny import TABLE, batches, lively_params, model_config, random_batch, train_config
 

@@ -15,7 +15,7 @@ from hma_jax.config import ConfigError, MupConfig
 from hma_jax.convert import loads_in_release, read_official, write_official
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.model.hma import declare_model
-from hma_jax.training.train import Run
+from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import CONTINUOUS, make_checkpoint
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
 

@@ -1,0 +1,58 @@
+"""How one training run is saved and watched: what `hma train` and `hma adapt` ask about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from experiments.setting import UNSET
+from hma_jax.config import require
+
+CHECKPOINTS = 5
+"""Saved per training run, evenly spread, besides those by time: what an interrupted trial resumes from."""
+
+VALIDATIONS = 20
+"""Per training run that is validated while it trains, unless told otherwise."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is saved and watched; nothing here changes its result, and each start may say it anew."""
+
+    checkpoint_every: Annotated[
+        int | None, arg(name="checkpoint-every", metavar="STEPS", help_behavior_hint="(default: a fifth of all)")
+    ] = None
+    """Steps from one checkpoint to the next; 0: none by steps. There is always one at the end and when
+    interrupted."""
+    checkpoint_minutes: Annotated[float, arg(name="checkpoint-minutes", metavar="MINUTES")] = 10.0
+    """Minutes from one checkpoint to the next, besides those by steps; 0: none by time."""
+    keep_checkpoints: Annotated[int, arg(name="keep-checkpoints", metavar="N")] = 2
+    """How many checkpoints are kept, the newest ones."""
+    skip_damaged: Annotated[FlagCreatePairsOff[bool], arg(name="skip-damaged"), UNSET] = False
+    """Go on from the newest checkpoint that is whole.
+    Damaged ones after it are moved to RUN/damaged."""
+    validate_every: Annotated[
+        int | None, arg(name="validate-every", metavar="STEPS", help_behavior_hint="(default: a twentieth of all)")
+    ] = None
+    """Steps from one measurement of the loss on held-out windows to the next, written to
+    RUN/validation.jsonl; 0: none."""
+
+    def check(self) -> None:
+        """Raises ConfigError, in the words of the command line."""
+        hint = "; 0 saves at the end and when interrupted"
+        for name, more in (("checkpoint_every", hint), ("checkpoint_minutes", hint), ("validate_every", "")):
+            value, flag = getattr(self, name), "--" + name.replace("_", "-")
+            require(value is None or value >= 0, f"{flag} must not be negative, got {value}{more}")
+        require(self.keep_checkpoints >= 1, f"--keep-checkpoints must be at least 1, got {self.keep_checkpoints}")
+
+    def steps_between(self, steps: int) -> tuple[int, int]:
+        """(checkpoints, validations) of a run of `steps`; 0: none."""
+        saves = max(steps // CHECKPOINTS, 1) if self.checkpoint_every is None else self.checkpoint_every
+        views = steps // VALIDATIONS if self.validate_every is None else self.validate_every
+        return saves, views
+
+
+UNWATCHED = RunOptions(validate_every=0)
+"""Of a study's trials: they are evaluated at their end."""

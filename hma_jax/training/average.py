@@ -1,0 +1,28 @@
+"""An exponential moving average of the weights: smoother than the last ones, for inference."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.model.params import Params, ParamSpec, is_spec
+from hma_jax.training.optimizer import Presence
+
+
+def update_average(ema: Params, params: Params, specs: Params, presence: Presence, decay: float) -> Params:
+    """decay * ema + (1 - decay) * params, for what the step concerned.
+
+    An average starts as the first parameters. A robot without an example keeps its average as it
+    keeps its parameters: its average counts the steps in which it was there.
+    """
+
+    def update(spec: ParamSpec, old: jax.Array, new: jax.Array) -> jax.Array:
+        if spec.embodiment_axis is None:
+            present = presence.shared[spec.use]
+        else:
+            shape = [1] * new.ndim
+            shape[spec.embodiment_axis] = -1
+            present = presence.robots[spec.use].reshape(shape)
+        return jnp.where(present, decay * old + (1 - decay) * new, old)
+
+    return jax.tree.map(update, specs, ema, params, is_leaf=is_spec)

@@ -1,0 +1,93 @@
+"""A list of a checkpoint's files with their hashes, by which damage is noticed when they are read.
+
+The list lies in the checkpoint's own directory, so that it is moved and deleted with it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+NAME = "sha256.json"
+
+Chosen = Callable[[str], bool]
+"""Whether a file, named by its path within the checkpoint, is meant."""
+
+
+class Damaged(Exception):
+    """A file is not as it was written. `path` names it, `reason` says how it differs."""
+
+    def __init__(self, path: Path, reason: str):
+        super().__init__(f"{path}: {reason}")
+        self.path, self.reason = path, reason
+
+
+def write_list(checkpoint: Path) -> None:
+    """Lists every file under `checkpoint`: path, size in bytes, SHA-256. Written aside, then renamed."""
+    rows = [[name, path.stat().st_size, _sha256(path)] for name, path in _files(checkpoint)]
+    aside = checkpoint / f".{NAME}.tmp"
+    with open(aside, "w") as file:
+        file.write(json.dumps({"sha256": _hash_of(rows), "files": rows}, indent=0))
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, checkpoint / NAME)
+
+
+def verify(checkpoint: Path, chosen: Chosen = lambda name: True) -> bool:
+    """Compares the `chosen` files with the list. False if there is no list.
+
+    Raises Damaged for the first file that is missing or differs, the list itself included.
+    """
+    path = checkpoint / NAME
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError) as error:
+        raise Damaged(path, f"cannot be read ({error})") from error
+    for name, size, digest in _rows(path, text):
+        if chosen(name):
+            _compare(checkpoint / name, size, digest)
+    return True
+
+
+def _rows(path: Path, text: str) -> Iterable[tuple[str, int, str]]:
+    try:
+        content: Any = json.loads(text)
+        rows, stated = content["files"], content["sha256"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise Damaged(path, f"is no list of files ({error})") from error
+    if _hash_of(rows) != stated:
+        raise Damaged(path, "its contents do not match the hash that it states")
+    return rows
+
+
+def _compare(path: Path, size: int, digest: str) -> None:
+    try:
+        found = path.stat().st_size
+        if found != size:
+            raise Damaged(path, f"has {found} bytes, {size} were written")
+        if _sha256(path) != digest:
+            raise Damaged(path, "its contents are not those that were written (SHA-256 differs)")
+    except OSError as error:
+        raise Damaged(path, f"cannot be read ({error.strerror})") from error
+
+
+def _files(checkpoint: Path) -> Iterator[tuple[str, Path]]:
+    for path in sorted(checkpoint.rglob("*")):
+        name = path.relative_to(checkpoint).as_posix()
+        if path.is_file() and name not in (NAME, f".{NAME}.tmp"):
+            yield name, path
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _hash_of(rows: Any) -> str:
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()

@@ -1,0 +1,163 @@
+"""What a run reports: JSON lines, TensorBoard and a progress line.
+
+A file that a resumed run goes on with is cut after the step that it resumes from.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, TextIO
+
+from hma_jax.config import ConfigError
+from hma_jax.training.board import Board
+from hma_jax.training.checkpoints import SaveError
+
+Progress = Callable[[int, int, dict[str, float]], None]
+"""Called as progress(step, steps, metrics) after every step; once the run was validated, with the latest
+of its numbers as 'validation/loss' and so on."""
+
+
+FLUSH_SECONDS = 30.0
+"""After so long at most, files show what was written."""
+
+
+class RunLog:
+    """Writes the files of a run directory that `loop` lists; drops lines of steps that were not saved."""
+
+    def __init__(
+        self,
+        run_dir: Path,
+        start: int,
+        steps: int,
+        *,
+        every: int,
+        flops_per_step: float,
+        peak_flops: float | None,
+        clock: Callable[[], float],
+        progress: Progress | None,
+    ):
+        """`every` steps there is a line of timing. Raises ConfigError if the log lacks steps up to `start`."""
+        self.run_dir, self.steps, self.every = run_dir, steps, every
+        self.flops_per_step, self.peak_flops = flops_per_step, peak_flops
+        self.clock, self.progress = clock, progress
+        kept = self._cut("metrics.jsonl", start)
+        self.losses = [record["loss"] for record in kept]
+        if len(kept) != start:
+            raise ConfigError(
+                f"{run_dir / 'metrics.jsonl'} has {len(kept)} of the {start} steps of its "
+                "checkpoint; the run directory was edited: use a new one"
+            )
+        self._cut("timing.jsonl", start)
+        self._cut("validation.jsonl", start)
+        self.validation: dict[str, float] = {}
+        self.mark, self.flushed = (clock(), start), clock()
+        self.files: dict[str, TextIO] = {}
+        with self._writing("tensorboard"):
+            self.board = Board(run_dir / "tensorboard", start + 1)
+
+    def _cut(self, name: str, step: int) -> list[dict[str, Any]]:
+        """Drops what comes after `step`. Returns the records kept."""
+        path = self.run_dir / name
+        if not path.exists():
+            return []
+        kept = _read_until(path, step)
+        with self._writing(name):
+            aside = path.with_suffix(".tmp")
+            aside.write_text("".join(json.dumps(record) + "\n" for record in kept))
+            os.replace(aside, path)
+        return kept
+
+    def start_clock(self, step: int) -> None:
+        """From here on time counts as training."""
+        self.mark = (self.clock(), step)
+
+    def discount(self, seconds: float) -> None:
+        """Takes `seconds` that just passed out of the timing."""
+        self.mark = (self.mark[0] + seconds, self.mark[1])
+
+    def write_start(self, record: Mapping[str, Any]) -> None:
+        """A line of execution.jsonl: every start of the run, never cut."""
+        self._append("execution.jsonl", record)
+        self.flush()
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        self.losses.append(values["loss"])
+        self._append("metrics.jsonl", {"step": step, **values})
+        if step % self.every == 0 or step == self.steps:
+            self._write_timing(step)
+            self._show(step, values)
+        if self.clock() - self.flushed > FLUSH_SECONDS:
+            self.flush()
+        if self.progress is not None:
+            self.progress(step, self.steps, {**values, **self.validation})
+
+    def write_validation(self, step: int, values: Mapping[str, float]) -> None:
+        self._append("validation.jsonl", {"step": step, **values})
+        self.validation = {f"validation/{name}": value for name, value in values.items()}
+        self._show(step, self.validation)
+
+    def _write_timing(self, step: int) -> None:
+        now = self.clock()
+        per_step = max(now - self.mark[0], 1e-9) / (step - self.mark[1])
+        self.mark = (now, step)
+        record = {"seconds_per_step": per_step}
+        if self.flops_per_step:
+            record["flops_per_second"] = self.flops_per_step / per_step
+            if self.peak_flops:
+                record["mfu"] = record["flops_per_second"] / self.peak_flops
+        self._append("timing.jsonl", {"step": step, **record})
+        self._show(step, {f"timing/{name}": value for name, value in record.items()})
+
+    def _show(self, step: int, values: Mapping[str, float]) -> None:
+        with self._writing("tensorboard"):
+            self.board.show(step, values)
+
+    def _append(self, name: str, record: Mapping[str, Any]) -> None:
+        with self._writing(name):
+            if name not in self.files:
+                self.files[name] = open(self.run_dir / name, "a")
+            self.files[name].write(json.dumps(record) + "\n")
+
+    def flush(self) -> None:
+        """Makes every written line durable: a checkpoint must not outlive its log."""
+        self.flushed = self.clock()
+        for name, file in self.files.items():
+            with self._writing(name):
+                file.flush()
+                os.fsync(file.fileno())
+        with self._writing("tensorboard"):
+            self.board.flush()
+
+    def close(self) -> None:
+        """Does not fail: what matters was flushed before, and a full disk reported."""
+        for file in (*self.files.values(), self.board):
+            with suppress(OSError):
+                file.close()
+
+    @contextmanager
+    def _writing(self, name: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise SaveError(
+                f"{self.run_dir / name} could not be written: {error.strerror}. See that there is space and "
+                "permission to write, then give the same command again: it goes on from the last checkpoint"
+            ) from error
+
+
+def _read_until(path: Path, step: int) -> list[dict[str, Any]]:
+    """The records of a JSONL file up to `step`; the last line may be torn."""
+    kept: list[dict[str, Any]] = []
+    for line in path.read_text().splitlines():
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            break  # torn by a kill; everything up to the checkpoint was flushed before it
+        if record["step"] > step:
+            break
+        kept.append(record)
+    return kept

@@ -1,0 +1,118 @@
+"""Checkpoints as they are read: whole, or refused by the name of the file that is damaged.
+
+A checkpoint DIRECTORY/<step> holds a folder per item (the fields of a state), Orbax's own files, the
+description of its run, and the list of all of these with their hashes (`training.hashes`). Only the
+items that are asked for are read and checked.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from orbax.checkpoint import v1 as ocp
+
+from hma_jax.config import ConfigError
+from hma_jax.training.hashes import Damaged, verify
+
+WHOLE_STATE = "state"
+"""The one item of checkpoints that were written before there were several."""
+
+log = logging.getLogger(__name__)
+
+
+class CheckpointError(ConfigError):
+    """A checkpoint that is missing, unreadable or belongs to another configuration."""
+
+
+def list_steps(directory: Path) -> list[int]:
+    """Steps with a finished checkpoint, in order; what Orbax has not finished has another name."""
+    if not directory.is_dir():
+        return []
+    return sorted(int(path.name) for path in directory.iterdir() if path.name.isdigit() and path.is_dir())
+
+
+def find_damage(checkpoint: Path) -> Damaged | None:
+    """The first file that is not as it was written; None where there is none, or no list to tell."""
+    try:
+        verify(checkpoint)
+    except Damaged as damage:
+        return damage
+    return None
+
+
+def read_description(checkpoint: Path) -> dict[str, Any]:
+    """What the run said of itself. Raises CheckpointError for damage to the files that tell."""
+    with _reading(checkpoint):
+        listed = verify(checkpoint, lambda name: "/" not in name)
+        if not listed:
+            log.warning(
+                "%s has no list of its files (an earlier version wrote it, or its writer was stopped): "
+                "it is read without a check of their hashes",
+                checkpoint,
+            )
+        return ocp.checkpointables_metadata(checkpoint).custom_metadata or {}
+
+
+def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
+    """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says.
+
+    Raises CheckpointError if a file of theirs is damaged or missing.
+    """
+    old = (checkpoint / WHOLE_STATE).is_dir()
+    folders = {WHOLE_STATE} if old else set(shapes)
+    with _reading(checkpoint):
+        verify(checkpoint, lambda name: name.split("/")[0] in folders)
+        if not old:
+            return ocp.load_checkpointables(checkpoint, dict(shapes))
+        context = ocp.Context()
+        context.pytree.loading.partial_load = True
+        with context:
+            return ocp.load(checkpoint, dict(shapes))
+
+
+def has_item(checkpoint: Path, name: str) -> bool:
+    return (checkpoint / name).is_dir()
+
+
+@contextmanager
+def _reading(checkpoint: Path) -> Iterator[None]:
+    """Damage, and whatever Orbax raises for it (types of four libraries), becomes a CheckpointError."""
+    hush_orbax()
+    try:
+        yield
+    except Damaged as damage:
+        raise CheckpointError(
+            f"the checkpoint {checkpoint} is damaged: {damage.path.relative_to(checkpoint)} {damage.reason}; "
+            + _advice(checkpoint)
+        ) from damage
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise CheckpointError(
+            f"the checkpoint {checkpoint} cannot be read ({reason[:160]}); if its files are damaged, remove "
+            "this directory to go on from an earlier checkpoint"
+        ) from error
+
+
+def _advice(checkpoint: Path) -> str:
+    earlier = [step for step in list_steps(checkpoint.parent) if step < int(checkpoint.name)]
+    whole = [step for step in earlier if find_damage(checkpoint.parent / str(step)) is None]
+    if not whole:
+        return "there is no whole checkpoint before it: train again in a new output directory"
+    return (
+        f"that of step {whole[-1]} is whole: to go on from there, train with --skip-damaged (in Python "
+        "LoopOptions(skip_damaged=True)), or remove this directory"
+    )
+
+
+def hush_orbax() -> None:
+    """From now on Orbax logs no errors: it raises each of them as well, and what it logs are pages of
+    tracebacks and of damaged files, also from threads that go on after a save has failed."""
+    logging.getLogger("absl").addFilter(_is_no_error_of_orbax)  # once, however often it is added
+
+
+def _is_no_error_of_orbax(record: logging.LogRecord) -> bool:
+    return record.levelno < logging.ERROR or "orbax" not in record.pathname

@@ -1,0 +1,144 @@
+"""Runs on disk: what their checkpoints say of them, and reading them back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, Weights, require
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Declared, Params, inference_params
+from hma_jax.runtime.devices import default_device
+from hma_jax.training.reading import CheckpointError, has_item, list_steps, load_items, read_description
+
+FORMER_FIELDS = {"model": ("compute_dtype", "remat", "attention"), "train": ("accumulate",)}
+"""Fields of descriptions that earlier versions wrote and that say how a run was computed, not what it
+is (`config.execution`); they are not compared."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained model, read from its run directory."""
+
+    model: ModelConfig
+    train: TrainConfig
+    table: EmbodimentTable
+    params: Params
+    step: int
+    provenance: dict[str, Any]
+    weights: Weights = "last"  # which of the run's weights `params` are: last or ema
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained model, ready for inference: `declared.merge(params)` is what computes, inside a traced function."""
+
+    run: Run  # with parameters as `model.params.inference_params` makes them
+    declared: Declared
+    execution: ExecutionConfig
+
+    @property
+    def config(self) -> ModelConfig:
+        return self.run.model
+
+    @property
+    def table(self) -> EmbodimentTable:
+        return self.run.table
+
+    @property
+    def params(self) -> Params:
+        """On this process's default device."""
+        return self.run.params
+
+    @property
+    def step(self) -> int:
+        return self.run.step
+
+
+def describe_run(
+    model: ModelConfig, train: TrainConfig, table: EmbodimentTable, provenance: dict[str, Any]
+) -> dict[str, Any]:
+    """The JSON description that every checkpoint of a run carries."""
+    return {
+        "model": to_dict(model),
+        "train": to_dict(train),
+        "table": to_dict(table),
+        "provenance": provenance,
+    }
+
+
+def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[str, Any]:
+    """A description that this or an earlier version wrote, as `describe_run` writes it today.
+
+    A field that it lacks takes today's default: a run does not depend on what came later. Raises
+    ConfigError for a field that this version does not know.
+    """
+    parts = {"model": ModelConfig, "train": TrainConfig, "table": EmbodimentTable}
+    today = dict(described)
+    for name, kind in parts.items():
+        former = FORMER_FIELDS.get(name, ())
+        values = {key: value for key, value in described[name].items() if key not in former}
+        today[name] = to_dict(from_dict(kind, values, f"{where}: {name}"))
+    return today
+
+
+def load_run(run_dir: Path, weights: Weights = "last") -> Run:
+    """The parameters and description of a run's latest checkpoint; its moments are not read.
+
+    The parameters lie on this process's default device. Raises CheckpointError if there is no
+    checkpoint, or it is damaged or foreign, and ConfigError for an average that the run does not keep.
+    """
+    run_dir = Path(run_dir)
+    directory = run_dir.absolute() / "checkpoints"
+    steps = list_steps(directory)
+    if not steps:
+        found = "no finished checkpoint under" if directory.is_dir() else "no checkpoints at"
+        raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved one")
+    checkpoint = directory / str(steps[-1])
+    described = read_description(checkpoint)
+    missing = {"model", "train", "table", "provenance"} - set(described)
+    if missing:
+        raise CheckpointError(
+            f"{run_dir}: not a run of this project (no {', '.join(sorted(missing))}); give the directory "
+            "of a training run"
+        )
+    described = modernise(described, str(run_dir))
+    model = from_dict(ModelConfig, described["model"])
+    table = from_dict(EmbodimentTable, described["table"])
+    averaged = has_item(checkpoint, "ema")
+    require(
+        averaged or weights != "ema",
+        f"{run_dir} keeps no average of its weights (train.ema_decay is 0); take the last weights",
+    )
+    item = "ema" if averaged and weights != "last" else "params"
+    device = jax.sharding.SingleDeviceSharding(default_device())
+    shapes = declare_model(model, table).shapes()
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), shapes)
+    return Run(
+        model,
+        from_dict(TrainConfig, described["train"]),
+        table,
+        load_items(checkpoint, {item: shapes})[item],
+        steps[-1],
+        described["provenance"],
+        "ema" if item == "ema" else "last",
+    )
+
+
+def load_model(
+    run_dir: Path, execution: ExecutionConfig = ExecutionConfig(), weights: Weights = "auto"
+) -> Model:
+    """The model of a run's latest checkpoint, to be computed as `execution` says; its parameters are cast once,
+    here.
+
+    `weights` are the last ones, their moving average (`ema`), or the average where the run keeps one
+    (`auto`). Raises as `load_run`.
+    """
+    run = load_run(run_dir, weights)
+    declared = declare_model(run.model, run.table, execution)
+    return Model(replace(run, params=inference_params(declared, run.params, execution.dtype)), declared, execution)

@@ -1,0 +1,107 @@
+"""Held-out loss while a run trains: on the same windows and masks each time, and no part of what the run is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import MaskingConfig, ModelConfig, require
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.params import Declared, Params
+from hma_jax.objective.losses import LossSums, TargetCounts, masked_loss
+from hma_jax.objective.masking import mask_batch
+from hma_jax.training.loop import Watch
+from hma_jax.training.state import TrainState
+
+SEED = 0
+"""Of masks and noise: the same for every run, so that runs compare."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What a run is validated on.
+
+    `batches()` yields this process's rows of a few global batches, as for training, perhaps with `valid`
+    bool [B] (False: a row that only fills up). It is read once; the windows stay in memory of the host.
+    """
+
+    every: int  # steps
+    batches: Callable[[], Iterable[Mapping[str, np.ndarray]]]
+
+    def __post_init__(self):
+        require(self.every >= 1, f"a run is validated every step or more rarely, got {self.every}")
+
+
+def make_watch(
+    validation: Validation,
+    declared: Declared,
+    table: EmbodimentTable,
+    model: ModelConfig,
+    masking: MaskingConfig,
+    put_batch: Callable[[Any], Any],
+) -> Watch:
+    """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one."""
+    compute = jax.jit(make_sums(declared, table, model, masking))
+    held: list[dict[str, np.ndarray]] = []
+
+    def mean(params: Params) -> dict[str, float]:
+        rows = [compute(params, put_batch(batch), np.int32(n)) for n, batch in enumerate(held)]
+        sums, counts = jax.tree.map(lambda *x: float(sum(x)), *jax.device_get(rows))
+        return _combine(sums, counts, model, masking)
+
+    def measure(state: TrainState) -> dict[str, float]:
+        if not held:
+            held.extend(_with_valid(batch) for batch in validation.batches())
+            require(bool(held), "there is no window to validate on; switch validation off")
+        values = mean(state.params)
+        if state.ema is not None:
+            values |= {f"ema_{name}": value for name, value in mean(state.ema).items()}
+        return values
+
+    return Watch(validation.every, measure)
+
+
+def make_sums(
+    declared: Declared, table: EmbodimentTable, model: ModelConfig, masking: MaskingConfig
+) -> Callable[[Params, Mapping[str, jax.Array], jax.Array], tuple[LossSums, TargetCounts]]:
+    """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function."""
+
+    def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:
+        key = jax.random.fold_in(jax.random.key(SEED), number)
+        masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table)
+        valid_B = batch["valid"]
+        masked = masked._replace(
+            targets_TS=masked.targets_TS & valid_B[:, None, None],
+            action_targets_T=masked.action_targets_T & valid_B[:, None],
+        )
+        noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
+        keys = jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(len(valid_B)))
+        found = masked_loss(
+            declared.merge(params), masked, batch["tokens"], batch["actions"], batch["embodiment"], masking, keys
+        )
+        return found, TargetCounts(jnp.sum(masked.targets_TS), jnp.sum(masked.action_targets_T))
+
+    return sums
+
+
+def _combine(sums: LossSums, counts: TargetCounts, model: ModelConfig, masking: MaskingConfig) -> dict[str, float]:
+    """Means over all targets; a mean over none is 0."""
+    tokens, actions = max(counts.tokens, 1), max(counts.actions, 1)
+    values = {"loss": sums.tokens / tokens}
+    if masking.predicts_frames and not model.diffusion:
+        values["accuracy"] = sums.correct / tokens
+    if masking.predicts_actions:
+        values["action_loss"] = sums.actions / actions
+        values["loss"] += masking.action_loss_weight * values["action_loss"]
+    return values
+
+
+def _with_valid(batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    names = ("tokens", "actions", "embodiment")
+    everything = np.ones(len(batch["tokens"]), bool)
+    return {name: batch[name] for name in names} | {"valid": batch.get("valid", everything)}

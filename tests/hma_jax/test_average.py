@@ -1,0 +1,97 @@
+"""The moving average of the weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError
+from hma_jax.model.hma import declare_model
+from hma_jax.training.loop import LoopOptions
+from hma_jax.training.reading import list_steps, load_items
+from hma_jax.training.state import TrainState, state_shapes
+from hma_jax.training.train import train_model
+from tests.tiny import SMALLER, TABLE, batches, model_config, train_config
+
+MODEL = model_config(**SMALLER)
+DECAY = 0.75
+CONFIG = train_config(ema_decay=DECAY, batch=4, steps=4)
+
+
+def run(run_dir: Path, config, steps_of=batches(MODEL, 4), **options):
+    return train_model(
+        MODEL, TABLE, config, steps_of, run_dir=run_dir, provenance={}, options=LoopOptions(**options)
+    )
+
+
+def one_robot_at_a_time(start: int):
+    """The first robot alone in even steps, the second in odd ones, the third never."""
+    for step, batch in enumerate(batches(MODEL, 4)(start), start):
+        yield batch | {"embodiment": np.full_like(batch["embodiment"], step % 2)}
+
+
+@pytest.fixture(scope="module")
+def states(tmp_path_factory: pytest.TempPathFactory) -> list[TrainState]:
+    """The states before and after each of four steps."""
+    run_dir, declared = tmp_path_factory.mktemp("run"), declare_model(MODEL, TABLE)
+    run(run_dir, CONFIG, one_robot_at_a_time, checkpoint_every=1, keep_checkpoints=4)
+    shapes = state_shapes(declared, TABLE, average=True)
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    params = declared.shapes(jax.tree.map(lambda _: device, shapes.params))
+    first = declared.init(CONFIG.seed)
+    found = [TrainState(0, first, None, first)]
+    for step in list_steps(run_dir / "checkpoints"):
+        items = load_items(run_dir / "checkpoints" / str(step), {"params": params, "ema": params})
+        found.append(TrainState(step, items["params"], None, items["ema"]))
+    return found
+
+
+def test_the_average_starts_as_the_weights_and_moves_towards_them(states: list[TrainState]):
+    tables = [np.asarray(s.params["embed"]["tables"], np.float64) for s in states]
+    want = tables[0]
+    for weights in tables[1:]:
+        want = DECAY * want + (1 - DECAY) * weights
+    got = np.asarray(states[-1].ema["embed"]["tables"])
+    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-8)
+    assert np.abs(got - tables[-1]).max() > 1e-5
+    assert states[-1].weights is states[-1].ema and states[-1]._replace(ema=None).weights is states[-1].params
+
+
+def test_the_average_of_an_absent_robot_stands_still(states: list[TrainState]):
+    stems = [np.asarray(s.ema["stem"]["into"]["kernel"]) for s in states]
+    for step, (before, after) in enumerate(zip(stems, stems[1:], strict=False)):
+        moved = [robot for robot in range(TABLE.size) if not np.array_equal(before[robot], after[robot])]
+        assert moved == [step % 2]
+    want = stems[0][0]
+    for state in (states[1], states[3]):  # its own two steps, whatever came between
+        want = DECAY * want + (1 - DECAY) * np.asarray(state.params["stem"]["into"]["kernel"])[0]
+    np.testing.assert_allclose(stems[-1][0], want, rtol=1e-6, atol=1e-9)
+
+
+def test_the_average_is_resumed_and_changes_nothing_else(tmp_path: Path):
+    def dying(start: int):
+        for number, batch in enumerate(batches(MODEL, 4)(start), start + 1):
+            if number > 3:
+                raise OSError("the disk went away")
+            yield batch
+
+    whole = run(tmp_path / "whole", CONFIG)
+    with pytest.raises(OSError, match="went away"):
+        run(tmp_path / "broken", CONFIG, dying, checkpoint_every=2)
+    resumed = run(tmp_path / "broken", CONFIG)
+    assert resumed.resumed_from == 2
+    for a, b in zip(jax.tree.leaves(resumed.state), jax.tree.leaves(whole.state), strict=True):
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+    plain = run(tmp_path / "plain", train_config(batch=4, steps=4))
+    assert plain.losses == whole.losses
+    assert plain.state.ema is None and not (tmp_path / "plain" / "checkpoints" / "4" / "ema").exists()
+    params, bigger = (sum(x.nbytes for x in jax.tree.leaves(t)) for t in (plain.state.params, whole.state))
+    assert sum(x.nbytes for x in jax.tree.leaves(plain.state)) == bigger - params
+
+
+def test_a_decay_of_one_never_moves_and_is_refused():
+    with pytest.raises(ConfigError, match=r"train.ema_decay must lie in \[0, 1\)"):
+        train_config(ema_decay=1.0)

@@ -1,0 +1,160 @@
+"""Checkpoints on disk: items, hashes, damage, and going on from the one before."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
+from hma_jax.training.hashes import NAME, Damaged, verify, write_list
+from hma_jax.training.loop import LoopOptions
+from hma_jax.training.reading import find_damage, list_steps, load_items
+from tests.toy import fit_toy, toy_shapes, toy_state
+
+EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
+SKIP = LoopOptions(checkpoint_every=2, log_every=1, skip_damaged=True)
+
+
+def flip(path: Path, at: int | None = None) -> None:
+    """One bit, in the middle unless told otherwise."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 if at is None else at] ^= 4
+    path.write_bytes(content)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of 6 steps with checkpoints at 4 and 6."""
+    run_dir = tmp_path_factory.mktemp("run")
+    fit_toy(run_dir, 6, options=EVERY_TWO)
+    return run_dir
+
+
+@pytest.fixture
+def run_dir(trained: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(trained, tmp_path / "run")
+
+
+def files_of(checkpoint: Path) -> list[str]:
+    return sorted(p.relative_to(checkpoint).as_posix() for p in checkpoint.rglob("*") if p.is_file())
+
+
+# --- Damage ----------------------------------------------------------------------------------
+
+
+def test_one_flipped_bit_in_any_file_is_refused_by_its_name(run_dir: Path):
+    checkpoint = run_dir / "checkpoints" / "6"
+    names = files_of(checkpoint)
+    assert {name.split("/")[0] for name in names} > {"params", "opt_state", "step", "_CHECKPOINT_METADATA", NAME}
+    for name in names:
+        good = (checkpoint / name).read_bytes()
+        flip(checkpoint / name)
+        with pytest.raises(CheckpointError) as refused:
+            fit_toy(run_dir, 8, options=EVERY_TWO)
+        message = str(refused.value)
+        assert str(checkpoint) in message and name in message, name
+        assert "step 4 is whole" in message and "--skip-damaged" in message
+        (checkpoint / name).write_bytes(good)
+    assert list_steps(run_dir / "checkpoints") == [4, 6]
+    assert fit_toy(run_dir, 8, options=EVERY_TWO).resumed_from == 6
+
+
+def test_a_file_that_is_missing_or_cut_is_refused_too(run_dir: Path):
+    checkpoint = run_dir / "checkpoints" / "6"
+    metadata = checkpoint / "params" / "_METADATA"
+    metadata.write_bytes(metadata.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="params/_METADATA has .* bytes, .* were written"):
+        fit_toy(run_dir, 8)
+    metadata.unlink()
+    with pytest.raises(CheckpointError, match="params/_METADATA cannot be read"):
+        fit_toy(run_dir, 8)
+
+
+@pytest.mark.parametrize("item", ["params", "opt_state", "_CHECKPOINT_METADATA"])
+def test_a_run_goes_on_from_before_the_damage_when_told_to_and_ends_as_if_nothing_had_been(
+    item: str, run_dir: Path, tmp_path: Path
+):
+    checkpoint = run_dir / "checkpoints" / "6"
+    flip(next(checkpoint / name for name in reversed(files_of(checkpoint)) if name.startswith(item)))
+    resumed = fit_toy(run_dir, 9, options=SKIP)
+    assert resumed.resumed_from == 4
+    assert list_steps(run_dir / "damaged") == [6] and find_damage(run_dir / "damaged" / "6") is not None
+    # The damaged one is not counted among those that are kept, and not taken for the latest.
+    assert list_steps(run_dir / "checkpoints") == [8, 9]
+    whole = fit_toy(tmp_path / "whole", 9, options=EVERY_TWO)
+    same = [(d / "metrics.jsonl").read_bytes() for d in (run_dir, tmp_path / "whole")]
+    assert same[0] == same[1]
+    for a, b in zip(jax.tree.leaves(resumed.state), jax.tree.leaves(whole.state), strict=True):
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+
+
+def test_a_run_without_a_whole_checkpoint_is_not_started_again_in_silence(run_dir: Path):
+    for step in ("4", "6"):
+        flip(run_dir / "checkpoints" / step / "step" / "_METADATA")
+    with pytest.raises(CheckpointError, match="no whole checkpoint before it: train again in a new output"):
+        fit_toy(run_dir, 8)
+    with pytest.raises(CheckpointError, match="no checkpoint under .* is whole"):
+        fit_toy(run_dir, 8, options=SKIP)
+    assert list_steps(run_dir / "checkpoints") == [4, 6]
+
+
+def test_a_checkpoint_without_a_list_is_read_with_a_remark(run_dir: Path, caplog: pytest.LogCaptureFixture):
+    """An earlier version wrote it, or its writer died between finishing it and listing it."""
+    (run_dir / "checkpoints" / "6" / NAME).unlink()
+    with caplog.at_level(logging.WARNING):
+        assert fit_toy(run_dir, 8).resumed_from == 6
+    assert "without a check of their hashes" in caplog.text
+
+
+def test_the_list_is_whole_or_absent(tmp_path: Path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b").write_bytes(b"12")
+    assert verify(tmp_path) is False
+    write_list(tmp_path)
+    assert verify(tmp_path) is True and files_of(tmp_path) == ["a/b", NAME]
+    listed = (tmp_path / NAME).read_bytes()
+    for at in range(len(listed)):
+        flip(tmp_path / NAME, at)
+        with pytest.raises(Damaged, match=NAME):
+            verify(tmp_path)
+        (tmp_path / NAME).write_bytes(listed)
+
+
+# --- Items -----------------------------------------------------------------------------------
+
+
+def test_parameters_are_read_without_the_moments(run_dir: Path):
+    checkpoint = run_dir / "checkpoints" / "6"
+    shutil.rmtree(checkpoint / "opt_state")
+    shapes = toy_shapes()
+    params = load_items(checkpoint, {"params": shapes.params})["params"]
+    assert np.isfinite(np.asarray(params["w"])).all()
+    with pytest.raises(CheckpointError, match="opt_state/"):
+        load_items(checkpoint, {"opt_state": shapes.opt_state})
+
+
+# --- Failing saves ---------------------------------------------------------------------------
+
+
+def test_a_save_that_fails_in_the_background_is_one_message_and_keeps_the_last(tmp_path: Path, monkeypatch):
+    import hma_jax.training.checkpoints as module
+
+    with pytest.raises(SaveError, match="step 2 could not be written .*: No space left on device") as refused:
+        with Checkpoints(tmp_path, {"toy": 1}) as checkpoints:
+            checkpoints.save(1, toy_state())
+            checkpoints.wait()
+
+            def full(checkpoint: Path) -> None:
+                raise OSError(28, "No space left on device")
+
+            monkeypatch.setattr(module, "write_list", full)
+            checkpoints.save(2, toy_state())
+            while checkpoints._pending is not None:
+                checkpoints.raise_failure()  # noticed while training goes on, not at the next save only
+    assert "give the same command again: it goes on from step" in str(refused.value)
+    assert list_steps(tmp_path)[0] == 1

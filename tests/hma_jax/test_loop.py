@@ -1,0 +1,218 @@
+"""What the training loop does around any step: saving, refusing, timing, locking."""
+
+from __future__ import annotations
+
+import json
+import math
+import multiprocessing
+import os
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.training.claim import RunBusy, claimed
+from hma_jax.training.loop import DivergedError, LoopOptions, Watch
+from hma_jax.training.reading import list_steps
+from tests.toy import fit_toy, toy_batches, toy_step
+
+EVERY_STEP = LoopOptions(checkpoint_every=1, log_every=1)
+
+
+def lines(path: Path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+# --- Nothing that is not finite is saved -----------------------------------------------------
+
+
+def spoilt(what: str, at: int, value: float):
+    """A step that is wrong in one respect at step `at`; its loss is finite unless `what` is the loss."""
+
+    def step(state, batch):
+        after, metrics = toy_step(state, batch)
+        wrong = jnp.where(state.step + 1 == at, value, 0.0)
+        if what == "loss":
+            return after, metrics | {"loss": metrics["loss"] + wrong}
+        if what == "gradient":
+            metrics["finite/gradient"] = jnp.isfinite(wrong)
+        params = {"w": after.params["w"].at[7].add(wrong)}
+        metrics["finite/update"] = jnp.isfinite(params["w"]).all()
+        return after._replace(params=params), metrics
+
+    return step
+
+
+@pytest.mark.parametrize("at", [4, 6], ids=["in the middle", "at the very last step"])
+@pytest.mark.parametrize(
+    ("what", "value", "message"),
+    [
+        ("loss", math.nan, "the loss is nan at step {}"),
+        ("gradient", math.nan, "the gradient and the update are not finite at step {}"),
+        ("update", math.inf, "the update is not finite at step {}"),
+    ],
+)
+def test_what_is_not_finite_is_never_saved(what, value, message, at, tmp_path: Path):
+    with pytest.raises(DivergedError, match=message.format(at)):
+        fit_toy(tmp_path, step=spoilt(what, at, value), options=EVERY_STEP)
+    assert list_steps(tmp_path / "checkpoints")[-1] == at - 1
+    assert [line["step"] for line in lines(tmp_path / "metrics.jsonl")] == list(range(1, at))
+    resumed = fit_toy(tmp_path, options=EVERY_STEP)
+    assert resumed.resumed_from == at - 1 and len(resumed.losses) == 6
+
+
+def test_checks_are_not_logged(tmp_path: Path):
+    fit_toy(tmp_path)
+    assert lines(tmp_path / "metrics.jsonl")[0].keys() == {"step", "loss"}
+
+
+# --- When a run is saved ---------------------------------------------------------------------
+
+
+class Clock:
+    """Time passes where a test says so."""
+
+    def __init__(self):
+        self.seconds = 0.0
+
+    def __call__(self) -> float:
+        return self.seconds
+
+    def after(self, seconds: float, make=toy_batches):
+        """Batches that take `seconds` each."""
+
+        def slow(start: int):
+            for batch in make(start):
+                self.seconds += seconds
+                yield batch
+
+        return slow
+
+
+@pytest.mark.parametrize(
+    ("every", "minutes", "saved"),
+    [
+        (0, 0.0, [10]),
+        (0, 1.5, [3, 6, 9, 10]),  # each step takes 40 s, and the last saves anyway
+        (4, 0.0, [4, 8, 10]),
+        (4, 2.5, [4, 8, 10]),  # time counts from the last save, whatever asked for it
+        (7, 2.5, [4, 7, 10]),
+    ],
+)
+def test_a_run_is_saved_by_steps_and_by_minutes(every, minutes, saved, tmp_path: Path):
+    clock = Clock()
+    options = LoopOptions(
+        checkpoint_every=every, checkpoint_minutes=minutes, keep_checkpoints=20, clock=clock, log_every=1
+    )
+    fit_toy(tmp_path, 10, make=clock.after(40.0), options=options)
+    assert list_steps(tmp_path / "checkpoints") == saved
+
+
+def test_as_many_checkpoints_are_kept_as_asked_for(tmp_path: Path):
+    fit_toy(tmp_path, options=LoopOptions(checkpoint_every=1, keep_checkpoints=3))
+    assert list_steps(tmp_path / "checkpoints") == [4, 5, 6]
+
+
+# --- Timing ----------------------------------------------------------------------------------
+
+
+class SlowToCompile:
+    """A step function whose compilation takes 1000 s of `clock`."""
+
+    def __init__(self, clock: Clock):
+        self.clock = clock
+
+    def lower(self, *_):
+        return self
+
+    def compile(self):
+        self.clock.seconds += 1000
+        return lambda state, batch: toy_step(state, batch)
+
+
+def test_timing_and_utilisation_are_of_steps_alone(tmp_path: Path):
+    clock = Clock()
+
+    def measure(state):
+        clock.seconds += 500
+        return {"loss": 1.0}
+
+    options = LoopOptions(log_every=1, clock=clock, flops_per_step=6.0, peak_flops=4.0)
+    result = fit_toy(
+        tmp_path, 5, step=SlowToCompile(clock), make=clock.after(2.0), options=options, watch=Watch(2, measure)
+    )
+    assert result.compile_seconds == 1000 and result.seconds == 4 * 2.0
+    timing = lines(tmp_path / "timing.jsonl")
+    assert sum(line["seconds_per_step"] for line in timing) == pytest.approx(4 * 2.0)
+    for line in timing:
+        assert line["flops_per_second"] == pytest.approx(6 / line["seconds_per_step"])
+        assert line["mfu"] == pytest.approx(line["flops_per_second"] / 4)
+
+
+# --- What is recorded ------------------------------------------------------------------------
+
+
+def test_every_start_of_a_run_is_recorded(tmp_path: Path):
+    fit_toy(tmp_path, 2)
+    fit_toy(tmp_path, 4)
+    first, second = lines(tmp_path / "execution.jsonl")
+    assert (first["resumed_from"], second["resumed_from"]) == (0, 2)
+    assert first["device"] == "cpu" and first["devices"] == 1 and first["jax"] and first["date"]
+
+
+def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path):
+    seen = []
+    watch = Watch(2, lambda state: {"loss": float(state.params["w"][0])})
+
+    def show(step, steps, values):
+        seen.append(values.get("validation/loss"))
+
+    fit_toy(tmp_path / "whole", 7, watch=watch, progress=show)
+    whole = (tmp_path / "whole" / "validation.jsonl").read_bytes()
+    assert [json.loads(line)["step"] for line in whole.splitlines()] == [2, 4, 6, 7]
+    assert seen[1] is None and seen[2] == seen[3] is not None
+
+    def dying(start: int):
+        for number, batch in enumerate(toy_batches(start), start + 1):
+            if number > 5:
+                raise OSError("the disk went away")
+            yield batch
+
+    with pytest.raises(OSError, match="went away"):
+        fit_toy(tmp_path / "broken", 7, make=dying, watch=watch, options=LoopOptions(checkpoint_every=3))
+    fit_toy(tmp_path / "broken", 7, watch=watch, options=LoopOptions(checkpoint_every=3))
+    assert (tmp_path / "broken" / "validation.jsonl").read_bytes() == whole
+
+
+# --- One process at a time -------------------------------------------------------------------
+
+
+def hold(run_dir: Path, ready, done) -> None:
+    with claimed(run_dir):
+        ready.set()
+        done.wait(60)
+
+
+def test_a_run_that_another_process_trains_is_refused_by_its_name(tmp_path: Path):
+    context = multiprocessing.get_context("spawn")
+    ready, done = context.Event(), context.Event()
+    holder = context.Process(target=hold, args=(tmp_path, ready, done))
+    holder.start()
+    assert ready.wait(60)
+    with pytest.raises(RunBusy, match=f"process {holder.pid} on .*; wait for it or stop it"):
+        fit_toy(tmp_path)
+    assert not (tmp_path / "metrics.jsonl").exists()
+    os.kill(holder.pid, 9)  # the lock dies with its process
+    holder.join(60)
+    assert fit_toy(tmp_path).resumed_from == 0
+
+
+def test_states_of_a_run_and_a_resumed_run_are_equal_bit_for_bit(tmp_path: Path):
+    whole = fit_toy(tmp_path / "whole", 8)
+    fit_toy(tmp_path / "parts", 3)
+    resumed = fit_toy(tmp_path / "parts", 8)
+    assert resumed.resumed_from == 3 and resumed.losses == whole.losses
+    for name in ("params", "opt_state"):
+        a, b = (getattr(r.state, name) for r in (whole, resumed))
+        assert all(np.asarray(a[k]).tobytes() == np.asarray(b[k]).tobytes() for k in a)

@@ -1,0 +1,93 @@
+"""Held-out loss while a run trains."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, MaskingConfig
+from hma_jax.model.hma import declare_model
+from hma_jax.objective.losses import LossSums
+from hma_jax.training.loop import LoopOptions
+from hma_jax.training.train import train_model
+from hma_jax.training.validation import Validation, make_sums, make_watch
+from tests.tiny import (
+    DIFFUSION,
+    SMALLER,
+    TABLE,
+    batches,
+    lively_params,
+    model_config,
+    random_batch,
+    train_config,
+)
+
+MODEL = model_config(**SMALLER)
+
+
+def held_out():
+    return [random_batch(1000 + n, MODEL, 4) for n in range(2)]
+
+
+def run(run_dir: Path, validation: Validation | None):
+    return train_model(
+        MODEL, TABLE, train_config(batch=4, ema_decay=0.75), batches(MODEL, 4), run_dir=run_dir, provenance={},
+        options=LoopOptions(log_every=1), validation=validation,
+    )  # fmt: skip
+
+
+def test_validation_changes_nothing_of_the_run_and_is_no_part_of_it(tmp_path: Path):
+    plain = run(tmp_path / "plain", None)
+    seen = run(tmp_path / "seen", Validation(2, held_out))
+    series = [(tmp_path / d / "metrics.jsonl").read_bytes() for d in ("plain", "seen")]
+    assert series[0] == series[1]
+    for a, b in zip(jax.tree.leaves(plain.state), jax.tree.leaves(seen.state), strict=True):
+        assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
+    lines = [json.loads(line) for line in (tmp_path / "seen" / "validation.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [2, 4, 6]
+    assert lines[0].keys() == {"step", "loss", "accuracy", "ema_loss", "ema_accuracy"}
+    assert len({line["loss"] for line in lines}) == 3 and lines[-1]["loss"] != lines[-1]["ema_loss"]
+    assert not (tmp_path / "plain" / "validation.jsonl").exists()
+    again = run(tmp_path / "seen", Validation(3, held_out))  # a finished run, watched otherwise: the same run
+    assert again.resumed_from == 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "masking"),
+    [({}, MaskingConfig()), ({}, MaskingConfig(setting="full")), ({"diffusion": DIFFUSION}, MaskingConfig())],
+    ids=["discrete", "full", "continuous"],
+)
+def test_points_are_comparable_and_rows_that_fill_up_do_not_count(changes, masking):
+    model = model_config(**SMALLER, **changes)
+    declared, params = lively_params(model)
+    sums = jax.jit(make_sums(declared, TABLE, model, masking))
+    batch = random_batch(0, model, 4)
+    whole = batch | {"valid": np.ones(4, bool)}
+    first, second, other = sums(params, whole, 0), sums(params, whole, 0), sums(params, whole, 1)
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        assert np.array_equal(a, b)
+    assert float(first[0].tokens) != float(other[0].tokens)  # another batch draws other masks
+    noise = {
+        name: np.concatenate([batch[name][:3], random_batch(9, model, 1)[name]])
+        for name in ("tokens", "actions", "embodiment")
+    }
+    valid = np.array([True, True, True, False])
+    padded, cut = sums(params, noise | {"valid": valid}, 0), sums(params, batch | {"valid": valid}, 0)
+    np.testing.assert_array_equal(jax.tree.leaves(padded[1]), jax.tree.leaves(cut[1]))
+    for a, b in zip(padded[0], cut[0], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+    assert int(cut[1].tokens) < int(first[1].tokens)
+    assert isinstance(first[0], LossSums)
+
+
+def test_a_validation_without_windows_is_refused_by_words(tmp_path: Path):
+    declared = declare_model(MODEL, TABLE)
+    watch = make_watch(Validation(1, list), declared, TABLE, MODEL, MaskingConfig(), lambda batch: batch)
+    with pytest.raises(ConfigError, match="no window to validate on"):
+        watch.measure(None)
+    with pytest.raises(ConfigError, match="every step or more rarely, got 0"):
+        Validation(0, list)
