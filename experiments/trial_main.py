@@ -26,22 +26,17 @@ def main(directory: Path) -> int:
     from data_pipelines.errors import DataError
     from experiments.atomic import write_atomically
     from experiments.ledger import DIVERGED, FAILED
-    from experiments.trial import Trial, run_trial
+    from experiments.job import read_job
+    from experiments.trial import run_trial
     from experiments.workspace import Workspace
-    from hma_jax.config import ConfigError, ExecutionConfig
-    from hma_jax.config.json import from_dict
+    from hma_jax.config import ConfigError
     from hma_jax.training.loop import DivergedError, Interrupted
 
     job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS)
     try:
-        run_trial(
-            from_dict(Trial, job["trial"]),
-            Workspace(directory.parent.parent),
-            directory,
-            execution=from_dict(ExecutionConfig, job["execution"]),
-            progress=report,
-        )
+        trial, execution = read_job(job)
+        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
     except (Interrupted, KeyboardInterrupt):
         return STOPPED

@@ -1,0 +1,41 @@
+"""job.json: what a trial's process is told, also by earlier versions."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.job import read_job
+from experiments.presets import SMOKE
+from experiments.sweep import reference_trial
+from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
+from hma_jax.config.json import to_dict
+
+OLD = Path(__file__).parent / "data" / "job_3caafdd.json"
+"""The reference trial of the smoke study as commit 3caafdd wrote it, in bfloat16, without remat, in two
+micro-batches, on a mesh of fsdp 2."""
+
+
+def test_a_job_says_the_trial_and_how_it_is_computed():
+    trial, execution = reference_trial(SMOKE, 1), ExecutionConfig(dtype="bfloat16", remat="none")
+    record = json.loads(json.dumps({"trial": to_dict(trial), "provenance": {}, "execution": to_dict(execution)}))
+    assert read_job(record) == (trial, execution)
+
+
+def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_is_kept():
+    trial, execution = read_job(json.loads(OLD.read_text()))
+    assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train)
+    assert (trial.model.width, trial.train.steps) == (SMOKE.model.width, SMOKE.train.steps)
+    assert execution == ExecutionConfig("bfloat16", "products", "auto", 2, MeshConfig(fsdp=2))
+
+
+def test_what_is_no_job_is_refused_by_words():
+    with pytest.raises(ConfigError, match="not a job of this project .*; run its study again"):
+        read_job({"steps": 3})
+    record = json.loads(OLD.read_text())
+    record["trial"]["model"]["telepathy"] = True
+    with pytest.raises(ConfigError, match=r"unknown field\(s\) telepathy"):
+        read_job(record)
