@@ -25,8 +25,8 @@ def main(directory: Path) -> int:
 
     from data_pipelines.errors import DataError
     from experiments.atomic import write_atomically
-    from experiments.ledger import DIVERGED, FAILED
     from experiments.job import read_job
+    from experiments.ledger import DIVERGED, FAILED
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError

@@ -1,11 +1,17 @@
 """`hma convert`, from an official checkpoint through every format and back."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
 from experiments.cli.main import main
+from hma_jax.convert.run_directory import fresh_state
+from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.runs import describe_run, load_run
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
 
 CHECKPOINT = Path(__file__).parent.parent / "golden" / "04_discrete_mlp"
@@ -42,3 +48,26 @@ def test_what_the_release_does_not_load_is_not_said_to_load(base, loads, tmp_pat
     assert ("load it in the official release with STMaskGIT.from_pretrained" in said) == loads
     assert ("which the release itself does not load" in said) != loads
     assert f"hma convert from-official {back} --out RUN" in said
+
+
+@pytest.mark.parametrize(("asked", "taken"), [("", "ema"), ("ema", "ema"), ("last", "params")])
+def test_the_average_of_the_weights_is_what_is_converted_unless_told_otherwise(asked, taken, tmp_path, capsys):
+    assert main(["convert", "from-official", str(CHECKPOINT), "--out", str(tmp_path / "plain")]) == 0
+    plain = load_run(tmp_path / "plain")
+    run = replace(plain, train=replace(plain.train, ema_decay=0.5))
+    state = fresh_state(run)._replace(ema=jax.tree.map(lambda x: np.asarray(x) + 1, plain.params))
+    about = describe_run(run.model, run.train, run.table, run.provenance)
+    with Checkpoints(tmp_path / "run" / "checkpoints", about) as checkpoints:
+        checkpoints.save(0, state)
+    weights = ["--weights", asked] if asked else []
+
+    def convert(command: str, start: str, out: str, *options: str) -> int:
+        return main(["convert", command, str(tmp_path / start), "--out", str(tmp_path / out), *options])
+
+    assert convert("to-safetensors", "run", "neutral", *weights) == 0
+    assert convert("from-safetensors", "neutral", "again") == 0
+    got, want = load_run(tmp_path / "again").params, getattr(state, taken)
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert convert("to-safetensors", "plain", "none", "--weights", "ema") == 2
+    assert "keeps no average of its weights" in capsys.readouterr().err

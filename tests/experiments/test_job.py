@@ -29,7 +29,7 @@ def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_i
     trial, execution = read_job(json.loads(OLD.read_text()))
     assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train)
     assert (trial.model.width, trial.train.steps) == (SMOKE.model.width, SMOKE.train.steps)
-    assert execution == ExecutionConfig("bfloat16", "products", "auto", 2, MeshConfig(fsdp=2))
+    assert execution == ExecutionConfig("bfloat16", "products", "auto", accumulate=2, mesh=MeshConfig(fsdp=2))
 
 
 def test_what_is_no_job_is_refused_by_words():

@@ -1,10 +1,15 @@
 """`hma train`: its own settings, and what it says it trains on."""
 
+import json
+from pathlib import Path
+
 import pytest
 
 from experiments import trial as trials
 from experiments.cli.main import main
-from hma_jax.training.train import load_run
+from hma_jax.training.claim import claimed
+from hma_jax.training.reading import list_steps
+from hma_jax.training.runs import load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
@@ -54,10 +59,52 @@ def test_fewer_trajectories_when_asked_for(train):
 @pytest.mark.parametrize(("asked", "every"), [(None, 2), ("3", 3), ("0", 0)])
 def test_checkpoints_are_saved_as_often_as_asked_for(train, asked, every):
     _, _, options = train("--set", "train.steps=12", *(["--checkpoint-every", asked] if asked else []))
-    assert options.checkpoint_every == every
+    assert options.steps_between(12)[0] == every
 
 
-@pytest.mark.parametrize("setting", [["--trajectories", "0"], ["--checkpoint-every", "-1"]])
+def test_checkpoints_are_saved_by_the_minute_and_kept_as_asked_for(train, tmp_path):
+    often = ("--checkpoint-every", "0", "--checkpoint-minutes", "1e-9", "--keep-checkpoints", "4")
+    train("--set", "train.steps=5", *often)
+    assert list_steps(tmp_path / "run" / "checkpoints") == [2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(("asked", "steps"), [("", list(range(2, 41, 2))), ("30", [30, 40]), ("0", [])])
+def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, steps, train, tmp_path):
+    train("--set", "train.steps=40", *(["--validate-every", asked] if asked else []))
+    file = tmp_path / "run" / "validation.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()] if steps else []
+    assert [line["step"] for line in lines] == steps and file.exists() == bool(steps)
+    assert all(0 < line["loss"] < 10 and 0 <= line["accuracy"] <= 1 for line in lines)
+
+
+def test_a_run_that_another_process_trains_is_refused(where, tmp_path, capsys):
+    with claimed(tmp_path / "run"):
+        assert main(["train", *where, "--run", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: {tmp_path / 'run'} is being trained in by process ") and "Traceback" not in said
+    assert main(["train", *where, "--run", str(tmp_path / "run")]) == 0
+
+
+def test_the_average_of_the_weights_is_evaluated_unless_told_otherwise(train, where, tmp_path, capsys):
+    train("--set", "train.ema_decay=0.5")
+
+    def evaluate(run: Path, *arguments: str) -> str:
+        code = main(["evaluate", str(run), *where, *arguments])
+        said = capsys.readouterr()
+        return said.out if code == 0 else said.err
+
+    assert "step 3, averaged weights" in evaluate(tmp_path / "run")
+    last = evaluate(tmp_path / "run", "--weights", "last")
+    assert "step 3" in last and "averaged" not in last
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        ["--trajectories", "0"], ["--checkpoint-every", "-1"], ["--checkpoint-minutes", "-1"],
+        ["--keep-checkpoints", "0"], ["--validate-every", "-1"],
+    ],
+)  # fmt: skip
 def test_settings_of_its_own_are_checked_before_any_work(setting, where, capsys):
     assert main(["train", *where, *setting]) == 2
     assert f"{setting[0]} must " in capsys.readouterr().err

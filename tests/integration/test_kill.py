@@ -10,8 +10,9 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from orbax.checkpoint import v1 as ocp
 
-from hma_jax.training.checkpoints import read_checkpoint
+from hma_jax.training.reading import find_damage, list_steps
 
 pytestmark = pytest.mark.exact
 
@@ -46,8 +47,11 @@ def test_a_killed_run_continued_is_byte_equal_to_one_never_killed(
     kill_after(tmp_path, step)
     finish(tmp_path)
     assert (tmp_path / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()
-    (step_a, a, _), (step_b, b, _) = (read_checkpoint(d / "checkpoints") for d in (tmp_path, whole))
-    assert step_a == step_b == 12
+    latest = [d / "checkpoints" / str(list_steps(d / "checkpoints")[-1]) for d in (tmp_path, whole)]
+    assert [checkpoint.name for checkpoint in latest] == ["12", "12"]
+    assert all((checkpoint / "sha256.json").exists() and not find_damage(checkpoint) for checkpoint in latest)
+    a, b = map(ocp.load_checkpointables, latest)
+    assert a.keys() == b.keys() == {"step", "params", "opt_state"}
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 

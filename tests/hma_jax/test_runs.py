@@ -1,0 +1,181 @@
+"""Runs on disk: those of earlier versions, what may differ between starts, and models for inference."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tarfile
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hma_jax
+from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
+from hma_jax.config.json import to_dict
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import inference_params
+from hma_jax.training.loop import LoopOptions
+from hma_jax.training.reading import CheckpointError
+from hma_jax.training.runs import describe_run, load_model, load_run, modernise
+from hma_jax.training.train import train_model
+from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, lively_params, model_config, train_config
+
+OLD = Path(__file__).parent / "data" / "run_3caafdd.tar.gz"
+MODEL = model_config(**SMALLER)
+OLD_LOSSES = [
+    2.7726471424102783, 2.7733123302459717, 2.7752277851104736, 2.7715091705322266, 2.774799108505249,
+    2.7706916332244873,
+]  # fmt: skip
+"""Of six steps by that version."""
+
+AVERAGED = train_config(steps=2, batch=4, ema_decay=0.75)
+
+
+@pytest.fixture
+def old_run(tmp_path: Path) -> Path:
+    with tarfile.open(OLD) as archive:
+        archive.extractall(tmp_path / "old", filter="data")
+    return tmp_path / "old"
+
+
+@pytest.fixture(scope="module")
+def averaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, object]:
+    """(a run that keeps an average, its final state)."""
+    run_dir = tmp_path_factory.mktemp("averaged")
+    result = train_model(MODEL, TABLE, AVERAGED, batches(MODEL, 4), run_dir=run_dir, provenance={})
+    return run_dir, result.state
+
+
+def equal(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+# --- Earlier versions ------------------------------------------------------------------------
+
+
+def test_a_run_of_an_earlier_version_loads(old_run: Path):
+    run = load_run(old_run)
+    assert run.model == MODEL and run.table == TABLE and run.step == 4
+    assert run.train == train_config(steps=4, batch=4)
+    assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(run.params))
+
+
+def test_a_run_of_an_earlier_version_goes_on_where_it_would_have(old_run: Path):
+    """It was computed with other remat, attention and accumulation: rounding may differ, and nothing else."""
+    result = train_model(
+        MODEL, TABLE, train_config(steps=6, batch=4), batches(MODEL, 4),
+        run_dir=old_run, provenance={"data": "random"}, options=LoopOptions(checkpoint_every=1),
+    )  # fmt: skip
+    assert result.resumed_from == 4
+    np.testing.assert_allclose(result.losses, OLD_LOSSES, rtol=1e-5)
+    assert load_run(old_run).step == 6
+
+
+def test_a_field_that_came_later_takes_its_default_and_an_unknown_one_is_named():
+    today = describe_run(MODEL, AVERAGED, TABLE, {})
+    earlier = json.loads(json.dumps(today))
+    del earlier["train"]["ema_decay"], earlier["model"]["mup"]["without"]
+    earlier["model"]["compute_dtype"], earlier["train"]["accumulate"] = "bfloat16", 4
+    assert modernise(earlier) == describe_run(MODEL, replace(AVERAGED, ema_decay=0.0), TABLE, {})
+    assert modernise(today) == today
+    earlier["model"]["telepathy"] = True
+    with pytest.raises(ConfigError, match=r"RUN: model: unknown field\(s\) telepathy"):
+        modernise(earlier, "RUN")
+
+
+# --- Reading a model -------------------------------------------------------------------------
+
+
+def test_loading_a_model_does_not_read_the_moments(averaged, tmp_path: Path):
+    run_dir = shutil.copytree(averaged[0], tmp_path / "run")
+    shutil.rmtree(run_dir / "checkpoints" / "2" / "opt_state")
+    assert equal(load_run(run_dir).params, averaged[1].params)
+    damaged = next((run_dir / "checkpoints" / "2" / "params").rglob("_METADATA"))
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    with pytest.raises(CheckpointError, match="params/_METADATA"):
+        load_run(run_dir)
+
+
+def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Path):
+    run_dir, state = averaged
+    assert not equal(state.ema, state.params)
+    for weights, want, which in (("last", "params", "last"), ("ema", "ema", "ema"), ("auto", "ema", "ema")):
+        run = load_run(run_dir, weights)
+        assert run.weights == which and equal(run.params, getattr(state, want))
+    assert load_run(old_run, "auto").weights == "last"
+    with pytest.raises(ConfigError, match="keeps no average of its weights"):
+        load_run(old_run, "ema")
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_a_model_is_loaded_as_it_is_executed(dtype: str, averaged):
+    run_dir, state = averaged
+    model = load_model(run_dir, ExecutionConfig(dtype=dtype), weights="last")
+    assert model.config == MODEL and model.table == TABLE and model.step == 2
+    for x, y in zip(jax.tree.leaves(model.params), jax.tree.leaves(state.params), strict=True):
+        assert x.devices() == {jax.local_devices()[0]}
+        np.testing.assert_array_equal(x, y.astype(x.dtype))
+    assert model.params["trunk"]["blocks"]["mlp_in"]["kernel"].dtype == dtype
+    assert model.params["embed"]["tables"].dtype == "float32"
+
+    def logits(params, batch):
+        merged = model.declared.merge(params)
+        return merged(batch["tokens"], None, merged.align(batch["actions"]), batch["embodiment"]).said
+
+    assert jax.eval_shape(logits, model.params, next(batches(MODEL, 4)(0))).shape == (4, 3, 4, 2, 4)
+
+
+@pytest.mark.parametrize("changes", [{}, {"diffusion": DIFFUSION}], ids=["discrete", "continuous"])
+def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
+    """Nothing that is cast is used in a finer type."""
+    config = model_config(**SMALLER, **changes)
+    declared, batch = declare_model(config, TABLE, ExecutionConfig(dtype="bfloat16")), next(batches(config, 4)(0))
+    _, params = lively_params(config)
+
+    @jax.jit
+    def outputs(params):
+        model = declared.merge(params)
+        out = model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"])
+        if not config.diffusion:
+            return out.said, out.actions
+        times = jnp.full((4, config.frames), 3)
+        tokens, actions = batch["tokens"], batch["actions"]
+        return (
+            model.denoiser(tokens, jnp.full(tokens.shape[:-1], 3), out.said),
+            model.action_head(actions, times, out.actions, batch["embodiment"]),
+        )
+
+    cast = inference_params(declared, params, "bfloat16")
+    assert sum(x.nbytes for x in jax.tree.leaves(cast)) < 0.6 * sum(x.nbytes for x in jax.tree.leaves(params))
+    for a, b in zip(outputs(cast), outputs(params), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_package_offers_what_loads_a_model(averaged):
+    assert hma_jax.load_model is load_model and hma_jax.load_model(averaged[0]).run.weights == "ema"
+    code = "import sys, hma_jax.config; assert 'jax' not in sys.modules and 'load_model' in hma_jax.__all__"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    with pytest.raises(AttributeError, match="no attribute 'load_modle'; it offers load_model"):
+        hma_jax.load_modle  # noqa: B018
+
+
+# --- How a run is computed -------------------------------------------------------------------
+
+
+def test_how_a_run_is_computed_is_recorded_and_may_change_with_every_start(averaged, tmp_path: Path):
+    run_dir = shutil.copytree(averaged[0], tmp_path / "run")
+    other = ExecutionConfig("bfloat16", "products", "plain", accumulate=2, mesh=MeshConfig(min_shard_size=1))
+    result = train_model(
+        MODEL, TABLE, replace(AVERAGED, steps=3), batches(MODEL, 4),
+        run_dir=run_dir, provenance={}, execution=other,
+    )  # fmt: skip
+    assert result.resumed_from == 2 and len(result.losses) == 3
+    starts = [json.loads(line) for line in (run_dir / "execution.jsonl").read_text().splitlines()]
+    assert [start["execution"] for start in starts] == [to_dict(ExecutionConfig()), to_dict(other)]
+    assert [start["resumed_from"] for start in starts] == [0, 2]

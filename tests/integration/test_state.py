@@ -1,0 +1,42 @@
+"""What a process holds and leaves behind: one state in memory, one message when the disk is full."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from hma_jax.training.reading import find_damage, list_steps
+
+ROOT = Path(__file__).parents[2]
+
+
+def run(program: str, *arguments: object) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", f"tests.integration.{program}", *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+
+
+def test_a_new_run_and_a_resumed_one_hold_one_state(tmp_path: Path):
+    for resumed_from in (0, 2):
+        done = run("live_bytes", tmp_path / "run")
+        assert done.returncode == 0, done.stderr[-3000:]
+        said = json.loads(done.stdout.splitlines()[-1])
+        assert said["resumed_from"] == resumed_from
+        assert 1 <= said["states"] <= 1.05, said
+
+
+def test_a_full_disk_is_one_message_and_the_last_checkpoint_is_kept(tmp_path: Path):
+    full = run("train_full_disk", tmp_path, "full")
+    assert full.returncode == 1
+    assert full.stderr.count("\n") == 1, full.stderr[-3000:]
+    assert full.stderr.startswith(f"error: the checkpoint of step 4 could not be written to {tmp_path}/checkpoints: ")
+    assert re.search(r": File too large\. It takes about 8 kB, and [0-9.]+ .?B are free there\. See that", full.stderr)
+    assert full.stderr.endswith("the same command again: it goes on from step 2, the last whole checkpoint\n")
+    assert list_steps(tmp_path / "checkpoints") == [2]
+    assert find_damage(tmp_path / "checkpoints" / "2") is None
+    again = run("train_full_disk", tmp_path)
+    assert again.returncode == 0, again.stderr[-3000:]
+    assert again.stdout == "2\n" and list_steps(tmp_path / "checkpoints") == [4, 6]
+    assert {p.name for p in (tmp_path / "checkpoints").iterdir()} == {"4", "6"}
