@@ -25,11 +25,11 @@ def where(tmp_path_factory) -> list[str]:
 @pytest.fixture
 def train(where, tmp_path, monkeypatch, capsys):
     """Runs `hma train`; returns what it said and how training was called."""
-    calls, real = [], trials.train_trial
+    calls, phases, real = [], [], trials.train_trial
 
     def spy(trial, materials, run, **how):
         calls.append((trial, how["options"]))
-        return real(trial, materials, run, **how)
+        return real(trial, materials, run, **how | {"progress": lambda phase, *_: phases.append(phase)})
 
     monkeypatch.setattr(trials, "train_trial", spy)
 
@@ -38,6 +38,7 @@ def train(where, tmp_path, monkeypatch, capsys):
         assert main(["train", *where, "--run", str(tmp_path / "run"), *arguments]) == 0
         return capsys.readouterr().out, *calls[-1]
 
+    run.phases = phases  # what the progress line said
     return run
 
 
@@ -75,6 +76,8 @@ def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, s
     lines = [json.loads(line) for line in file.read_text().splitlines()] if steps else []
     assert [line["step"] for line in lines] == steps and file.exists() == bool(steps)
     assert all(0 < line["loss"] < 10 and 0 <= line["accuracy"] <= 1 for line in lines)
+    assert train.phases[0] == "training"
+    assert train.phases[-1] == (f"training, held-out loss {lines[0]['loss']:.4f}" if steps else "training")
 
 
 def test_a_run_that_another_process_trains_is_refused(where, tmp_path, capsys):
