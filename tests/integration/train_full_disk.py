@@ -3,14 +3,18 @@ disk that every user may ask for. An error is said as the program `hma` says it.
 
 import resource
 import sys
+import time
 from pathlib import Path
 
+from hma_jax.training.hashes import NAME
 from hma_jax.training.loop import LoopOptions
 from tests.toy import fit_toy
 
 
 def fill(step: int, steps: int, metrics: dict) -> None:
     if step == 3 and "full" in sys.argv:
+        while not (Path(sys.argv[1]) / "checkpoints" / "2" / NAME).exists():  # it is saved in the background
+            time.sleep(0.01)
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
 
 
