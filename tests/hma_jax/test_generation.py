@@ -16,11 +16,19 @@ from hma_jax.generation import (
     start,
 )
 from hma_jax.generation.decoding import Frame, masked_counts, unmask
+from hma_jax.model import trunk
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
 
 pytestmark = pytest.mark.exact
 
 SAMPLER = SamplerConfig(steps=5)
+
+
+@pytest.fixture(autouse=True)
+def layers_in_a_scan(request, monkeypatch):
+    """As large models have them, which also compiles faster; those marked `written_out` as small models do."""
+    if "written_out" not in request.keywords:
+        monkeypatch.setattr(trunk, "UNROLLED", 0)
 
 
 def test_masked_counts_are_the_cosine_schedule_of_the_release():
@@ -76,7 +84,7 @@ def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
     "decode, prompt, alignment",
     [
         (DecodeConfig(1), 1, "released"),
-        (DecodeConfig(2), 3, "released"),
+        pytest.param(DecodeConfig(2), 3, "released", marks=pytest.mark.written_out),
         (DecodeConfig(3, 1.0), 3, "causal"),
         (DecodeConfig(4, order="confidence"), 1, "causal"),
     ],
@@ -100,7 +108,7 @@ def test_the_cached_rollout_is_exact_under_every_conditioning(conditioning: str)
 @pytest.mark.parametrize("resample", [False, True])
 def test_the_cached_rollout_is_exact_for_continuous_tokens(resample: bool):
     config = model_config(diffusion=DIFFUSION)
-    got = compare_with_naive(config, DecodeConfig(3, sampler=SAMPLER, resample=resample), 2)
+    got = compare_with_naive(config, DecodeConfig(2, sampler=SAMPLER, resample=resample), 2)
     assert np.abs(got[:, 0] - got[:, 1]).max() > 1e-2
 
 
