@@ -17,11 +17,23 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-PUBLIC = {"load_model": "hma_jax.training.runs"}
+PUBLIC = {
+    "ModelConfig": "hma_jax.config",
+    "TrainConfig": "hma_jax.config",
+    "ExecutionConfig": "hma_jax.config",
+    "DecodeConfig": "hma_jax.config",
+    "EmbodimentTable": "hma_jax.model.embodiments",
+    "declare_model": "hma_jax.model.hma",
+    "train_model": "hma_jax.training.train",
+    "load_model": "hma_jax.training.runs",
+    "rollout": "hma_jax.generation",
+    "start": "hma_jax.generation",
+    "advance": "hma_jax.generation",
+}
 """Names that this package offers, and where they live. Each is imported when it is first asked for: a program that
 only reads configurations does not wait for JAX."""
 
-__all__ = ["PUBLIC", *PUBLIC]
+__all__ = list(PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

@@ -74,20 +74,20 @@ def sample_tokens(
     return compose(ids, logits_BSQV.shape[-1]).astype(jnp.int32), jnp.prod(chosen, axis=-1)
 
 
-def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, keep: int) -> Frame:
-    """Fills masked positions of a discrete frame but for the `keep` with the lowest score.
+def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_masked: int) -> Frame:
+    """Fills masked positions of a discrete frame but for the `still_masked` ones with the lowest score.
 
     Known positions are never drawn again.
     """
     filled = jnp.where(frame.masked, sampled_BS, frame.values)
-    still = frame.masked & (_ranks(jnp.where(frame.masked, score_BS, jnp.inf)) < keep)
+    still = frame.masked & (_ranks(jnp.where(frame.masked, score_BS, jnp.inf)) < still_masked)
     return Frame(jnp.where(still, 0, filled), still)
 
 
-def choose_patches(order_BS: jax.Array, before: int, keep: int) -> jax.Array:
+def choose_patches(order_BS: jax.Array, before: int, after: int) -> jax.Array:
     """Token numbers [B, n] that a step samples: those that leave the mask when the first `before`
-    of an order become the first `keep`, in ascending order."""
-    return jnp.sort(order_BS[:, keep:before], axis=-1)
+    of an order become the first `after`, in ascending order."""
+    return jnp.sort(order_BS[:, after:before], axis=-1)
 
 
 def _ranks(score_BS: jax.Array) -> jax.Array:
@@ -108,13 +108,13 @@ def decode_frame(model: HMA, first: jax.Array, look: Look, key_B: jax.Array, dec
 def _decode_tokens(model: HMA, logits: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     batch, size = logits.shape[:2]
     frame = blank_frame(model.config, batch)
-    for step, keep in enumerate(masked_counts(model.config, decode.unmask_steps)):
+    for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
         keys = jax.vmap(lambda k, s=step: jax.random.split(jax.random.fold_in(k, s)))(key_B)
         sampled, score = sample_tokens(logits, keys[:, 0], decode.temperature, decode.top_k)
         if decode.order == "random":
             score = jax.vmap(lambda k: jax.random.uniform(k, (size,)))(keys[:, 1])
-        frame = unmask(frame, sampled, score, keep)
-        if keep:
+        frame = unmask(frame, sampled, score, still_masked)
+        if still_masked:
             logits = look(frame)
     return frame.values
 
@@ -130,14 +130,14 @@ def _decode_latents(model: HMA, z: jax.Array, look: Look, key_B: jax.Array, deco
     frame = blank_frame(model.config, batch)
     order = jax.vmap(lambda k: jax.random.permutation(jax.random.fold_in(k, decode.unmask_steps), size))(key_B)
     before = size
-    for step, keep in enumerate(masked_counts(model.config, decode.unmask_steps)):
-        chosen = choose_patches(order, size if decode.resample else before, keep)
+    for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
+        chosen = choose_patches(order, size if decode.resample else before, still_masked)
         keys = jax.vmap(lambda k, s=step: jax.random.fold_in(k, s))(key_B)
         # The denoiser, not the trunk, costs most: it sees only the patches it is asked for.
         new = denoise(model, jnp.take_along_axis(z, chosen[..., None], axis=1), keys, decode)
         frame = commit(frame, chosen, new)
-        before = keep
-        if keep:
+        before = still_masked
+        if still_masked:
             z = look(frame)
     return frame.values
 
@@ -147,7 +147,10 @@ def denoise(model: HMA, z: jax.Array, key_B: jax.Array, decode: DecodeConfig) ->
     config = model.config.diffusion
     process = sampling_process(make_process(config.steps), decode.sampler)
     shape = (*z.shape[:-1], config.token_channels)
-    network = lambda x, t: model.denoiser(x, t, z)  # noqa: E731
+
+    def network(x: jax.Array, t: jax.Array) -> jax.Array:
+        return model.denoiser(x, t, z)
+
     return sample_with_key(network, key_B, shape, process, decode.sampler, config.clip)
 
 

@@ -135,7 +135,10 @@ def sample(
         f"got {None if noise_steps is None else noise_steps.shape}",
     )
     recorded = jnp.asarray(noise_steps if sampler.noisy_steps else [], jnp.float32)
-    noise_at = lambda index: recorded[-1 - index]  # noqa: E731
+
+    def noise_at(index: jax.Array) -> jax.Array:
+        return recorded[-1 - index]
+
     return _run(network, noise_init, noise_at, process, sampler, clip, trajectory)
 
 
@@ -158,7 +161,9 @@ def sample_with_key(
     )
 
     def draw(index: jax.Array | int) -> jax.Array:
-        one = lambda k: jax.random.normal(jax.random.fold_in(k, index), shape[key.ndim :])  # noqa: E731
+        def one(k: jax.Array) -> jax.Array:
+            return jax.random.normal(jax.random.fold_in(k, index), shape[key.ndim :])
+
         for _ in range(key.ndim):
             one = jax.vmap(one)
         return one(key)

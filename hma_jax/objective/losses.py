@@ -143,7 +143,10 @@ def action_loss_per_step(
     if model.config.diffusion:
         keys = jax.vmap(lambda k: jax.random.fold_in(k, 2**20))(key_B)  # not one of the repeats'
         time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion))(keys)
-        network = lambda x, t: model.action_head(x, t, pooled_BTD, slice_B)  # noqa: E731
+
+        def network(x: jax.Array, t: jax.Array) -> jax.Array:
+            return model.action_head(x, t, pooled_BTD, slice_B)
+
         noise = jnp.where(alive_BTU, noise, 0)
         process = make_process(model.config.diffusion.steps)
         some_BTU = alive_BTU | ~alive_BTU.any(axis=-1, keepdims=True)  # a mean over nothing is no number

@@ -55,7 +55,7 @@ def test_continuous_frames_count_the_denoiser_at_every_sampler_step(monkeypatch)
         monkeypatch.setattr(module, "time_by_turns", lambda calls, _: dict.fromkeys(calls, Timing(1.0, 1.0, 1.0, 1)))
     subject = make_subject("cpu-continuous", layers=1)
     few, many = (DecodeConfig(2, sampler=SamplerConfig(steps=n)) for n in (10, 100))
-    per_step = denoiser_flops(subject.config, subject.config.tokens)
+    per_step = denoiser_flops(subject.config, subject.config.tokens, own_steps=False)
     at = [{s.name: s.flops for s in bench_generate.time_frames(subject, 2, decode, 1)} for decode in (few, many)]
     more = {name: at[1][name] - at[0][name] for name in at[0]}
     ways = dict.fromkeys(("recompute", "slide", "fill", "stream"), pytest.approx(2 * 90 * per_step))

@@ -60,7 +60,7 @@ def test_samplers_of_latents_are_paid_for_step_by_step():
         return estimate(replace(trial, eval=replace(trial.eval, decode=decode))).evaluation_flops
 
     assert flops(40) - flops(20) == pytest.approx(20 / 5 * (flops(15) - flops(10)))
-    assert flops(100) > 4 * flops(10)
+    assert flops(100) > 3 * flops(10)  # the rest is the trunk's
 
 
 def test_the_plan_says_what_it_counts_and_what_not(capsys):

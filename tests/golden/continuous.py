@@ -69,7 +69,10 @@ def make_sampler(case: Case, head: Callable, temperature: float, trajectory: boo
     @jax.jit
     def run(params, condition, start, noises):
         model = case.declared.merge(params)
-        network = lambda x, t: head(model, x, t, condition)  # noqa: E731
+
+        def network(x, t):
+            return head(model, x, t, condition)
+
         noises = noises if sampler.noisy_steps else None
         return sample(network, start, noises, process, sampler, config.clip, trajectory)
 
@@ -248,7 +251,10 @@ def check_joint(case: Case) -> None:
     case.check("action_z_policy", out.actions)
 
     rows = out.actions.reshape(1, -1, out.actions.shape[-1])
-    head = lambda model, x, t, z: model.action_head(x[None], t[None], z, robots[:1])[0]  # noqa: E731
+
+    def head(model, x, t, z):
+        return model.action_head(x[None], t[None], z, robots[:1])[0]
+
     noise = [_pad(case, case.inputs[f"action_noise_{kind}"]) for kind in ("init", "steps")]
     chunk = case.table.entries[case.table.index(robot)].chunk
     case.check("action_sample_policy", make_sampler(case, head, 1.0)(rows, *noise)[:, :chunk])
@@ -274,7 +280,10 @@ def _check_joint_training(case: Case, latents: Latents, robot: str) -> None:
             model = case.declared.merge(p)
             out = model(tokens, masked, actions, robots, hidden_BT=hidden, leak="all")
             loss, _, _ = frame_loss(model, case, tokens, out.said, masked)
-            network = lambda x, t: model.action_head(x, t, out.actions, robots)  # noqa: E731
+
+            def network(x, t):
+                return model.action_head(x, t, out.actions, robots)
+
             mse, vb = diffusion_loss(network, actions, time, noise, process, valid=own)
             action_loss = jnp.sum((mse + vb) * hidden) / jnp.sum(hidden)
             return loss + weight * action_loss, (loss, action_loss)

@@ -198,7 +198,9 @@ def check_generation(case: Case) -> None:
     robot, out_t, prompt = case.domains[0], case.info["out_t"], case.info["num_prompt"]
     actions = case.actions(robot)
     later = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= out_t)[None, :, None], tokens.shape)
-    as_frame = lambda x: np.asarray(x).reshape(*x.shape[:-1], *grid)  # noqa: E731
+
+    def as_frame(x):
+        return np.asarray(x).reshape(*x.shape[:-1], *grid)
 
     with_actions, without = Decoder(case, actions), Decoder(case, None)
     runs = {m.group(1) for m in (re.fullmatch(r"(m\d+\w*?)_tokens", key) for key in case.outputs) if m}

@@ -19,8 +19,16 @@ NEWCOMERS = (
 )
 
 
-@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["discrete", "continuous"])
-@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention"])
+@pytest.mark.parametrize(
+    ("diffusion", "conditioning"),
+    [
+        (None, "concat+modulate"),
+        pytest.param(DIFFUSION, "concat+modulate", marks=pytest.mark.slow),
+        pytest.param(None, "cross_attention", marks=pytest.mark.slow),
+        pytest.param(DIFFUSION, "cross_attention", marks=pytest.mark.slow),
+    ],
+    ids=["discrete", "continuous", "discrete-cross", "continuous-cross"],
+)
 def test_old_robots_answers_stay_bit_identical(diffusion, conditioning: str):
     config = model_config(diffusion=diffusion, conditioning=conditioning)
     declared, params = lively_params(config)

@@ -31,7 +31,9 @@ def gaussian_network(process: Process, mean=MEAN):
     variance = np.exp(low) + process.posterior_x0**2 * var_x0
     fraction = (np.log(variance) - low)[1:] / (high - low)[1:]
     fraction = np.append(0.0, fraction)  # the last step draws nothing
-    at = lambda table, t: jnp.asarray(table, jnp.float32)[t][..., None]  # noqa: E731
+
+    def at(table, t):
+        return jnp.asarray(table, jnp.float32)[t][..., None]
 
     def network(x_t, t):
         index = jnp.searchsorted(jnp.asarray(process.timestep_map), t)
@@ -118,7 +120,10 @@ def rows_of_every_kind(rows: int = 64, channels: int = 5):
 @jax.jit
 def terms(x0, t, noise, eps, variance, valid=None):
     """diffusion_loss of a network that says (eps, variance)."""
-    network = lambda x_t, t: jnp.concatenate([eps, variance], axis=-1)  # noqa: E731
+
+    def network(x_t, t):
+        return jnp.concatenate([eps, variance], axis=-1)
+
     return diffusion_loss(network, x0, t, noise, FULL, valid)
 
 
@@ -175,7 +180,9 @@ def test_the_bound_teaches_the_variance_only_and_the_error_the_noise_only():
     x0, t, noise, eps, variance = rows_of_every_kind()
     t[5] = 0
 
-    totals = lambda eps, variance: [v.sum() for v in terms(x0, t, noise, eps, variance)]  # noqa: E731
+    def totals(eps, variance):
+        return [v.sum() for v in terms(x0, t, noise, eps, variance)]
+
     (mse_eps, vb_eps), (mse_variance, vb_variance) = jax.jit(jax.jacrev(totals, (0, 1)))(eps, variance)
     assert np.all(mse_variance == 0) and np.all(vb_eps == 0)
     np.testing.assert_allclose(mse_eps, 2 * (eps - noise) / eps.shape[-1], rtol=1e-4, atol=1e-6)
@@ -186,13 +193,18 @@ def test_padded_channels_change_neither_loss_nor_gradient():
     x0, t, noise, eps, variance = rows_of_every_kind()
     t[5] = 0
     want = terms(x0, t, noise, eps, variance)
-    rubbish = lambda x: np.pad(x, ((0, 0), (0, 3)), constant_values=7.0)  # noqa: E731
+
+    def rubbish(x):
+        return np.pad(x, ((0, 0), (0, 3)), constant_values=7.0)
+
     x0, noise, eps, variance = map(rubbish, (x0, noise, eps, variance))
     eps[:, 5:] = -30.0
     valid = np.broadcast_to(np.arange(8) < 5, x0.shape)
     np.testing.assert_allclose(terms(x0, t, noise, eps, variance, valid), want, rtol=1e-5)
 
-    total = lambda *out: sum(v.sum() for v in terms(x0, t, noise, *out, valid))  # noqa: E731
+    def total(*out):
+        return sum(v.sum() for v in terms(x0, t, noise, *out, valid))
+
     for gradient in jax.jit(jax.grad(total, (0, 1)))(eps, variance):
         assert np.all(gradient[:, 5:] == 0) and np.any(gradient[:, :5] != 0)
 
@@ -294,7 +306,10 @@ def test_dpm_starts_where_an_error_of_the_network_does_no_harm():
     for sampler in (SamplerConfig("ddim", 25), SamplerConfig("dpm++", 10, eta=0.0)):
         process = sampling_process(FULL, sampler)
         exact = gaussian_network(process)
-        wrong = lambda x, t, exact=exact: exact(x, t) + jnp.repeat(jnp.array([0.01, 0.0]), 3)  # noqa: E731
+
+        def wrong(x, t, exact=exact):
+            return exact(x, t) + jnp.repeat(jnp.array([0.01, 0.0]), 3)
+
         samples = (np.asarray(sample(n, start, None, process, sampler, CLIP)) for n in (exact, wrong))
         moved[sampler.kind] = np.abs(np.subtract(*samples)).mean() / STD
     assert moved["ddim"] > 0.2 and moved["dpm++"] < 0.05, moved
@@ -314,7 +329,10 @@ def test_dpm_is_the_multistep_formula_of_second_order(eta):
     process, sampler = respace_by_log_snr(FULL, 5), SamplerConfig("dpm++", 5, temperature=0.7, eta=eta)
     noise = np.random.default_rng(1).normal(size=(6, 1, 2)).astype(np.float32)
     told = np.array([[0.5, -1.5]])
-    network = lambda x_t, t: jnp.concatenate([jnp.asarray(told) * (1 + x_t), jnp.zeros((1, 2))], -1)  # noqa: E731
+
+    def network(x_t, t):
+        return jnp.concatenate([jnp.asarray(told) * (1 + x_t), jnp.zeros((1, 2))], -1)
+
     _, visited = sample(network, noise[0], noise[1:] if eta else None, process, sampler, CLIP, True)
     signal, spread = np.sqrt(process.alphas_cumprod), np.sqrt(1 - process.alphas_cumprod)
     x, before, stride_before = 0.7 * noise[0].astype(np.float64), None, None

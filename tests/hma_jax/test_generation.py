@@ -16,19 +16,14 @@ from hma_jax.generation import (
     start,
 )
 from hma_jax.generation.decoding import Frame, masked_counts, unmask
-from hma_jax.model import trunk
 from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
-
-pytestmark = pytest.mark.exact
 
 SAMPLER = SamplerConfig(steps=5)
 
 
-@pytest.fixture(autouse=True)
-def layers_in_a_scan(request, monkeypatch):
-    """As large models have them, which also compiles faster; those marked `written_out` as small models do."""
-    if "written_out" not in request.keywords:
-        monkeypatch.setattr(trunk, "UNROLLED", 0)
+def some(cases: list) -> list:
+    """Those that only `make test-slow` runs."""
+    return [pytest.param(case, marks=pytest.mark.slow) for case in cases]
 
 
 def test_masked_counts_are_the_cosine_schedule_of_the_release():
@@ -80,13 +75,14 @@ def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
     return got
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "decode, prompt, alignment",
     [
-        (DecodeConfig(1), 1, "released"),
-        pytest.param(DecodeConfig(2), 3, "released", marks=pytest.mark.written_out),
+        pytest.param(DecodeConfig(1), 1, "released", marks=pytest.mark.slow),
+        (DecodeConfig(2), 3, "released"),
         (DecodeConfig(3, 1.0), 3, "causal"),
-        (DecodeConfig(4, order="confidence"), 1, "causal"),
+        pytest.param(DecodeConfig(4, order="confidence"), 1, "causal", marks=pytest.mark.slow),
     ],
     ids=str,
 )
@@ -99,26 +95,30 @@ def test_the_cached_rollout_equals_recomputing_the_window(
     assert got.max() < config.vocab_size
 
 
-@pytest.mark.parametrize("conditioning", ["modulate", "concat", "add", "cross_attention"])
+@pytest.mark.exact
+@pytest.mark.parametrize("conditioning", ["cross_attention", *some(["modulate", "concat", "add"])])
 def test_the_cached_rollout_is_exact_under_every_conditioning(conditioning: str):
     got = compare_with_naive(model_config(conditioning=conditioning), DecodeConfig(2), 2)
     assert (got[:, 0] != got[:, 1]).any()
 
 
-@pytest.mark.parametrize("resample", [False, True])
+@pytest.mark.exact
+@pytest.mark.parametrize("resample", some([False, True]))
 def test_the_cached_rollout_is_exact_for_continuous_tokens(resample: bool):
     config = model_config(diffusion=DIFFUSION)
     got = compare_with_naive(config, DecodeConfig(2, sampler=SAMPLER, resample=resample), 2)
     assert np.abs(got[:, 0] - got[:, 1]).max() > 1e-2
 
 
-@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention"])
+@pytest.mark.exact
+@pytest.mark.parametrize("conditioning", ["concat+modulate", *some(["cross_attention"])])
 def test_the_cached_rollout_is_exact_with_hidden_actions(conditioning: str):
     hidden = np.random.default_rng(0).random((4, 6)) < 0.5
     compare_with_naive(model_config(conditioning=conditioning), DecodeConfig(2), 3, hidden)
 
 
-@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention"])
+@pytest.mark.exact
+@pytest.mark.parametrize("conditioning", ["cross_attention", *some(["concat+modulate"])])
 def test_actions_that_are_all_hidden_make_no_difference(conditioning: str):
     config = model_config(conditioning=conditioning)
     declared, params = lively_params(config)
@@ -141,6 +141,7 @@ def test_top_1_is_greedy():
     np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "alignment, diffusion",
     [("causal", None), ("released", DIFFUSION)],
@@ -209,6 +210,7 @@ def test_a_policy_never_sees_what_it_predicts(alignment: str):
     assert np.abs(a[:, 4:] - b[:, 4:]).max() > 1e-3
 
 
+@pytest.mark.exact
 def test_equal_actions_give_equal_rollouts_even_when_sampled():
     config = model_config()
     declared, params = lively_params(config)
@@ -256,10 +258,11 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
         np.testing.assert_allclose(fast[:, t - 1], slow, atol=1e-4 * np.abs(slow).max())
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "options, decode",
     [
-        ({"conditioning": "concat+modulate"}, DecodeConfig(3, 1.0)),
+        pytest.param({"conditioning": "concat+modulate"}, DecodeConfig(3, 1.0), marks=pytest.mark.slow),
         ({"action_alignment": "causal"}, DecodeConfig(2, order="confidence")),
         pytest.param({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SAMPLER), marks=pytest.mark.slow),
         pytest.param({"conditioning": "cross_attention"}, DecodeConfig(2), marks=pytest.mark.slow),
@@ -297,9 +300,10 @@ def test_temperature_is_a_temperature():
     batch = random_batch(0, config, 8)
     actions = batch["actions"][:, None]
     keys = jax.random.split(jax.random.key(0), 8)
-    run = lambda t: np.asarray(  # noqa: E731
-        jitted_rollout(declared, batch, actions, keys, DecodeConfig(1, t), 5)(params)
-    )
+
+    def run(temperature: float) -> np.ndarray:
+        return np.asarray(jitted_rollout(declared, batch, actions, keys, DecodeConfig(1, temperature), 5)(params))
+
     greedy = run(0.0)
     assert (run(0.01) == greedy).mean() > (run(5.0) == greedy).mean() + 0.2
 
@@ -321,10 +325,11 @@ def whole_rollouts(config, decode: DecodeConfig, prompt: int, hidden=None) -> tu
     return np.asarray(fast(params))[:, 0], np.asarray(naive(params))
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "options, decode, prompt",
     [
-        ({}, DecodeConfig(2), 2),
+        pytest.param({}, DecodeConfig(2), 2, marks=pytest.mark.slow),
         ({"action_alignment": "causal"}, DecodeConfig(3, 1.0), 5),
         pytest.param({"conditioning": "cross_attention"}, DecodeConfig(1), 9, marks=pytest.mark.slow),
         pytest.param(
@@ -351,6 +356,7 @@ def case(conditioning: str, decode: DecodeConfig, slow: bool = True):
     return pytest.param(conditioning, decode, marks=[pytest.mark.slow] if slow else [], id=name)
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "conditioning, decode",
     [
@@ -373,6 +379,7 @@ def test_one_to_twenty_four_frames_of_different_robots_equal_the_oracle_s(condit
         np.testing.assert_array_equal(fast(params), want[:, :new])
 
 
+@pytest.mark.exact
 def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions():
     hidden = np.random.default_rng(0).random((2, LONG)) < 0.5
     got, want = whole_rollouts(model_config(diffusion=DIFFUSION), DecodeConfig(2, sampler=SAMPLER), 4, hidden)
@@ -387,6 +394,7 @@ def test_streaming_is_exact_while_the_window_fills_and_an_approximation_after():
     assert (streamed[:, inside:] != exact[:, inside:]).any()
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "slide, alignment, prompt",
     [

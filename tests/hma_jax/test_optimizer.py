@@ -105,9 +105,10 @@ def test_mup_divides_the_rate_of_hidden_matrices_only():
 
 
 def test_schedules_warm_up_hold_and_fall():
-    rates = lambda **kw: np.array(  # noqa: E731
-        [make_schedule(OptimizerConfig(learning_rate=1.0, **kw), 100)(s) for s in range(100)]
-    )
+    def rates(**settings):
+        schedule = make_schedule(OptimizerConfig(learning_rate=1.0, **settings), 100)
+        return np.array([schedule(s) for s in range(100)])
+
     constant = rates(schedule="constant", warmup_steps=10)
     np.testing.assert_allclose(constant[:10], np.arange(1, 11) / 10, rtol=1e-5)
     assert (constant[10:] == 1).all()
