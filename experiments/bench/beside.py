@@ -1,4 +1,4 @@
-"""Our stages beside the official release's: two processes that take turns, so that a slow spell hits both."""
+"""Our stages beside the official release's: processes that take turns, so that a slow spell hits all."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 from experiments.bench.record import Stage
 from experiments.bench.timing import summarise
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.host_memory import HUGE_PAGES
 
 RELEASED = {
     "forward": "forward",
@@ -24,7 +25,8 @@ RELEASED = {
 }
 """Our stage -> the release's that gives the same."""
 
-OURS, THEIRS = "ours: ", "release: "
+OURS, THEIRS, TUNED = "ours: ", "release: ", "release with huge pages: "
+"""The release as its users start it, and with the environment in which this program starts itself."""
 
 
 class Worker:
@@ -64,12 +66,18 @@ def time_beside(
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
     # As text: started from its file, it would find our modules beside it before those of the standard library.
     script = Path(__file__).with_name("released.py").read_text()
-    order = list(dict.fromkeys(turn for name in names for turn in ((THEIRS, RELEASED[name]), (OURS, name))))
+    turns_of = (((THEIRS, RELEASED[name]), (TUNED, RELEASED[name]), (OURS, name)) for name in names)
+    order = list(dict.fromkeys(turn for of_one in turns_of for turn in of_one))
+    checkout = {"PYTHONPATH": str(release.absolute())}
     seconds: dict[tuple[str, str], list[float]] = {turn: [] for turn in order}
     with ExitStack() as stack:
         workers = {
-            THEIRS: stack.enter_context(Worker([str(python), "-c", script], PYTHONPATH=str(release.absolute()))),
-            OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"])),
+            whose: stack.enter_context(Worker(command, **environment))
+            for whose, command, environment in (
+                (THEIRS, [str(python), "-c", script], checkout | dict.fromkeys(HUGE_PAGES, "")),
+                (TUNED, [str(python), "-c", script], checkout | HUGE_PAGES),
+                (OURS, [sys.executable, "-m", "experiments.bench.stages"], HUGE_PAGES),
+            )
         }
         for turn in range(-1, turns):  # the first one compiles and warms up
             for whose, stage in order:
@@ -79,5 +87,8 @@ def time_beside(
                     seconds[whose, stage].append(took)
     stages = [Stage(f"{whose}{stage}", 1, summarise(taken)) for (whose, stage), taken in seconds.items()]
     median = {stage.name: stage.timing.median for stage in stages}
-    ratios = {f"{n}, times faster": median[THEIRS + RELEASED[n]] / median[OURS + n] for n in names}
+    ratios = {}
+    for name in names:
+        for whose, words in ((THEIRS, "times faster"), (TUNED, "times faster than with huge pages")):
+            ratios[f"{name}, {words}"] = median[whose + RELEASED[name]] / median[OURS + name]
     return stages, ratios

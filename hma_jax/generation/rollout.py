@@ -60,7 +60,7 @@ def rollout(
     """
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape
-    count, size = prompt.shape[1], min(frames, model.config.frames)
+    size = min(frames, model.config.frames)
     sequences = Sequences(
         actions_BRTU.reshape(batch * repeats, frames, -1),
         None if hidden_BT is None else jnp.repeat(hidden_BT, repeats, axis=0),

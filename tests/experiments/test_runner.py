@@ -147,7 +147,8 @@ def test_the_program_starts_again_with_huge_pages_unless_the_user_said_otherwise
         "restart_with_huge_pages()\n"
         "print(os.environ['GLIBC_TUNABLES'], *sys.argv[1:])\n"
     )
-    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"} | ({"GLIBC_TUNABLES": asked} if asked else {})
+    environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
+    environment |= {"GLIBC_TUNABLES": asked} if asked else {}
     command = [sys.executable, "-u", program, "--set", "a b"]
     lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines == ["started"] * (1 if asked else 2) + [f"{asked or 'glibc.malloc.hugetlb=1'} --set a b"]

@@ -2,8 +2,8 @@
 
 Any folder of the format is taken, whatever its sizes, robots and seeds; `case.json` says its kind. It may hold some
 of the outputs of its kind only: images of any size, or only ids to decode; schedules at any points; parameters after
-training whole, as changes or as norms (`final`, `final_norm`, `final_change`, `final_change_norm`), with muP or without.
-Every output is compared, or named as not compared; the exit code is 1 on any failure.
+training whole, as changes or as norms (`final`, `final_norm`, `final_change`, `final_change_norm`), with muP or
+without. Every output is compared, or named as not compared; the exit code is 1 on any failure.
 """
 
 from __future__ import annotations

@@ -71,6 +71,7 @@ def test_the_average_of_an_absent_robot_stands_still(states: list[TrainState]):
     np.testing.assert_allclose(stems[-1][0], want, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_average_is_resumed_and_changes_nothing_else(tmp_path: Path):
     def dying(start: int):
         for number, batch in enumerate(batches(MODEL, 4)(start), start + 1):

@@ -42,7 +42,9 @@ def gradients(dtype: str, diffusion: DiffusionConfig | None) -> dict[str, np.nda
     return {spec: np.asarray(g) for spec, g in zip(declared.leaves(), jax.tree.leaves(gradient(params)), strict=True)}
 
 
-@pytest.mark.parametrize("diffusion", [None, LATENTS], ids=["ids", "latents"])
+@pytest.mark.parametrize(
+    "diffusion", [None, pytest.param(LATENTS, marks=pytest.mark.slow)], ids=["ids", "latents"]
+)
 def test_gradients_in_bfloat16_are_those_in_float32_within_its_rounding(diffusion):
     exact, rounded = gradients("float32", diffusion), gradients("bfloat16", diffusion)
     for name, g in exact.items():

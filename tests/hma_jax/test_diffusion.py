@@ -287,7 +287,10 @@ def moments(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x.mean(0), x.std(0), np.bincount(np.argmin(score, axis=1), minlength=3) / len(x)
 
 
-@pytest.mark.parametrize("steps, eta", [(8, 0.0), (10, 0.0), (12, 0.0), (10, 0.5), (12, 0.5)])
+@pytest.mark.parametrize(
+    "steps, eta",
+    [(10, 0.5), *(pytest.param(*p, marks=pytest.mark.slow) for p in [(8, 0.0), (10, 0.0), (12, 0.0), (12, 0.5)])],
+)
 def test_a_few_steps_of_dpm_have_the_moments_of_a_mixture_and_of_100_ancestral_steps(steps, eta):
     found = moments(from_mixture(SamplerConfig("dpm++", steps, eta=eta)))
     mean = WEIGHTS @ CENTRES

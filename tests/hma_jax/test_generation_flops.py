@@ -146,7 +146,9 @@ def test_the_denoiser_counts_the_tokens_that_it_sees_at_every_step(resample, sam
 
 
 @pytest.mark.parametrize("slide", ["exact", "streaming"])
-@pytest.mark.parametrize(("frames", "prompt"), [(6, 2), (9, 2), (10, 8)])
+@pytest.mark.parametrize(
+    ("frames", "prompt"), [(9, 2), *(pytest.param(*p, marks=pytest.mark.slow) for p in [(6, 2), (10, 8)])]
+)
 def test_a_rollout_is_the_sum_of_its_frames(slide, frames, prompt):
     case = Case(diffusion=DIFFUSION)
     decode = DecodeConfig(2, slide=slide, sampler=SamplerConfig(steps=4))

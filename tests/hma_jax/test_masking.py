@@ -152,11 +152,11 @@ def poison_hidden(data, masked):
 @pytest.mark.parametrize(
     "conditioning, alignment",
     [
-        ("concat+modulate", "released"),
+        pytest.param("concat+modulate", "released", marks=pytest.mark.slow),
         ("concat+modulate", "causal"),
         pytest.param("concat", "released", marks=pytest.mark.slow),
         pytest.param("add", "causal", marks=pytest.mark.slow),
-        ("cross_attention", "released"),
+        pytest.param("cross_attention", "released", marks=pytest.mark.slow),
     ],
 )
 def test_hidden_actions_do_not_reach_the_frames_on_any_path(conditioning: str, alignment: str):

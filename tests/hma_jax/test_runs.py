@@ -131,7 +131,9 @@ def test_a_model_is_loaded_as_it_is_executed(dtype: str, averaged):
     assert jax.eval_shape(logits, model.params, next(batches(MODEL, 4)(0))).shape == (4, 3, 4, 2, 4)
 
 
-@pytest.mark.parametrize("changes", [{}, {"diffusion": DIFFUSION}], ids=["discrete", "continuous"])
+@pytest.mark.parametrize(
+    "changes", [{}, pytest.param({"diffusion": DIFFUSION}, marks=pytest.mark.slow)], ids=["discrete", "continuous"]
+)
 def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
     """Nothing that is cast is used in a finer type."""
     config = model_config(**SMALLER, **changes)

@@ -73,6 +73,7 @@ def test_a_finished_run_is_not_run_again(tmp_path: Path):
     assert equal_trees(again.state, first.state)
 
 
+@pytest.mark.slow
 def test_a_constant_rate_run_may_be_lengthened_and_another_not(tmp_path: Path):
     train(tmp_path)
     longer = train(tmp_path, config=train_config(steps=8))

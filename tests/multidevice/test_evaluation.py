@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from hma_jax.evaluation.windows import WindowTable
 
@@ -26,6 +27,7 @@ def run_on(devices: int, mesh: str, path: Path) -> WindowTable:
     return WindowTable.load(path)
 
 
+@pytest.mark.slow
 def test_numbers_do_not_depend_on_the_number_of_devices(tmp_path: Path):
     """Batches of 5 windows: with 8 devices, padded; in groups of 1 and of 4 windows."""
     one = run_on(1, "1,1,1", tmp_path / "one.csv.gz")

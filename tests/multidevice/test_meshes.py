@@ -46,6 +46,7 @@ def test_eight_devices_train_as_one_does_and_checkpoints_move_between_meshes(tmp
     np.testing.assert_allclose(longer["losses"], back["losses"], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_latents_train_on_eight_shards_of_the_parameters_as_on_one_device(tmp_path: Path):
     one = run_on(1, "1,1,1", tmp_path / "one", steps=3, kind="latents")
     eight = run_on(8, "1,8,1", tmp_path / "eight", steps=3, kind="latents")

@@ -11,7 +11,6 @@ from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
 from tests.tiny import TABLE, batches, model_config, train_config
 
-
 LATENTS = DiffusionConfig(channels=2, patch=1, width=64, depth=2, steps=20)
 
 

@@ -52,6 +52,7 @@ def test_a_converted_checkpoint_is_a_run(base, tmp_path):
     same(load_run(tmp_path / "run"), run)
 
 
+@pytest.mark.slow
 def test_training_goes_on_from_a_converted_run(tmp_path):
     run = replace(small_run(), step=0)
     write_run(run, tmp_path / "run")
@@ -134,7 +135,9 @@ assert not [name for name in sys.modules if name.split(".")[0] in ("hma_jax", "e
     "changes, decode",
     [
         ({}, DecodeConfig(2, 1.0)),
-        ({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3))),
+        pytest.param(
+            {"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3)), marks=pytest.mark.slow
+        ),
     ],
     ids=["discrete", "continuous"],
 )

@@ -105,6 +105,7 @@ def test_new_robots_change_no_number_of_the_old_ones(diffusion):
         np.testing.assert_allclose(new.metrics[metric], column, rtol=1e-4, atol=1e-4, err_msg=metric)
 
 
+@pytest.mark.slow
 def test_latents_that_are_no_numbers_are_not_decoded_into_images():
     config = model_config(diffusion=DIFFUSION)
     broken = jax.tree.map(lambda x: x * jnp.nan, lively_params(config)[1])
@@ -152,6 +153,7 @@ def test_after_recorded_frames_every_frame_but_the_first_is_predicted(params):
     assert recorded.summary.overall["delta_psnr"].sem > 0
 
 
+@pytest.mark.slow
 def test_windows_longer_than_the_model_s_are_continued_past_it(params):
     def judge(batches, settings):
         return evaluate(params, CONFIG, TABLE, TOKENIZER, batches, settings)
@@ -196,6 +198,7 @@ def test_a_window_s_numbers_depend_on_neither_batch_nor_row_nor_neighbours(param
     agree(together.rows(np.asarray([together.names.index(name) for name in alone.names])), alone)
 
 
+@pytest.mark.slow
 def test_how_many_windows_are_in_memory_changes_no_number(params):
     """A batch of 4 in two groups of 2."""
     agree(run(params, execution=ExecutionConfig(windows_at_once=3)).windows, run(params).windows)
@@ -258,6 +261,7 @@ def test_the_next_batch_is_dispatched_before_numbers_are_read(params, monkeypatc
     assert list(one_ahead([])) == [] and list(one_ahead([5])) == [5]
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_the_windows_at_once_not_of_the_batch(params):
     """Rollouts of all windows together would need a multiple of this."""
 

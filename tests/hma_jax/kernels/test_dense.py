@@ -53,7 +53,9 @@ def test_each_example_is_multiplied_with_its_own_robot_s_matrix(product, sizes: 
 WIDTHS = [1, 7, 31, 33, 65, 176, 300]
 
 
-@pytest.mark.parametrize("rows, out", [((4, 6), 32), ((1, 1), 24), pytest.param((3, 12), 256, marks=pytest.mark.slow)], ids=str)
+@pytest.mark.parametrize(
+    "rows, out", [((4, 6), 32), ((1, 1), 24), pytest.param((3, 12), 256, marks=pytest.mark.slow)], ids=str
+)
 def test_padding_the_action_axis_changes_no_bit(rows: tuple, out: int):
     """Each width in a program of its own, padded to the next larger ones and to the largest."""
     into, back = jax.jit(from_actions), jax.jit(to_actions)
