@@ -1,4 +1,4 @@
-"""Our stages beside the official release's: processes that take turns, so that a slow spell hits all."""
+"""Our stages beside the official release's: two processes that take turns, so that a slow spell hits both."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ RELEASED = {
 }
 """Our stage -> the release's that gives the same."""
 
-OURS, THEIRS, TUNED = "ours: ", "release: ", "release with huge pages: "
-"""The release as its users start it, and with the environment in which this program starts itself."""
+OURS, THEIRS = "ours: ", "release: "
 
 
 class Worker:
@@ -66,18 +65,13 @@ def time_beside(
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
     # As text: started from its file, it would find our modules beside it before those of the standard library.
     script = Path(__file__).with_name("released.py").read_text()
-    turns_of = (((THEIRS, RELEASED[name]), (TUNED, RELEASED[name]), (OURS, name)) for name in names)
-    order = list(dict.fromkeys(turn for of_one in turns_of for turn in of_one))
-    checkout = {"PYTHONPATH": str(release.absolute())}
+    order = list(dict.fromkeys(turn for name in names for turn in ((THEIRS, RELEASED[name]), (OURS, name))))
+    as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(HUGE_PAGES, "")
     seconds: dict[tuple[str, str], list[float]] = {turn: [] for turn in order}
     with ExitStack() as stack:
         workers = {
-            whose: stack.enter_context(Worker(command, **environment))
-            for whose, command, environment in (
-                (THEIRS, [str(python), "-c", script], checkout | dict.fromkeys(HUGE_PAGES, "")),
-                (TUNED, [str(python), "-c", script], checkout | HUGE_PAGES),
-                (OURS, [sys.executable, "-m", "experiments.bench.stages"], HUGE_PAGES),
-            )
+            THEIRS: stack.enter_context(Worker([str(python), "-c", script], **as_its_users)),
+            OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"], **HUGE_PAGES)),
         }
         for turn in range(-1, turns):  # the first one compiles and warms up
             for whose, stage in order:
@@ -87,8 +81,5 @@ def time_beside(
                     seconds[whose, stage].append(took)
     stages = [Stage(f"{whose}{stage}", 1, summarise(taken)) for (whose, stage), taken in seconds.items()]
     median = {stage.name: stage.timing.median for stage in stages}
-    ratios = {}
-    for name in names:
-        for whose, words in ((THEIRS, "times faster"), (TUNED, "times faster than with huge pages")):
-            ratios[f"{name}, {words}"] = median[whose + RELEASED[name]] / median[OURS + name]
+    ratios = {f"{name}, times faster": median[THEIRS + RELEASED[name]] / median[OURS + name] for name in names}
     return stages, ratios

@@ -193,8 +193,7 @@ def release(
     turns: int = 5,
     out: Path = Path("runs/bench"),
 ) -> None:
-    """Time the base models beside the official PyTorch release, as its users start it and with the memory
-    pages of this program: processes that take turns.
+    """Time the base models beside the official PyTorch release: two processes that take turns.
 
     Args:
         checkout: A clone of github.com/liruiw/HMA.

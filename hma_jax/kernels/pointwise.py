@@ -59,8 +59,9 @@ def gelu(x: jax.Array) -> jax.Array:
 @gelu.defjvp
 def _gelu_slope(x: tuple[jax.Array], tangent: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
     (x,), (t,) = x, tangent
-    # Behind a barrier, or XLA computes erf once for value and slope, and stores it between them.
-    x32 = jax.lax.optimization_barrier(x).astype(jnp.float32)
+    # Behind a barrier, or XLA computes erf once for value and slope, and stores it between them: on CPU the
+    # slower way.
+    x32 = jax.lax.platform_dependent(x, cpu=jax.lax.optimization_barrier, default=lambda x: x).astype(jnp.float32)
     slope = _normal_below(x32) + x32 * jnp.exp(-0.5 * jnp.square(x32)) / math.sqrt(2 * math.pi)
     return gelu(x), t * slope.astype(t.dtype)
 

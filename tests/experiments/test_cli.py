@@ -99,9 +99,9 @@ def test_paper_plan_prints_the_papers_sizes(capsys):
     ("module", "shown"),
     [
         ("scale_width", "control"),
-        ("ablate_settings", "full dynamics, seed 1"),
-        ("ablate_conditioning", "cross_attention, seed 0"),
-        ("transfer_lr", "learning rate 0.002, no muP"),
+        pytest.param("ablate_settings", "full dynamics, seed 1", marks=pytest.mark.slow),
+        pytest.param("ablate_conditioning", "cross_attention, seed 0", marks=pytest.mark.slow),
+        pytest.param("transfer_lr", "learning rate 0.002, no muP", marks=pytest.mark.slow),
     ],
 )
 def test_sweep_modules_run_as_programs(module, shown):

@@ -52,6 +52,7 @@ def released(folder: Path, vocab: int) -> Path:
     return write_checkpoint(folder, config, small)
 
 
+@pytest.mark.slow
 def test_released_model_is_evaluated_on_ids_of_an_imported_tokenizer(arm, tmp_path, capsys):
     """Random weights in both; but for their sizes, all is as with the published ones."""
     tokenizer, out = imported(tmp_path, "magvit2"), tmp_path / "out"

@@ -88,6 +88,7 @@ def test_a_run_that_another_process_trains_is_refused(where, tmp_path, capsys):
     assert main(["train", *where, "--run", str(tmp_path / "run")]) == 0
 
 
+@pytest.mark.slow
 def test_the_average_of_the_weights_is_evaluated_unless_told_otherwise(train, where, tmp_path, capsys):
     train("--set", "train.ema_decay=0.5")
 

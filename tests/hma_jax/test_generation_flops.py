@@ -120,7 +120,7 @@ def ways(case: Case, decode: DecodeConfig) -> dict:
     }
 
 
-@pytest.mark.parametrize("looks", [1, 2, 4])
+@pytest.mark.parametrize("looks", [2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))])
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_frame_counts_every_look_and_every_sampler_step(kind, looks):
     case = Case(diffusion=KINDS[kind])
@@ -131,7 +131,7 @@ def test_a_frame_counts_every_look_and_every_sampler_step(kind, looks):
         assert formula == pytest.approx(count, rel=0.03), way
 
 
-@pytest.mark.parametrize("resample", [False, True])
+@pytest.mark.parametrize("resample", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("sampler", [SamplerConfig("ddpm", 5), SamplerConfig("ddim", 12), SamplerConfig("dpm++", 8)])
 def test_the_denoiser_counts_the_tokens_that_it_sees_at_every_step(resample, sampler):
     """Without the trunk's part: the difference of two numbers of steps."""

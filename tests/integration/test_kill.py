@@ -40,7 +40,7 @@ def kill_after(run_dir: Path, step: int) -> None:
     assert process.returncode == -signal.SIGKILL
 
 
-@pytest.mark.parametrize("step", [5, 9])
+@pytest.mark.parametrize("step", [pytest.param(5, marks=pytest.mark.slow), 9])
 def test_a_killed_run_continued_is_byte_equal_to_one_never_killed(
     tmp_path: Path, whole: Path, step: int
 ):
