@@ -241,8 +241,9 @@ def test_sigterm_ends_like_an_interruption_with_a_last_word(tmp_path):
     program = (
         "import sys, time; from experiments.cli import main; from experiments.commands import study\n"
         "def run(*_, **__):\n"
-        "    print('at work', flush=True)\n"
-        "    try: time.sleep(60)\n"
+        "    try:\n"
+        "        print('at work', flush=True)\n"
+        "        time.sleep(60)\n"
         "    finally: print('saved', flush=True)\n"
         "study.run_study = run\n"
         "sys.exit(main.main(['study', '--preset', 'smoke']))"

@@ -19,6 +19,7 @@ def fill(step: int, steps: int, metrics: dict) -> None:
 
 
 if __name__ == "__main__":
+    sys.unraisablehook = lambda _: None  # as `hma` does: writers in the background complain once more at the end
     try:
         print(fit_toy(Path(sys.argv[1]), options=LoopOptions(checkpoint_every=2), progress=fill).resumed_from)
     except OSError as error:
