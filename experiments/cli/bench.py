@@ -21,6 +21,7 @@ HELP = (
     "prints both, and writes a JSON record with commit, hardware and versions."
 )
 
+Program = Literal["step", "forward", "fill", "slide"]
 Model = Literal["base", "xl", "base-continuous", "xl-continuous", "cpu", "cpu-continuous"]
 
 
@@ -97,6 +98,17 @@ def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
         remat: What a block keeps for the backward pass; the rest is computed again.
     """
     commands.train(bench, remat)
+
+
+@bench_app.command(name="products")
+def products(bench: OmitArgPrefixes[Bench], program: Program = "step") -> None:
+    """Time a program, and every matrix product in it alone: what could be gained, and where.
+
+    Args:
+        bench: What is timed and how often.
+        program: An optimiser step, a pass over the window, or a frame while the window fills or when it slides.
+    """
+    commands.products(bench, program)
 
 
 @bench_app.command(name="eval")

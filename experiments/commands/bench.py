@@ -64,6 +64,20 @@ def train(bench: Bench, remat: Remat) -> None:
     _finish("train", bench, subject, stages, found, {})
 
 
+def products(bench: Bench, program: str) -> None:
+    from experiments.bench.products import time_products
+
+    subject = _subject(bench, remat="none" if bench.model.startswith("cpu") else "products")
+    stages = _over_batches(
+        bench, f"the products of {program}", lambda rows: time_products(subject, program, rows, bench.repeats)
+    )
+    found = {}
+    for rows in bench.batch:
+        whole, *parts = [s.timing.median for s in stages if s.batch == rows]
+        found[f"{program} / the sum of its products alone, batch {rows}"] = whole / sum(parts)
+    _finish(f"products-{program}", bench, subject, stages, found, {})
+
+
 def evaluate(bench: Bench, context: Literal["recorded", "generated"], draws: int) -> None:
     from experiments.bench.evaluate import time_evaluation
     from hma_jax.config import EvalConfig
@@ -80,7 +94,13 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     from dataclasses import replace
 
     from data_pipelines.loading.evalset import eval_batches, freeze_manifest
-    from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
+    from experiments.bench.quality import (
+        Judged,
+        decodings,
+        judge,
+        plot_quality,
+        subject_of,
+    )
     from experiments.commands.model import check_fits, require_prepared
     from experiments.rows import write_csv
     from experiments.trial import open_materials
@@ -150,7 +170,13 @@ def load(
     import tempfile
 
     from data_pipelines.tokens.store import TokenStore
-    from experiments.bench.load import MemoryPoint, make_store, plot_memory, time_shards, time_windows
+    from experiments.bench.load import (
+        MemoryPoint,
+        make_store,
+        plot_memory,
+        time_shards,
+        time_windows,
+    )
     from experiments.rows import write_csv
 
     with tempfile.TemporaryDirectory() as scratch:

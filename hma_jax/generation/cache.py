@@ -1,8 +1,8 @@
 """Passes over a window of T positions, with a cache of its finished frames.
 
 Spatial attention stays inside a frame and temporal attention is causal, so all that later frames need of a
-finished one is its keys and values. `extend` adds finished frames, `query` asks about a masked one, and
-`extend_and_query` does both in one pass: the newest finished frame, and the first look at the one after it.
+finished one is its keys and values. `Window.start` caches a prompt, `query` asks about a masked frame, and `extend_and_query` takes a finished one
+into the cache and looks at the one after it for the first time, both in one pass.
 How a rollout puts these together is told in `steps`.
 """
 

@@ -62,6 +62,10 @@ class ParamSpec:
     def size(self) -> int:
         return math.prod(self.shape)
 
+    def along_robots(self, x_E: jax.Array) -> jax.Array:
+        """One value per robot, shaped to broadcast against this parameter, which has an embodiment axis."""
+        return x_E.reshape([-1 if axis == self.embodiment_axis else 1 for axis in range(len(self.shape))])
+
 
 def param(
     shape: tuple[int, ...],

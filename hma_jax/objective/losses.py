@@ -6,7 +6,7 @@ continuous ones cost what diffusion costs (equation 3).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +35,23 @@ class TargetCounts(NamedTuple):
 
     tokens: jax.Array
     actions: jax.Array
+
+
+def loss_metrics(sums: LossSums, counts: TargetCounts, masking: MaskingConfig, discrete: bool) -> dict[str, Any]:
+    """Means over the targets by name: `loss` of everything, `accuracy` of `discrete` tokens, `action_loss`."""
+    metrics = {"loss": sums.tokens / counts.tokens}
+    if masking.predicts_frames and discrete:
+        metrics["accuracy"] = sums.correct / counts.tokens
+    if masking.predicts_actions:
+        metrics["action_loss"] = sums.actions / counts.actions
+        metrics["loss"] += masking.action_loss_weight * metrics["action_loss"]
+    return metrics
+
+
+def noise_keys(key: jax.Array, rows: int) -> jax.Array:
+    """Keys [B] of the diffusion noise of a batch whose masks are drawn with `key`."""
+    noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
+    return jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(rows))
 
 
 def count_targets(masked: Masked) -> TargetCounts:

@@ -17,12 +17,6 @@ def update_average(ema: Params, params: Params, specs: Params, presence: Presenc
     """
 
     def update(spec: ParamSpec, old: jax.Array, new: jax.Array) -> jax.Array:
-        if spec.embodiment_axis is None:
-            present = presence.shared[spec.use]
-        else:
-            shape = [1] * new.ndim
-            shape[spec.embodiment_axis] = -1
-            present = presence.robots[spec.use].reshape(shape)
-        return jnp.where(present, decay * old + (1 - decay) * new, old)
+        return jnp.where(presence.of(spec), decay * old + (1 - decay) * new, old)
 
     return jax.tree.map(update, specs, ema, params, is_leaf=is_spec)

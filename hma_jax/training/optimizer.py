@@ -26,6 +26,10 @@ class Presence(NamedTuple):
     shared: dict[Use, jax.Array]  # bool []
     robots: dict[Use, jax.Array]  # bool [E]
 
+    def of(self, spec: ParamSpec) -> jax.Array:
+        """Whether the step concerns a parameter: bool, and for robots' own parameters each robot's slice."""
+        return _own(spec, self.shared, self.robots)
+
 
 class AdamState(NamedTuple):
     """Moments like the parameters, and how often each was updated, for bias correction."""
@@ -92,20 +96,14 @@ def apply_adamw(
     b1, b2 = config.beta1, config.beta2
 
     def update(p, g, m, v, spec: ParamSpec, multiplier: float):
-        if spec.embodiment_axis is None:
-            steps, present = count[spec.use], presence.shared[spec.use]
-        else:
-            shape = [1] * p.ndim
-            shape[spec.embodiment_axis] = -1
-            steps, present = (x[spec.use].reshape(shape) for x in (count_E, presence.robots))
         # The count may be 0 before a first example; its (unused) correction must stay finite.
-        steps = jnp.maximum(steps, 1).astype(jnp.float32)
+        steps = jnp.maximum(_own(spec, count, count_E), 1).astype(jnp.float32)
         new_m = b1 * m + (1 - b1) * g
         new_v = b2 * v + (1 - b2) * jnp.square(g)
         adam = new_m / (1 - b1**steps) / (jnp.sqrt(new_v / (1 - b2**steps)) + config.epsilon)
         decay = config.weight_decay * p if spec.decay else 0.0
         new_p = p - learning_rate * (multiplier * adam + decay)
-        return tuple(jnp.where(present, new, old) for new, old in ((new_p, p), (new_m, m), (new_v, v)))
+        return tuple(jnp.where(presence.of(spec), new, old) for new, old in ((new_p, p), (new_m, m), (new_v, v)))
 
     leaves, treedef = jax.tree.flatten(params)
     others = [jax.tree.leaves(tree) for tree in (grads, state.first, state.second)]
@@ -133,13 +131,14 @@ def keep_own(grads: Params, specs: Params, trained_E: jax.Array) -> Params:
     """Gradients of the `trained_E` robots' own parameters; zero for everything else."""
 
     def keep(g: jax.Array, spec: ParamSpec) -> jax.Array:
-        if spec.embodiment_axis is None:
-            return jnp.zeros_like(g)
-        shape = [1] * g.ndim
-        shape[spec.embodiment_axis] = -1
-        return g * trained_E.reshape(shape)
+        return jnp.zeros_like(g) if spec.embodiment_axis is None else g * spec.along_robots(trained_E)
 
     return jax.tree.map(keep, grads, specs)
+
+
+def _own(spec: ParamSpec, shared: dict[Use, jax.Array], robots_E: dict[Use, jax.Array]) -> jax.Array:
+    """A parameter's entry of two tables by use: of what all robots share, and of each robot's own."""
+    return shared[spec.use] if spec.embodiment_axis is None else spec.along_robots(robots_E[spec.use])
 
 
 def clip_by_global_norm(grads: Params, limit: float) -> tuple[Params, jax.Array]:

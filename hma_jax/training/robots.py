@@ -39,7 +39,7 @@ def take(tree: Params, specs: Params, active: Active) -> Params:
     def slices(spec: ParamSpec, x: jax.Array) -> jax.Array:
         if _whole(spec, active):
             return x
-        return jnp.take(x, active.robots_G, axis=spec.embodiment_axis, indices_are_sorted=False)
+        return jnp.take(x, active.robots_G, axis=spec.embodiment_axis)
 
     return jax.tree.map(slices, specs, tree, is_leaf=is_spec)
 

@@ -13,7 +13,14 @@ from einops import rearrange
 from hma_jax.config import ModelConfig, TrainConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Use, is_spec
-from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, masked_loss
+from hma_jax.objective.losses import (
+    LossSums,
+    TargetCounts,
+    count_targets,
+    loss_metrics,
+    masked_loss,
+    noise_keys,
+)
 from hma_jax.objective.masking import Masked, mask_batch
 from hma_jax.training import robots
 from hma_jax.training.average import update_average
@@ -101,12 +108,10 @@ def make_train_step(
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table)
-        noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
-        keys = jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(config.batch))
         counts = count_targets(masked)
         active = robots.choose(batch["embodiment"], table.size)
         own = robots.take(state.params, specs, active)
-        rows = batch | {"masked": masked, "key": keys, "slice": active.slice_B}
+        rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.slice_B}
         grads, total = accumulated(own, rows, counts)
         if config.only:
             grads = keep_own(grads, specs, jnp.asarray(trained_E)[active.robots_G])
@@ -123,12 +128,7 @@ def make_train_step(
         if config.ema_decay:
             average = update_average(robots.take(state.ema, specs, active), new, specs, here, config.ema_decay)
             ema = robots.put(state.ema, average, specs, active)
-        metrics = {"loss": total.tokens / counts.tokens}
-        if masking.predicts_frames and not model.diffusion:
-            metrics["accuracy"] = total.correct / counts.tokens
-        if masking.predicts_actions:
-            metrics["action_loss"] = total.actions / counts.actions
-            metrics["loss"] += masking.action_loss_weight * metrics["action_loss"]
+        metrics = loss_metrics(total, counts, masking, discrete=not model.diffusion)
         metrics |= {"grad_norm": norm, "learning_rate": rate}
         metrics |= {FINITE + "gradient": jnp.isfinite(norm), FINITE + "update": all_finite(new)}
         return TrainState(state.step + 1, params, opt_state, ema), metrics

@@ -13,7 +13,13 @@ import numpy as np
 from hma_jax.config import MaskingConfig, ModelConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Params
-from hma_jax.objective.losses import LossSums, TargetCounts, masked_loss
+from hma_jax.objective.losses import (
+    LossSums,
+    TargetCounts,
+    loss_metrics,
+    masked_loss,
+    noise_keys,
+)
 from hma_jax.objective.masking import mask_batch
 from hma_jax.training.loop import Watch
 from hma_jax.training.state import TrainState
@@ -52,7 +58,8 @@ def make_watch(
     def mean(params: Params) -> dict[str, float]:
         rows = [compute(params, put_batch(batch), np.int32(n)) for n, batch in enumerate(held)]
         sums, counts = jax.tree.map(lambda *x: float(sum(x)), *jax.device_get(rows))
-        return _combine(sums, counts, model, masking)
+        counts = TargetCounts(*(max(n, 1) for n in counts))
+        return loss_metrics(sums, counts, masking, discrete=not model.diffusion)
 
     def measure(state: TrainState) -> dict[str, float]:
         if not held:
@@ -79,26 +86,13 @@ def make_sums(
             targets_TS=masked.targets_TS & valid_B[:, None, None],
             action_targets_T=masked.action_targets_T & valid_B[:, None],
         )
-        noise_key = jax.random.fold_in(key, 2**31 - 1)  # not one of the rows' own
-        keys = jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(len(valid_B)))
+        keys = noise_keys(key, len(valid_B))
         found = masked_loss(
             declared.merge(params), masked, batch["tokens"], batch["actions"], batch["embodiment"], masking, keys
         )
         return found, TargetCounts(jnp.sum(masked.targets_TS), jnp.sum(masked.action_targets_T))
 
     return sums
-
-
-def _combine(sums: LossSums, counts: TargetCounts, model: ModelConfig, masking: MaskingConfig) -> dict[str, float]:
-    """Means over all targets; a mean over none is 0."""
-    tokens, actions = max(counts.tokens, 1), max(counts.actions, 1)
-    values = {"loss": sums.tokens / tokens}
-    if masking.predicts_frames and not model.diffusion:
-        values["accuracy"] = sums.correct / tokens
-    if masking.predicts_actions:
-        values["action_loss"] = sums.actions / actions
-        values["loss"] += masking.action_loss_weight * values["action_loss"]
-    return values
 
 
 def _with_valid(batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

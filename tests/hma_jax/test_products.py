@@ -1,0 +1,53 @@
+"""Counting a program's matrix products."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import ExecutionConfig
+from hma_jax.diagnostics.products import Product, count_products, total_flops
+from hma_jax.model.flops import train_flops_per_window
+from hma_jax.model.hma import declare_model
+from hma_jax.training.state import init_state
+from hma_jax.training.step import make_train_step
+from tests.tiny import TABLE, model_config, random_batch, train_config
+
+A, B = jnp.zeros((2, 3, 5)), jnp.zeros((2, 5, 7))
+BATCHED = Product((2, 3, 5), (2, 5, 7), ((2,), (1,)), ((0,), (0,)), "float32")
+
+
+def test_a_product_knows_its_size():
+    assert BATCHED.matrices == (2, 3, 5, 7)
+    assert BATCHED.flops == 2 * 2 * 3 * 5 * 7
+    np.testing.assert_array_equal(BATCHED(A + 1, B + 1), jnp.full((2, 3, 7), 5.0))
+
+
+def test_loops_count_as_often_as_they_run_and_conditions_by_their_dearest_branch():
+    def loop(a, b):
+        def body(carry, _):
+            return carry + jnp.sum(a @ b), None
+
+        return jax.lax.scan(body, 0.0, None, length=4)[0]
+
+    def choice(a, b, yes):
+        return jax.lax.cond(yes, lambda: a @ b, lambda: jnp.zeros((2, 3, 7)))
+
+    assert count_products(loop, A, B) == {BATCHED: 4}
+    assert count_products(jax.jit(choice), A, B, True) == {BATCHED: 1}
+
+
+def test_what_nothing_needs_is_not_counted():
+    assert not count_products(lambda a, b: (a @ b, a)[1], A, B)
+
+
+def test_a_training_step_has_the_products_that_the_formula_counts():
+    model = model_config(width=128, tokens=256, action_tokens=64, frames=12, factor_vocab=512)
+    train = train_config(batch=1)
+    declared = declare_model(model, TABLE, ExecutionConfig(remat="none"))
+    step = make_train_step(declared, TABLE, model, train)
+    state = jax.eval_shape(lambda: init_state(declared, TABLE, 0))
+    found = total_flops(count_products(step, state, random_batch(0, model, 1)))
+    # More than the formula: weights of attention within frames, always computed again. Less: frame 0 is not read out.
+    assert 1.0 < found / train_flops_per_window(model, TABLE) < 1.1
