@@ -51,7 +51,7 @@ def _forward(qkv: jax.Array, scale: float) -> tuple[jax.Array, tuple[jax.Array, 
 def _backward(scale: float, saved: tuple[jax.Array, ...], dy: jax.Array) -> tuple[jax.Array]:
     qkv, y, log_sum = saved
     # The mean of a row of dweights under its weights: dy.y.
-    delta = jnp.einsum("btphi,btphi->bthp", dy, y, preferred_element_type=jnp.float32)
+    delta = jnp.swapaxes(sum_over(dy.astype(jnp.float32) * y.astype(jnp.float32), -1)[..., 0], -1, -2)
     flat = (qkv, dy, delta)
     frames, dy, delta = (x.reshape(-1, *x.shape[2:]) for x in flat)
     dqkv = jax.lax.map(partial(_in_chains, partial(_attend_backward, scale)), (frames, dy, log_sum, delta))
