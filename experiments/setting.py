@@ -52,7 +52,7 @@ class Where:
 
     def anywhere(self) -> Where:
         """The same, meant in the same way from any working directory."""
-        from data_pipelines.rlds.location import absolute
+        from data_pipelines.sources.rlds.location import absolute
 
         def whole(path: Path | None) -> Path | None:
             return path and path.absolute()
@@ -150,7 +150,7 @@ def use_entries(registry: Path | None) -> None:
 
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:
     """`<root>/<name>` for every name, in the first root that has it. ConfigError for those missing."""
-    from data_pipelines.rlds.location import locate
+    from data_pipelines.sources.rlds.location import locate
 
     found = {n: locate(r) / n for r in reversed(roots) for n in names if (locate(r) / n).is_dir()}
     missing = [n for n in names if n not in found]

@@ -32,7 +32,7 @@ from data_pipelines.convert.settings import Ego4dSettings
 from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
-from data_pipelines.rlds.writer import encode_jpeg
+from data_pipelines.sources.rlds.writer import encode_jpeg
 from hma_jax.config.json import to_dict
 
 NAME = "ego4d"

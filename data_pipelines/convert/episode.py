@@ -17,8 +17,8 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.rlds.example import encode_example
-from data_pipelines.rlds.writer import STEP_FIELDS, TEXT, Field, step_features, vector_field
+from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.writer import STEP_FIELDS, TEXT, Field, step_features, vector_field
 from hma_jax.config import ConfigError
 
 

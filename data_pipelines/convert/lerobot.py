@@ -21,7 +21,7 @@ from data_pipelines.convert.lerobot_meta import EpisodeEntry, read_meta, read_ta
 from data_pipelines.convert.settings import LeRobotSettings
 from data_pipelines.convert.video import ADVICE, open_video, shrink, stored_jpeg
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 
 SUCCESS, REWARD = "next.success", "next.reward"
 

@@ -23,7 +23,7 @@ from data_pipelines.convert.episode import Episode, Layout, UnitError, choose, r
 from data_pipelines.convert.settings import RobomimicSettings
 from data_pipelines.convert.video import shrink
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from hma_jax.config import ConfigError
 
 CONTROL_RATE = 20.0

@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.convert.episode import UnitError, require_module
-from data_pipelines.rlds.images import decode_image
-from data_pipelines.rlds.writer import encode_jpeg
+from data_pipelines.sources.rlds.images import decode_image
+from data_pipelines.sources.rlds.writer import encode_jpeg
 
 ADVICE = "Fetch the file again, or leave it out with --skip-damaged."
 

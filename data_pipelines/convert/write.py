@@ -21,8 +21,8 @@ from pathlib import Path
 from data_pipelines.convert.episode import Conversion, LeftOut, Source, UnitError, encode
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.rlds.tfrecord import write_shard
-from data_pipelines.rlds.writer import VERSION, build_features, shard_name, write_info
+from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 

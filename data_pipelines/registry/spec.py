@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from data_pipelines.rlds.schema import field_slice
+from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import require
 
 FRAME_RATE = 2.0

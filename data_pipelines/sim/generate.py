@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import BinaryIO
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.writer import VERSION
 from data_pipelines.sim.embodiments import select
 from data_pipelines.sim.packages import require_packages
 from data_pipelines.sim.spec import SimSpec
 from data_pipelines.sim.worker import Job, record_path
 from data_pipelines.sim.write import write_dataset
+from data_pipelines.sources.rlds.writer import VERSION
 from data_pipelines.suite.generate import is_complete
 from hma_jax.config import ConfigError, require
 

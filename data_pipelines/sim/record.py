@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.rlds import writer as rlds_writer
-from data_pipelines.rlds.example import encode_example
-from data_pipelines.rlds.writer import (
+from data_pipelines.sim.episode import Episode
+from data_pipelines.sim.spec import SimSpec
+from data_pipelines.sources.rlds import writer as rlds_writer
+from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.writer import (
     STEP_FIELDS,
     TEXT,
     Field,
@@ -17,8 +19,6 @@ from data_pipelines.rlds.writer import (
     step_features,
     vector_field,
 )
-from data_pipelines.sim.episode import Episode
-from data_pipelines.sim.spec import SimSpec
 
 IMAGE_KEY = "image"
 START_KEY = "episode_metadata/start"

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.rlds.dataset import RldsDataset
 from data_pipelines.sim.embodiments import get_embodiment
 from data_pipelines.sim.episode import Replay, StartState, replay_episode
 from data_pipelines.sim.packages import prepare_process, require_packages
 from data_pipelines.sim.record import START_KEY
+from data_pipelines.sources.rlds.dataset import RldsDataset
 
 
 def read_start(dataset: RldsDataset, episode: int) -> StartState:

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from data_pipelines.registry import get_spec
-from data_pipelines.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 
 COLUMNS = 8
 GAP = 4  # pixels

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.rlds.tfrecord import write_shard
-from data_pipelines.rlds.writer import VERSION, shard_name, write_info
 from data_pipelines.sim.record import build_features
 from data_pipelines.sim.spec import SimSpec
 from data_pipelines.sim.worker import facts_path, record_path
+from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.writer import VERSION, shard_name, write_info
 from data_pipelines.suite.write import SHARD_FRAMES
 
 STATS = "stats.json"

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-from data_pipelines.rlds.writer import VERSION
+from data_pipelines.sources.rlds.writer import VERSION
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import write_dataset

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.rlds import writer as rlds_writer
-from data_pipelines.rlds.example import encode_example
-from data_pipelines.rlds.tfrecord import write_shard
-from data_pipelines.rlds.writer import (
+from data_pipelines.sources.rlds import writer as rlds_writer
+from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.writer import (
     STEP_FIELDS,
     TEXT,
     Field,

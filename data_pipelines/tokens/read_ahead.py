@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.rlds.dataset import OpenEpisode
+from data_pipelines.sources.rlds.dataset import OpenEpisode
 
 AHEAD = 128 * 2**20
 """Bytes of frames that are decoded, or wait for it, ahead of their use."""

@@ -11,8 +11,8 @@ from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
-    from data_pipelines.rlds.dataset import RldsDataset
-    from data_pipelines.rlds.location import Location
+    from data_pipelines.sources.rlds.dataset import RldsDataset
+    from data_pipelines.sources.rlds.location import Location
 
 Source = tuple["DatasetSpec", "Location"]
 """A dataset: how it is read, and its RLDS directory."""
@@ -20,7 +20,7 @@ Source = tuple["DatasetSpec", "Location"]
 
 def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
     """The names that RLDS directories give themselves. Raises DataError for one that is none."""
-    from data_pipelines.rlds.schema import dataset_name
+    from data_pipelines.sources.rlds.schema import dataset_name
 
     return tuple(map(dataset_name, data))
 
@@ -28,7 +28,7 @@ def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     """User directories with their registry entries. Raises ConfigError for unknown names."""
     from data_pipelines.registry import get_spec
-    from data_pipelines.rlds.location import locate
+    from data_pipelines.sources.rlds.location import locate
 
     named = dict(zip(name_datasets(data), map(locate, data), strict=True))
     missing = [n for n in study.dataset_names() if n not in named]
@@ -48,7 +48,7 @@ def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
 
 def open_source(source: Source, settings: StoreConfig) -> RldsDataset:
     """Indexes a dataset's shards. Raises DataError for damage that `settings` do not allow."""
-    from data_pipelines.rlds.dataset import RldsDataset
+    from data_pipelines.sources.rlds.dataset import RldsDataset
 
     spec, path = source
     return RldsDataset(path, spec.split, corrupt=settings.corrupt, max_skipped=settings.max_skipped)

@@ -34,7 +34,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     an earlier version of the simulator stay in use, which is said.
     """
     from data_pipelines.registry import get_spec
-    from data_pipelines.rlds.writer import VERSION
+    from data_pipelines.sources.rlds.writer import VERSION
     from data_pipelines.suite.generate import generate_suite
 
     names = study.dataset_names()

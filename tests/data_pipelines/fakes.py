@@ -16,8 +16,8 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.rlds.example import encode_example
-from data_pipelines.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
 
 REAL_DATA = Path(__file__).parent / "data" / "bridge_dataset"

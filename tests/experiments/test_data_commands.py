@@ -49,7 +49,7 @@ def test_a_conversion_says_what_it_wrote_the_entry_and_what_is_next(tmp_path, ca
 
 def test_the_entry_can_be_pasted_and_reads_the_dataset(tmp_path, capsys):
     from data_pipelines.registry import DatasetSpec
-    from data_pipelines.rlds.dataset import RldsDataset
+    from data_pipelines.sources.rlds.dataset import RldsDataset
 
     root = write_lerobot(tmp_path / "My Robot", "v3.0")
     assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0

@@ -12,7 +12,7 @@ import numpy as np
 import simplejpeg
 from PIL import Image
 
-from data_pipelines.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 
 HEIGHT, WIDTH = 36, 64
 
@@ -63,7 +63,7 @@ def read_back(directory: Path, image_key: str):
     episodes = [dataset.episode(i, image_key, ["action"]) for i in range(len(dataset))]
     builder = tfds.builder_from_directory(str(directory))
     assert builder.info.splits["train"].num_examples == len(dataset)
-    from data_pipelines.rlds.tfrecord import read_record
+    from data_pipelines.sources.rlds.tfrecord import read_record
 
     path, offset, length = dataset._place(0)
     steps = list(builder.info.features.deserialize_example_np(read_record(path, offset, length))["steps"])

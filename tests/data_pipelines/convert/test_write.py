@@ -11,7 +11,7 @@ import pytest
 from data_pipelines.convert.episode import Episode, Layout, LeftOut, UnitError, require_module
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import contents, number, picture, read_back
 

@@ -16,7 +16,7 @@ from data_pipelines.registry import (
 )
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import load_entries, to_toml
-from data_pipelines.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from hma_jax.config import ConfigError
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable

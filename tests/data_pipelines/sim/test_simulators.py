@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
-from data_pipelines.rlds.dataset import RldsDataset
 from data_pipelines.sim import EMBODIMENTS, generate_sim, select
 from data_pipelines.sim.packages import missing_packages
+from data_pipelines.sources.rlds.dataset import RldsDataset
 
 pytestmark = [
     pytest.mark.slow,
@@ -31,10 +31,10 @@ EPISODES, SIZE = 2, 32
 REPLAY = """
 import json, sys
 import numpy as np
-from data_pipelines.rlds.images import decode_image
-from data_pipelines.rlds.dataset import RldsDataset
 from data_pipelines.sim import read_start, replay
-from data_pipelines.rlds.writer import encode_jpeg
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.images import decode_image
+from data_pipelines.sources.rlds.writer import encode_jpeg
 for name in sys.argv[2:]:
     dataset = RldsDataset(f"{sys.argv[1]}/{name}")
     for i in range(len(dataset)):
@@ -133,7 +133,7 @@ def test_an_episode_does_not_depend_on_those_before_it(made, tmp_path):
     job = {"name": "dmc_reacher", "episodes": [1], "seed": 0, "size": SIZE, "directory": str(staged)}
     staged.mkdir()
     subprocess.run([*command, json.dumps(job)], check=True, capture_output=True)
-    from data_pipelines.rlds.tfrecord import index_shard, read_record
+    from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 
     shard = index_shard(next((made / "dmc_reacher").rglob("*.tfrecord-*")))
     whole = read_record(shard.path, shard.offsets[1], shard.lengths[1])
@@ -158,7 +158,7 @@ def test_recorded_actions_give_the_recorded_episode_and_others_another(made):
 
 def test_actions_of_another_robot_are_refused(made):
     code = (
-        "from data_pipelines.rlds.dataset import RldsDataset\nfrom data_pipelines.sim import read_start, replay\n"
+        "from data_pipelines.sources.rlds.dataset import RldsDataset\nfrom data_pipelines.sim import read_start, replay\n"
         f"start = read_start(RldsDataset({str(made / 'pusht')!r}), 0)\nreplay('pusht', start, [[0.0] * 7])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

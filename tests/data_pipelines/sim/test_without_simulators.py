@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.dataset import RldsDataset
 from data_pipelines.sim import generate, packages, read_start, select
 from data_pipelines.sim.episode import StartState
 from data_pipelines.sim.record import encode_episode
 from data_pipelines.sim.stats import stats_table
 from data_pipelines.sim.worker import Job, episode_seed
 from data_pipelines.sim.write import write_dataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.sim.fakes import EPISODES, SIZE, SPEC, fake_workers, make_episode, write_episode
 
@@ -47,7 +47,7 @@ def test_what_was_simulated_is_read_back(home):
 def test_tfds_decodes_the_records(home):
     import tensorflow_datasets as tfds
 
-    from data_pipelines.rlds.tfrecord import index_shard, read_record
+    from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 
     features = tfds.builder_from_directory(str(home / "pusht" / "1.0.0")).info.features
     shard = index_shard(next((home / "pusht" / "1.0.0").glob("*.tfrecord-*")))
@@ -61,7 +61,7 @@ def test_tfds_decodes_the_records(home):
 
 
 def test_robots_without_a_success_signal_claim_none():
-    from data_pipelines.rlds.example import parse_example
+    from data_pipelines.sources.rlds.example import parse_example
 
     (quiet,) = select(["dmc_reacher"])
     assert "episode_metadata/success" not in parse_example(encode_episode(quiet, make_episode(1), 0))

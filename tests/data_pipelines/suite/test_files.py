@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from data_pipelines.rlds.tfrecord import index_shard, read_record
+from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 from data_pipelines.suite import generate
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
@@ -74,7 +74,7 @@ def test_tfds_decodes_exactly_what_was_simulated(suite, name):
 
 
 def test_images_are_jpegs_without_chroma_subsampling(suite):
-    from data_pipelines.rlds.example import parse_example
+    from data_pipelines.sources.rlds.example import parse_example
 
     shard = index_shard(next((suite / NAMES[0]).rglob("*.tfrecord-*")))
     record = parse_example(read_record(shard.path, shard.offsets[0], shard.lengths[0]))

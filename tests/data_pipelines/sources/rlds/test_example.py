@@ -5,8 +5,8 @@ import pytest
 import tensorflow_datasets as tfds
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.example import encode_example, parse_example
-from data_pipelines.rlds.tfrecord import index_shard, read_record
+from data_pipelines.sources.rlds.example import encode_example, parse_example
+from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 from tests.data_pipelines.fakes import REAL_DATA
 
 

@@ -25,10 +25,10 @@ import google_crc32c
 import numpy as np
 
 from data_pipelines.errors import CorruptRecordError
-from data_pipelines.rlds.location import DiskFile, Ranges, is_remote, locate, open_ranges
+from data_pipelines.sources.rlds.location import DiskFile, Ranges, is_remote, locate, open_ranges
 
 if TYPE_CHECKING:
-    from data_pipelines.rlds.location import Location
+    from data_pipelines.sources.rlds.location import Location
 
 HEADER = 12  # bytes: length and its checksum
 FOOTER = 4  # bytes: checksum of the payload

@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
-from data_pipelines.rlds.example import Feature, parse_example
-from data_pipelines.rlds.images import decode_image
-from data_pipelines.rlds.location import REMOTE_READS, OpenFiles, is_remote
-from data_pipelines.rlds.schema import closest, field_slice, listing, read_metadata, resolve_version, step_key
-from data_pipelines.rlds.tfrecord import ShardIndex, open_record, read_parts, scan_shard
+from data_pipelines.sources.rlds.example import Feature, parse_example
+from data_pipelines.sources.rlds.images import decode_image
+from data_pipelines.sources.rlds.location import REMOTE_READS, OpenFiles, is_remote
+from data_pipelines.sources.rlds.schema import closest, field_slice, listing, read_metadata, resolve_version, step_key
+from data_pipelines.sources.rlds.tfrecord import ShardIndex, open_record, read_parts, scan_shard
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
-    from data_pipelines.rlds.location import Location
+    from data_pipelines.sources.rlds.location import Location
 
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""

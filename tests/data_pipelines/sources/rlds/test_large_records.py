@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError
-from data_pipelines.rlds import tfrecord
-from data_pipelines.rlds.dataset import RldsDataset
-from data_pipelines.rlds.example import LazyBytes, encode_example, parse_example
-from data_pipelines.rlds.tfrecord import FileView
+from data_pipelines.sources.rlds import tfrecord
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.example import LazyBytes, encode_example, parse_example
+from data_pipelines.sources.rlds.tfrecord import FileView
 from data_pipelines.tokens import read_ahead
 from tests.data_pipelines.fakes import make_spec, png, write_rlds
 
@@ -116,7 +116,7 @@ def test_frames_under_way_are_bounded_in_bytes(tmp_path, monkeypatch):
 def test_memory_does_not_grow_with_records(tmp_path, records, size):
     """Peak memory of a process that tokenises, JAX and the tokenizer included; and its growth by
     frames that are under way, but not by whole records (480 MB for the larger ones)."""
-    command = [sys.executable, "-m", "tests.data_pipelines.rlds.memory", str(tmp_path), str(records), str(size)]
+    command = [sys.executable, "-m", "tests.data_pipelines.sources.rlds.memory", str(tmp_path), str(records), str(size)]
     shown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     peak, growth = (float(shown.split(word)[1].split()[0]) for word in ("peak", "growth"))
     assert 100 < peak < 1500 and growth < GROWTH, shown

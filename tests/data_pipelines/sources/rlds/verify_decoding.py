@@ -1,4 +1,4 @@
-"""python -m tests.data_pipelines.rlds.verify_decoding DIR...: our reading equals tfds's, feature by feature.
+"""python -m tests.data_pipelines.sources.rlds.verify_decoding DIR...: our reading equals tfds's, feature by feature.
 
 Each DIR is an RLDS dataset or a folder of some. Every feature of every record of every split is
 compared with tfds's decoder; where TensorFlow can be imported, also with TensorFlow's, images
@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.schema import resolve_version
-from tests.data_pipelines.rlds.decoding import Tally, compare_directory
+from data_pipelines.sources.rlds.schema import resolve_version
+from tests.data_pipelines.sources.rlds.decoding import Tally, compare_directory
 
 SHOWN = 5
 """Differences printed per dataset."""

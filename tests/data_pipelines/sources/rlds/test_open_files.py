@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.location import OpenFiles
+from data_pipelines.sources.rlds.location import OpenFiles
 from tests.data_pipelines.fakes import count_open
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
-from data_pipelines.rlds.dataset import RldsDataset
-from data_pipelines.rlds.tfrecord import index_shard
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.tfrecord import index_shard
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
 
@@ -212,7 +212,7 @@ def test_frames_of_a_verified_episode_are_read_alone(tmp_path, monkeypatch):
     dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6, 5]))
     first = dataset.frames(1, SPEC.image_key, lambda n: range(n))
     dataset = pickle.loads(pickle.dumps(dataset))
-    monkeypatch.setattr("data_pipelines.rlds.dataset.open_record", None)
+    monkeypatch.setattr("data_pipelines.sources.rlds.dataset.open_record", None)
     again = dataset.frames(1, SPEC.image_key, lambda n: [n - 1, 0])
     np.testing.assert_array_equal(again, [first[4], first[0]])
     with pytest.raises(TypeError):  # the other has to be opened

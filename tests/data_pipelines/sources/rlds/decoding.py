@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.rlds.example import parse_example
-from data_pipelines.rlds.images import JPEG_MAGIC, decode_image
-from data_pipelines.rlds.tfrecord import index_shard, read_record
+from data_pipelines.sources.rlds.example import parse_example
+from data_pipelines.sources.rlds.images import JPEG_MAGIC, decode_image
+from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 
 
 @dataclass

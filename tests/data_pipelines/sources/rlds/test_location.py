@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError, UnreachableError
-from data_pipelines.rlds import tfrecord
-from data_pipelines.rlds.dataset import RldsDataset
-from data_pipelines.rlds.location import absolute, is_remote, locate
-from data_pipelines.rlds.schema import dataset_name
-from data_pipelines.rlds.tfrecord import index_shard, open_record, scan_shard
+from data_pipelines.sources.rlds import tfrecord
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.location import absolute, is_remote, locate
+from data_pipelines.sources.rlds.schema import dataset_name
+from data_pipelines.sources.rlds.tfrecord import index_shard, open_record, scan_shard
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_pipelines.rlds.dataset import RldsDataset
-from data_pipelines.rlds.images import decode_image, fit_image
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.images import decode_image, fit_image
 from tests.data_pipelines.fakes import REAL_DATA, png
 
 

@@ -1,6 +1,6 @@
 """Peak memory while a shard of very large records is tokenised.
 
-`python -m tests.data_pipelines.rlds.memory DIRECTORY [RECORDS] [MB]` writes RECORDS records of about MB
+`python -m tests.data_pipelines.sources.rlds.memory DIRECTORY [RECORDS] [MB]` writes RECORDS records of about MB
 megabytes into DIRECTORY and tokenises them with a small real tokenizer in another process. A
 record holds 480 x 640 frames stored raw, as large as frames get; two thirds of its bytes are
 another camera and an embedding that nobody asks for. Default: 7 of 300 MB.
@@ -20,8 +20,8 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.rlds.example import encode_example
-from data_pipelines.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.tfrecord import write_shard
 
 BATCH = 256
 FRAME = 480 * 640 * 3

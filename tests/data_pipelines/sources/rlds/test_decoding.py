@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_pipelines.rlds import example
+from data_pipelines.sources.rlds import example
 from data_pipelines.suite import generate_suite
 from tests.data_pipelines.fakes import REAL_DATA
-from tests.data_pipelines.rlds import decoding
-from tests.data_pipelines.rlds.decoding import compare_directory
-from tests.data_pipelines.rlds.verify_decoding import main
+from tests.data_pipelines.sources.rlds import decoding
+from tests.data_pipelines.sources.rlds.decoding import compare_directory
+from tests.data_pipelines.sources.rlds.verify_decoding import main
 
 SUITE = ("two_link_arm_joint_targets", "omni_base_world_velocity")
 

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.rlds.location import is_remote, locate
+from data_pipelines.sources.rlds.location import is_remote, locate
 from hma_jax.config import require
 
 if TYPE_CHECKING:
-    from data_pipelines.rlds.location import Location
+    from data_pipelines.sources.rlds.location import Location
 
 METADATA = (".json", ".txt")
 """How the files end that tfds writes beside the shards."""

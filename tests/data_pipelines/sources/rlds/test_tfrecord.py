@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError
-from data_pipelines.rlds.tfrecord import HEADER, index_shard, read_record, scan_shard, write_shard
+from data_pipelines.sources.rlds.tfrecord import HEADER, index_shard, read_record, scan_shard, write_shard
 from tests.data_pipelines.fakes import REAL_DATA
 
 RECORDS = [b"first", b"", b"a longer third record" * 20]

@@ -20,7 +20,7 @@ import numpy as np
 from data_pipelines.errors import DataError
 
 if TYPE_CHECKING:
-    from data_pipelines.rlds.tfrecord import FileView
+    from data_pipelines.sources.rlds.tfrecord import FileView
 
 Feature = np.ndarray | Sequence[bytes]
 
