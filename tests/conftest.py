@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 CACHE = Path(__file__).parent.parent / ".jax_cache"
@@ -18,6 +21,9 @@ FAST_COMPILATION = (
     "--xla_cpu_parallel_codegen_split_count=1",  # the other core has tests of its own
 )
 os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
+if "HMA_CACHE_DIR" not in os.environ:  # not the user's
+    os.environ["HMA_CACHE_DIR"] = tempfile.mkdtemp(prefix="hma-cache-")
+    atexit.register(shutil.rmtree, os.environ["HMA_CACHE_DIR"], ignore_errors=True)
 
 
 def pytest_report_header() -> str:

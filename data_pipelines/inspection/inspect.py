@@ -141,7 +141,7 @@ def inspect_dataset(
     numbers = [key for key in numbers if source.features[step_key(key)].size <= WIDEST]
     rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
     steps, examples, bytes_read = [], [], 0
-    drawn = smallest_hashes(source.name, np.arange(len(source)), episodes, "inspect")
+    drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
     first = np.unique(np.linspace(0, len(drawn) - 1, shown).round().astype(int))  # those to look at
     for i in [*drawn[first], *np.delete(drawn, first)]:
         if bytes_read > max_bytes:

@@ -20,9 +20,10 @@ from data_pipelines.loading.mixture import make_mixture
 from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
 from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources.rlds.dataset import MAX_SKIPPED, RldsDataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
+from data_pipelines.sources.source import MAX_SKIPPED
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4
@@ -60,7 +61,7 @@ def make_frame_loader(
     for spec, directory in datasets:
         source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-        mask = held_out(spec.name, len(source), val_fraction, min_val, max_val)
+        mask = held_out(spec.name, source.ids, val_fraction, min_val, max_val)[source.numbers]
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):

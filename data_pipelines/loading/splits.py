@@ -2,7 +2,8 @@
 
 Neighbouring episodes of a robot dataset share a scene, a task or a day, so the first 5 %
 are no sample of it. A hash of (dataset, episode) is one, needs no file, and is the same for
-everybody who reads the dataset.
+everybody who reads the dataset. What is hashed is the episode's name (`sources.identity`), and what is
+divided is all episodes that there should be: which are damaged changes the place of no other.
 """
 
 from __future__ import annotations
@@ -13,18 +14,32 @@ from data_pipelines.loading.order import hash64, stream_seed
 
 
 def held_out(
-    dataset: str, episodes: int, fraction: float = 0.05, min_val: int = 2, max_val: int = 200
+    dataset: str, ids: np.ndarray, fraction: float = 0.05, min_val: int = 2, max_val: int = 200
 ) -> np.ndarray:
-    """bool [episodes], True for validation.
+    """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 
     Their number is `fraction` of all, at least `min_val`, at most `max_val` and never more
     than half of the dataset.
     DIFFERS: the release takes the first max(20, 5 %) episodes (reference section 5.1).
     """
-    count = min(max(round(fraction * episodes), min_val), max_val, episodes // 2)
-    mask = np.zeros(episodes, bool)
-    mask[smallest_hashes(dataset, np.arange(episodes), count, "held-out")] = True
+    count = min(max(round(fraction * len(ids)), min_val), max_val, len(ids) // 2)
+    mask = np.zeros(len(ids), bool)
+    mask[smallest_hashes(dataset, ids, count, "held-out")] = True
     return mask
+
+
+def subset(
+    dataset: str, ids: np.ndarray, members: np.ndarray, present: np.ndarray, count: int | None, salt: str
+) -> np.ndarray:
+    """Positions in `present`, ascending, of the episodes among the `count` that are drawn.
+
+    Drawn from `members` (bool per entry of `ids`), whether they are `present` (numbers of episodes) or lost:
+    a lost one leaves a gap, which no other fills.
+    """
+    numbers = np.flatnonzero(members)
+    drawn = np.zeros(len(ids), bool)
+    drawn[numbers[smallest_hashes(dataset, ids[numbers], count, salt)]] = True
+    return np.flatnonzero(drawn[present])
 
 
 def smallest_hashes(dataset: str, episodes: np.ndarray, count: int | None, salt: str) -> np.ndarray:

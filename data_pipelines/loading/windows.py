@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.splits import smallest_hashes
+from data_pipelines.loading.splits import held_out, smallest_hashes, subset
+from data_pipelines.sources.identity import episode_ids
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import Manifest
 from data_pipelines.tokens.store import TokenStore
@@ -123,8 +124,7 @@ def val_windows(store: TokenStore, name: str, frames: int) -> WindowSet:
 def _windows(manifest: Manifest, split: str, frames: int, limit: int | None, seed: int) -> WindowSet:
     require(frames >= 1, f"frames must be at least 1, got {frames}")
     facts, name = manifest.split(split), manifest.spec.name
-    source = np.asarray(facts.episodes, np.int64)
-    chosen = smallest_hashes(name, source, limit, f"subset/{seed}")
+    chosen = _chosen(manifest, split, limit, f"subset/{seed}")
     steps = np.asarray(facts.steps, np.int64)[chosen]
     counts = count_windows(steps, frames, manifest.stride, manifest.frame_step)
     usable = counts > 0
@@ -138,6 +138,16 @@ def _windows(manifest: Manifest, split: str, frames: int, limit: int | None, see
         needed=frames * manifest.stride,
         longest=int(steps.max()) if len(steps) else 0,
     )
+
+
+def _chosen(manifest: Manifest, split: str, limit: int | None, salt: str) -> np.ndarray:
+    """Positions in the store's split, ascending, of `limit` episodes drawn from all that it should have."""
+    present, settings = np.asarray(manifest.split(split).episodes, np.int64), manifest.settings
+    if not manifest.runs:  # a store that names episodes by their number
+        return smallest_hashes(manifest.spec.name, present, limit, salt)
+    ids = episode_ids(manifest.runs)
+    is_val = held_out(manifest.spec.name, ids, settings.val_fraction, settings.min_val, settings.max_val)
+    return subset(manifest.spec.name, ids, is_val == (split == "val"), present, limit, salt)
 
 
 def cut_frames(array: np.ndarray, start: int, frames: int, manifest: Manifest) -> np.ndarray:

@@ -23,7 +23,7 @@ HEADER = 10  # int32 entries; a multiple of the widest item's alignment
 class StoredEpisode:
     """One episode. Every array is a read-only view into the record's bytes."""
 
-    episode: int  # index in the source split
+    episode: int  # number in the source split, damaged ones counted
     success: bool | None
     tokens: np.ndarray  # uint16 or uint32 [F, S] or float16 [F, S, C], every frame_step-th native frame
     actions: np.ndarray  # float32 [N, A], native rate, raw units

@@ -10,11 +10,13 @@ import hashlib
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sources.identity import EpisodeRun
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.model.embodiments import Embodiment
@@ -65,7 +67,7 @@ class JobSettings:
 class SplitFacts:
     """The episodes of one split, in store order."""
 
-    episodes: tuple[int, ...] = ()  # index in the source
+    episodes: tuple[int, ...] = ()  # number in the source, damaged ones counted
     steps: tuple[int, ...] = ()  # native frames N
     content: str = ""  # hash over all records
     parts: tuple[int, ...] = ()  # episodes in each part; there is no file for 0
@@ -101,6 +103,7 @@ class Manifest:
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
     skipped: tuple[Loss, ...] = ()  # what was left out
+    runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
     format: int = FORMAT
 
     @property
@@ -141,11 +144,18 @@ class Manifest:
     def hash(self) -> str:
         lists = (getattr(self.split(s), name) for s in SPLITS for name in LISTS)
         digests = [hashlib.sha256(np.asarray(x, "<i8").tobytes()).hexdigest() for x in lists]
-        return stable_hash([self._without_lists(), digests])
+        return stable_hash([self._facts(), digests])
+
+    def _facts(self) -> dict[str, Any]:
+        """All but the long lists, as plain JSON."""
+        values = to_dict(self._without_lists())
+        if not self.runs:  # of a store made before there were any, whose hash stays what it was
+            del values["runs"]
+        return values
 
     def to_text(self) -> str:
         """Deterministic JSON, long lists on one line."""
-        values = to_dict(self._without_lists())
+        values = self._facts()
         for split in SPLITS:
             values[split] |= {name: getattr(self.split(split), name) for name in LISTS}
         lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.sources.rlds.dataset import OpenEpisode
+from data_pipelines.sources.source import Fetched, OpenEpisode
 
 AHEAD = 128 * 2**20
 """Bytes of frames that are decoded, or wait for it, ahead of their use."""
@@ -183,10 +183,11 @@ class _Reader:
             episode = opening.result()[1]
             self._out.put(Begin(index, episode.actions, episode.success))
             for step in range(0, episode.steps, self._step):
-                encoded = episode.encoded(step)
-                cost = max(len(encoded), self._frame_bytes)
+                fetched = episode.fetch(step)
+                held = len(fetched) if isinstance(fetched, bytes) else fetched.nbytes
+                cost = max(held, self._frame_bytes)
                 self._budget.take(cost)
-                decoding = self._decoders.submit(self._decode, episode, step, encoded)
+                decoding = self._decoders.submit(self._decode, episode, step, fetched)
                 self._out.put((decoding, cost))
             self._out.put(End(index))
         except EpisodeError as error:
@@ -194,5 +195,5 @@ class _Reader:
         finally:
             self._leave(opening)
 
-    def _decode(self, episode: OpenEpisode, step: int, encoded: bytes) -> np.ndarray:
-        return self._fit(episode.decode(step, encoded))
+    def _decode(self, episode: OpenEpisode, step: int, fetched: Fetched) -> np.ndarray:
+        return self._fit(episode.decode(step, fetched))

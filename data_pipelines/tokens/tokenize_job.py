@@ -24,8 +24,9 @@ import numpy as np
 from data_pipelines.errors import EpisodeError
 from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources.rlds.dataset import MAX_SKIPPED, RldsDataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.source import MAX_SKIPPED
 from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
@@ -83,7 +84,7 @@ def tokenize_dataset(
         Loss(reason.replace(f"{source.directory}/", ""), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
-    return write_dataset(
+    manifest = write_dataset(
         store_root,
         plan,
         cut_parts(source.sizes(), part_size, MOST_PARTS),
@@ -94,6 +95,8 @@ def tokenize_dataset(
         overwrite=overwrite,
         progress=progress,
     )
+    source.remember()
+    return manifest
 
 
 def plan_dataset(
@@ -123,6 +126,7 @@ def plan_dataset(
         action_std=(),
         train=SplitFacts(),
         val=SplitFacts(),
+        runs=source.runs,
     )
 
 
@@ -165,7 +169,9 @@ class _Work:
         self._source, self._plan, self._threads = source, plan, threads
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
-        self._is_val = held_out(plan.spec.name, len(source), s.val_fraction, s.min_val, s.max_val)
+        self._numbers = source.numbers
+        is_val = held_out(plan.spec.name, source.ids, s.val_fraction, s.min_val, s.max_val)
+        self._is_val = is_val[self._numbers]
 
     def make(self, part: Part) -> Iterator[Made]:
         """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""
@@ -214,7 +220,7 @@ class _Work:
             frames = np.stack(episode.frames) if episode.keep else None
             episode.frames.clear()
             yield self._split(begin.index), StoredEpisode(
-                begin.index, begin.success, tokens.astype(self._dtype), begin.actions, frames
+                int(self._numbers[begin.index]), begin.success, tokens.astype(self._dtype), begin.actions, frames
             )
 
     def _lose(self, error: EpisodeError) -> Loss:

@@ -86,7 +86,7 @@ def png(image: np.ndarray) -> bytes:
 def make_features(episode: int, steps: int, dims: tuple[int, ...] = (3,)) -> dict:
     """The flat features of one episode."""
     frames = np.zeros((steps, 8, 8, 3), np.uint8)
-    frames[..., 0], frames[..., 1] = episode, np.arange(steps)[:, None, None]
+    frames[..., 0], frames[..., 1] = episode % 256, np.arange(steps)[:, None, None]
     actions = np.zeros((steps, sum(dims)), np.float32)
     actions[:, 0], actions[:, 1] = episode, np.arange(steps)
     columns = np.split(actions, np.cumsum(dims)[:-1], axis=1)

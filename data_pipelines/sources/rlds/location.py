@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import functools
 import os
+import random
+import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from data_pipelines.errors import DataError, UnreachableError
 from hma_jax.config import ConfigError
@@ -23,8 +25,13 @@ if TYPE_CHECKING:
 
     Location = Path | UPath
 
-REMOTE_READS = 16
-"""Requests to a remote store at a time where many places are looked up."""
+T = TypeVar("T")
+
+RETRY_WAITS = (0.1, 0.5, 2.0, 6.0)
+"""Seconds before a read that failed is tried again, each time by up to half more or less."""
+
+LASTING = (PermissionError, IsADirectoryError, NotADirectoryError)
+"""Failures that no waiting mends."""
 
 OPEN_FILES = 128
 """Files that `OpenFiles` holds by default: half of what the strictest system allows a process."""
@@ -39,7 +46,7 @@ class Ranges(Protocol):
     def read(self, offset: int, length: int) -> bytes:
         """Up to `length` bytes from `offset` on; fewer at the end of the file.
 
-        Raises OSError where a disk fails, UnreachableError where a remote store does.
+        Raises UnreachableError where the disk or the store fails again and again.
         """
         ...
 
@@ -83,14 +90,14 @@ def open_ranges(location: Location) -> Iterator[Ranges]:
         try:
             file = _RemoteFile(location)
         except FileNotFoundError:
-            raise _missing(location) from None
+            raise missing(location) from None
         yield file
         return
-    fd = _descriptor(location)
+    file = DiskFile(location)
     try:
-        yield DiskFile(fd)
+        yield file
     finally:
-        os.close(fd)
+        file.close()
 
 
 class OpenFiles:
@@ -102,7 +109,7 @@ class OpenFiles:
 
     def __init__(self, limit: int = OPEN_FILES):
         self._limit = limit
-        self._open = functools.lru_cache(limit)(_held)
+        self._open = functools.lru_cache(limit)(DiskFile)
 
     def __reduce__(self):
         return type(self), (self._limit,)
@@ -112,8 +119,8 @@ class OpenFiles:
         return self._open(path)
 
 
-class DiskFile:
-    """An open file descriptor as ranges."""
+class Descriptor:
+    """An open file descriptor of somebody else as ranges."""
 
     def __init__(self, fd: int):
         self._fd = fd
@@ -126,24 +133,76 @@ class DiskFile:
         return os.pread(self._fd, length, offset)
 
 
-def _held(path: Path) -> DiskFile:
-    """An open file that is closed when nobody refers to it any more."""
-    fd = _descriptor(path)
-    file = DiskFile(fd)
-    weakref.finalize(file, os.close, fd).atexit = False  # threads may still read while a process ends
-    return file
+class DiskFile(Descriptor):
+    """A file of a disk, closed by `close` or when nobody refers to it any more.
+
+    A read that fails opens the file again and is tried again: that is how a network disk comes back
+    (ESTALE). Raises DataError if the file is missing or was replaced since it was opened.
+    """
+
+    def __init__(self, path: Path):
+        try:
+            super().__init__(retried(path, lambda: os.open(path, os.O_RDONLY)))
+        except FileNotFoundError:
+            raise missing(path) from None
+        self._path, self._mark = path, _mark(self._fd)
+        self._finalizer = weakref.finalize(self, os.close, self._fd)
+        self._finalizer.atexit = False  # threads may still read while a process ends
+
+    def close(self) -> None:
+        self._finalizer()
+
+    def read(self, offset: int, length: int) -> bytes:
+        try:
+            return os.pread(self._fd, length, offset)
+        except OSError:
+            pass
+        try:
+            return retried(self._path, lambda: self._read_anew(offset, length))
+        except FileNotFoundError:
+            raise missing(self._path) from None
+
+    def _read_anew(self, offset: int, length: int) -> bytes:
+        fd = os.open(self._path, os.O_RDONLY)
+        try:
+            if _mark(fd) != self._mark:
+                message = f"{self._path}: the file was replaced while it was read. Run the same command again."
+                raise DataError(message)
+            data = os.pread(fd, length, offset)
+            os.dup2(fd, self._fd, inheritable=False)  # for all threads, which know the descriptor by its number
+            return data
+        finally:
+            os.close(fd)
 
 
-def _descriptor(path: Path) -> int:
-    try:
-        return os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
-        raise _missing(path) from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be opened: {error.strerror}.") from error
+def _mark(fd: int) -> tuple[int, int]:
+    status = os.fstat(fd)
+    return status.st_size, status.st_mtime_ns
 
 
-def _missing(location: Location) -> DataError:
+def retried(location: Location, request: Callable[[], T]) -> T:
+    """The answer of `request`, asked again after each of RETRY_WAITS where a disk or a store fails.
+
+    A failed read is no damage of data: after the last try the job stops, and goes on when it is
+    repeated. Raises UnreachableError, naming `location`; FileNotFoundError and DataError at once.
+    """
+    for wait in (*RETRY_WAITS, None):
+        try:
+            return request()
+        except (FileNotFoundError, DataError):
+            raise
+        except Exception as error:  # every protocol of a remote store has exceptions of its own
+            if wait is None or isinstance(error, LASTING):
+                raise UnreachableError(
+                    f"{location}: cannot be read ({type(error).__name__}: {error}). Check the disk or the "
+                    "connection and the right to read, and run the same command again."
+                ) from error
+            time.sleep(wait * random.uniform(0.5, 1.5))
+    raise AssertionError("unreachable")
+
+
+def missing(location: Location) -> DataError:
+    """What a shard that is not there is told as."""
     return DataError(f"{location}: the shard is missing. Fetch it again, or check the path.")
 
 
@@ -152,23 +211,14 @@ class _RemoteFile:
 
     def __init__(self, location: UPath):
         self._location = location
-        self.size = int(self._ask(lambda: location.fs.size(location.path)))
+        self.size = int(retried(location, lambda: location.fs.size(location.path)))
 
     def read(self, offset: int, length: int) -> bytes:
         end = min(offset + length, self.size)
         if end <= offset:
             return b""
         place = self._location
-        return self._ask(lambda: place.fs.cat_file(place.path, offset, end))
-
-    def _ask(self, request):
-        """A store out of reach is no damage of the data: the job stops, and goes on when repeated."""
         try:
-            return request()
+            return retried(place, lambda: place.fs.cat_file(place.path, offset, end))
         except FileNotFoundError:
-            raise
-        except Exception as error:  # every protocol has exceptions of its own
-            raise UnreachableError(
-                f"{self._location}: cannot be read ({type(error).__name__}: {error}). "
-                "Check the connection and the right to read, and run the same command again."
-            ) from error
+            raise missing(place) from None

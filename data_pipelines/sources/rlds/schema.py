@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 METADATA = (".json", ".txt")
 """How the files end that tfds writes beside the shards."""
 
+FILE_FORMATS = ("tfrecord", "array_record")
+"""How records may lie in shards, as dataset_info.json says it."""
+
 
 @dataclass(frozen=True)
 class FlatFeature:
@@ -47,6 +50,7 @@ class SplitMetadata:
     features: dict[str, FlatFeature]
     shards: list[Location]
     shard_lengths: list[int]
+    file_format: str = "tfrecord"
 
 
 def resolve_version(directory: str | Location) -> Location:
@@ -99,8 +103,9 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
             f"{directory}: dataset_info.json or features.json is missing or damaged ({error}). "
             "Restore both as tfds wrote them."
         ) from error
-    if file_format != "tfrecord":
-        raise DataError(f"{directory}: fileFormat is {file_format!r}; only 'tfrecord' can be read.")
+    if file_format not in FILE_FORMATS:
+        known = " and ".join(FILE_FORMATS)
+        raise DataError(f"{directory}: fileFormat is {file_format!r}; only {known} can be read.")
     require(
         split in info.splits,
         f"{info.name}: no split {split!r} in {directory}; splits there: {listing(sorted(info.splits))}",
@@ -111,6 +116,7 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
         features=_flatten(info.features, ""),
         shards=[directory / Path(p).name for p in info.splits[split].filepaths],
         shard_lengths=list(info.splits[split].shard_lengths),
+        file_format=file_format,
     )
 
 

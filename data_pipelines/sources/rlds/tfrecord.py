@@ -25,7 +25,7 @@ import google_crc32c
 import numpy as np
 
 from data_pipelines.errors import CorruptRecordError
-from data_pipelines.sources.rlds.location import DiskFile, Ranges, is_remote, locate, open_ranges
+from data_pipelines.sources.rlds.location import Descriptor, Ranges, is_remote, locate, open_ranges
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -42,8 +42,11 @@ CHUNK = 4 * 2**20
 BLOCK = 4096
 """Bytes read at least: the few bytes asked for next are mostly among them."""
 
-SCAN_BLOCK = 65536
-"""The same for the scan of a remote shard, where a request costs more than its bytes."""
+SMALL, SCAN_BLOCK = 4096, 65536
+"""A scan reads through records of up to SMALL bytes in blocks of SCAN_BLOCK, and skips larger ones."""
+
+REMOTE_SMALL, REMOTE_BLOCK = 256 * 2**10, 4 * 2**20
+"""The same for a remote shard, where a request costs as much time as a megabyte."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ def index_shard(path: str | Location) -> ShardIndex:
 
     Raises CorruptRecordError where a header's checksum is wrong or the file ends inside a
     record; payload checksums are verified by `read_record`. A file of 0 bytes has 0 records.
+    Here as everywhere, UnreachableError says that a file cannot be read: no damage of its bytes.
     """
     index, damage = scan_shard(path)
     if damage is not None:
@@ -84,7 +88,8 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
     """`index_shard` that returns what it could index, and what stopped it.
 
     After a damaged header the place of the next record is unknown, so the rest of the file
-    is lost: records before it are indexed, nothing behind it. The scan holds one block.
+    is lost: records before it are indexed, nothing behind it. The scan holds one block: many
+    records where they are small, little more than a header where they are large.
     """
     path = locate(path)
     offsets: list[int] = []
@@ -93,7 +98,8 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
     damage = None
     with open_ranges(path) as file:
         size = file.size
-        view = FileView(file, 0, size, SCAN_BLOCK if is_remote(path) else FOOTER + HEADER)
+        small, block = (REMOTE_SMALL, REMOTE_BLOCK) if is_remote(path) else (SMALL, SCAN_BLOCK)
+        view = FileView(file, 0, size, SCAN_BLOCK if is_remote(path) else BLOCK)
         offset = 0
         header = view[:HEADER]
         while offset < size:
@@ -111,6 +117,7 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
                 reason = f"the file is truncated: the record needs bytes up to {end}, the file has {size}"
                 damage = CorruptRecordError(path, offset, reason)
                 break
+            view.block = block if length <= small else FOOTER + HEADER
             between = view[end - FOOTER : end + HEADER]  # this footer, the next header
             offsets.append(offset)
             lengths.append(length)
@@ -169,17 +176,18 @@ def open_record(path: str | Location, offset: int, length: int) -> Iterator[byte
         with tempfile.TemporaryFile() as copy:
             _verify(_stream(file, path, offset, length, copy), footer, path, offset)
             copy.flush()
-            yield FileView(DiskFile(copy.fileno()), 0, length)
+            yield FileView(Descriptor(copy.fileno()), 0, length)
 
 
 class FileView:
     """A part of an open file that is indexed and sliced like `bytes`, and read on demand.
 
-    Not safe in threads: it remembers the block it read last.
+    Not safe in threads: it remembers the block it read last. `block`: bytes read at least, which
+    may be changed between reads.
     """
 
     def __init__(self, file: Ranges, start: int, length: int, block: int = BLOCK):
-        self._file, self._start, self._length, self._size = file, start, length, block
+        self._file, self._start, self._length, self.block = file, start, length, block
         self._at, self._block = 0, b""
 
     def __len__(self) -> int:
@@ -197,19 +205,16 @@ class FileView:
     def _bytes(self, at: int, count: int) -> bytes:
         first = at - self._at
         if first < 0 or first + count > len(self._block):
-            if count >= self._size:
+            if count >= self.block:
                 return self._file.read(self._start + at, count)
-            self._block = self._file.read(self._start + at, min(self._size, self._length - at))
+            self._block = self._file.read(self._start + at, min(self.block, self._length - at))
             self._at, first = at, 0
         return self._block[first : first + count]
 
 
 def _read(file: Ranges, path: Location, record: int, at: int, length: int) -> bytes:
     """Exactly `length` bytes of the record that starts at byte `record`."""
-    try:
-        data = file.read(at, length)
-    except OSError as error:
-        raise CorruptRecordError(path, record, f"it cannot be read ({error.strerror})") from error
+    data = file.read(at, length)
     if len(data) < length:
         raise CorruptRecordError(path, record, "the file has become shorter since it was indexed")
     return data

@@ -41,7 +41,7 @@ def test_random_below_is_even():
 
 
 def test_held_out_depends_on_the_dataset_not_on_order():
-    a, b = held_out("arm", 100), held_out("base", 100)
+    a, b = held_out("arm", np.arange(100)), held_out("base", np.arange(100))
     assert a.sum() == b.sum() == 5
     assert (a != b).any()
     assert not a[:5].all()
@@ -51,7 +51,7 @@ def test_held_out_depends_on_the_dataset_not_on_order():
     "episodes, expected", [(1, 0), (2, 1), (3, 1), (4, 2), (25, 2), (100, 5), (10_000, 200)]
 )
 def test_held_out_number_is_bounded_and_leaves_half_for_training(episodes, expected):
-    assert held_out("arm", episodes).sum() == expected
+    assert held_out("arm", np.arange(episodes)).sum() == expected
 
 
 def test_subsets_are_nested():

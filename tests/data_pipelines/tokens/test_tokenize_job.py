@@ -8,6 +8,7 @@ import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.loading.splits import held_out
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.tokens.manifest import load_manifest
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
@@ -50,7 +51,7 @@ def test_every_episode_is_stored_once_with_its_own_frames_and_actions(tmp_path, 
                 assert (item.frames[:, 0, 0, 1] == np.arange(0, steps, 2)).all()
             seen.append(number)
     assert sorted(seen) == list(range(8))
-    assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", 8)))
+    assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", RldsDataset(rlds).ids)))
     assert files(tmp_path / "store" / "toy") == ["manifest.json", "parts", *FILES]
     assert files(tmp_path / "store") == ["toy"]
 

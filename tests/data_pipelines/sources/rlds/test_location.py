@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError, UnreachableError
-from data_pipelines.sources.rlds import tfrecord
+from data_pipelines.sources.rlds import location, tfrecord
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import absolute, is_remote, locate
 from data_pipelines.sources.rlds.schema import dataset_name
@@ -61,6 +61,7 @@ def test_index_of_a_remote_shard_reads_a_block_at_a_time(remote, monkeypatch):
     index = index_shard(shard)
     assert len(index) == 3 and len(asked) == 1  # small records share a request
     monkeypatch.setattr(tfrecord, "SCAN_BLOCK", 64)
+    monkeypatch.setattr(tfrecord, "REMOTE_SMALL", 0)
     asked.clear()
     assert np.array_equal(index_shard(shard).offsets, index.offsets)
     assert 3 <= len(asked) <= 5 and max(asked) <= 64
@@ -104,14 +105,16 @@ def test_damage_of_a_remote_record_is_found(remote):
         RldsDataset(remote)
 
 
-def test_store_that_does_not_answer_costs_no_episode(remote, monkeypatch):
+def test_store_that_does_not_answer_costs_no_episode(remote, tmp_path, monkeypatch):
     def broken(*args, **options):
         raise ConnectionError("no route")
 
+    monkeypatch.setattr(location, "RETRY_WAITS", (0.0, 0.0))
     dataset = RldsDataset(remote, corrupt="skip")
     monkeypatch.setattr(remote.fs, "cat_file", broken)
     with pytest.raises(UnreachableError, match="cannot be read .*no route.*run the same command again"):
         dataset.episode(0, *KEYS)
+    monkeypatch.setenv("HMA_CACHE_DIR", str(tmp_path / "empty"))
     with pytest.raises(UnreachableError):
         RldsDataset(remote, corrupt="skip")
 

@@ -1,0 +1,138 @@
+"""Columns in a file: a small JSON header and numpy arrays behind it, mapped when they are asked for.
+
+Owns the layout and its checks, nothing of what the columns mean. A file appears under its name only
+when it is complete, and every part of it is checked against its hash before it is used.
+
+    8 bytes    magic, with the version of the layout
+    8 bytes    length of the header, little-endian
+    32 bytes   SHA-256 of the header
+    header     JSON: {"facts": ..., "columns": {name: [dtype, entries, offset, SHA-256]}}
+    columns    one-dimensional, little-endian, each at a multiple of 64 bytes
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+
+MAGIC = b"HMACOLS1"
+ALIGNMENT = 64
+DTYPES = ("<i4", "<i8", "<u4", "<u8")
+_START = len(MAGIC) + 8 + 32
+
+
+def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np.ndarray]) -> None:
+    """Writes `facts`, plain JSON values, and `columns`, arrays of one axis. Raises OSError."""
+    table, arrays, at, end = {}, {}, 0, 0
+    for name, values in columns.items():
+        array = np.ascontiguousarray(values)
+        array = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        if array.ndim != 1 or array.dtype.str not in DTYPES:
+            raise ValueError(f"column {name!r} is {array.dtype.str} {list(array.shape)}; it must be one of {DTYPES}")
+        digest = hashlib.sha256(array.data).hexdigest()
+        table[name], arrays[name] = [array.dtype.str, len(array), at, digest], array
+        end = at + array.nbytes
+        at = _aligned(end)
+    header = json.dumps({"facts": facts, "columns": table}, sort_keys=True).encode()
+    aside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(aside, "wb") as out:
+            out.write(MAGIC + len(header).to_bytes(8, "little") + hashlib.sha256(header).digest() + header)
+            begin = _aligned(_START + len(header))
+            for name, array in arrays.items():
+                out.seek(begin + table[name][2])
+                out.write(array.data)
+            out.truncate(begin + end)
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(aside, path)
+    finally:
+        aside.unlink(missing_ok=True)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+class Columns:
+    """A file that `write_columns` wrote: `facts` at once, `columns[name]` when it is asked for.
+
+    Columns are read-only views of the mapped file, which the kernel may drop from memory and read again.
+    Raises OSError if the file is missing, DataError if it is damaged.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            start = file.read(_START)
+            if len(start) < _START or start[: len(MAGIC)] != MAGIC:
+                raise self._damaged("it does not begin as such a file")
+            length = int.from_bytes(start[len(MAGIC) : len(MAGIC) + 8], "little")
+            header = file.read(min(length, size))
+        if hashlib.sha256(header).digest() != start[-32:]:
+            raise self._damaged("its header does not match its hash")
+        try:
+            values = json.loads(header)
+            self.facts: dict[str, Any] = values["facts"]
+            self._table = {name: (str(d), int(n), int(at), str(h)) for name, (d, n, at, h) in values["columns"].items()}
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise self._damaged(f"its header is no table ({error})") from error
+        self._begin, self._size = _aligned(_START + length), size
+        self._mapped: dict[str, np.ndarray] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._table)
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._table
+
+    def digest(self, name: str) -> str:
+        """SHA-256 of a column as it was written, without reading it."""
+        return self._entry(name)[3]
+
+    def entries(self, name: str) -> int:
+        """Length of a column, without reading it."""
+        return self._entry(name)[1]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """A column, verified when it is asked for first. Raises DataError if it is damaged or missing."""
+        if name not in self._mapped:
+            dtype, count, at, digest = self._entry(name)
+            nbytes = count * int(dtype[-1]) if dtype in DTYPES else -1
+            if nbytes < 0 or count < 0 or at < 0 or self._begin + at + nbytes > self._size:
+                raise self._damaged(f"its column {name!r} does not lie inside of it")
+            if count:
+                array = np.memmap(self.path, dtype, "r", self._begin + at, (count,)).view(np.ndarray)
+            else:
+                array = np.zeros(0, dtype)
+            if hashlib.sha256(array.data).hexdigest() != digest:
+                raise self._damaged(f"its column {name!r} does not match its hash")
+            self._mapped[name] = array
+        return self._mapped[name]
+
+    def _entry(self, name: str) -> tuple[str, int, int, str]:
+        if name not in self._table:
+            raise self._damaged(f"it has no column {name!r}")
+        return self._table[name]
+
+    def _damaged(self, reason: str) -> DataError:
+        return DataError(f"{self.path}: damaged: {reason}.")
+
+
+def _aligned(at: int) -> int:
+    return -(-at // ALIGNMENT) * ALIGNMENT

@@ -1,0 +1,53 @@
+"""What an episode is called, whatever lies before it: its file's name, and its place in that file.
+
+Owns names as numbers. Splits, subsets and frozen windows hash them, so that an episode keeps its side
+when others are damaged, absent or left out.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+
+
+@dataclass(frozen=True)
+class EpisodeRun:
+    """The episodes at the places `first`, ..., `first + count - 1` of one file, readable or not."""
+
+    file: str  # its name, without a directory
+    first: int
+    count: int
+
+
+def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:
+    """uint64 per episode: SHA-256 of the file's name, its first 8 bytes, plus the place.
+
+    Raises DataError for two episodes of one name.
+    """
+    pieces = [np.zeros(0, np.uint64)]
+    for run in runs:
+        file = int.from_bytes(hashlib.sha256(run.file.encode()).digest()[:8], "little")
+        first = np.uint64((file + run.first) % 2**64)
+        with np.errstate(over="ignore"):
+            pieces.append(np.arange(run.count, dtype=np.uint64) + first)
+    ids = np.concatenate(pieces)
+    ordered = np.sort(ids)
+    twice = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(twice):
+        at = int(np.flatnonzero(ids == twice[0])[1])
+        raise DataError(f"{describe(runs, at)}: two episodes have this name. List each file once.")
+    return ids
+
+
+def describe(runs: Sequence[EpisodeRun], number: int) -> str:
+    """The name of the `number`-th episode, for people: file and place."""
+    for run in runs:
+        if number < run.count:
+            return f"{run.file}, episode {run.first + number}"
+        number -= run.count
+    raise IndexError(number)

@@ -1,0 +1,321 @@
+"""Where the records of a split lie: found out once, kept in a file, reused by every later start.
+
+Owns that file. It lies in a cache directory, as datasets may be read-only: `$HMA_CACHE_DIR/index`, by
+default `~/.cache/hma-jax/index`. It is known by the shards' names, sizes and times (of remote ones
+etags or what else the store calls a version), so a start asks for a listing of the directory and
+reads no shard; shards that changed are scanned again, the others are not.
+
+Every process of every host may make it; of one host, one does, and the others wait for it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from data_pipelines.columns import Columns, write_columns
+from data_pipelines.errors import CorruptRecordError, DataError, UnreachableError
+from data_pipelines.sources.rlds.location import is_remote, retried
+from data_pipelines.sources.rlds.tfrecord import ShardIndex, scan_shard
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.rlds.location import Location
+
+CACHE_VARIABLE = "HMA_CACHE_DIR"
+
+SCANS, REMOTE_SCANS = 16, 64
+"""Shards that are scanned at a time: what takes time is waiting for the disk or the store."""
+
+SAVE_EVERY = 60.0
+"""Seconds of scanning after which what is known so far is kept, for a process that may be killed."""
+
+SETTLED = 2.0
+"""Seconds that a shard must be older than its scan: a later change could bear the same time."""
+
+MARKS = ("ETag", "etag", "md5Hash", "crc32c", "blob_id", "generation", "version_id", "content_md5")
+TIMES = ("LastModified", "last_modified", "updated", "mtime", "modified", "created")
+
+COLUMNS = {"offsets": np.int64, "lengths": np.int64, "checksums": np.uint32}
+
+Scan = Callable[["Location"], tuple[ShardIndex, CorruptRecordError | None]]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """What is known of one shard. `digest` is over the lengths and checksums of its records."""
+
+    name: str
+    size: int  # bytes
+    stamp: str  # tells versions of the file apart; "": unknown, it is scanned at every start
+    records: int
+    digest: str
+    missing: bool = False  # there is no such file
+    damage_at: int = -1  # where the scan stopped; -1: at the file's end
+    damage: str = ""
+
+
+class RecordIndex:
+    """The records of some shards, one after the other: `offsets`, `lengths` and `checksums` of each.
+
+    `shards` in the order asked for; `ends` int64 [shards]: records up to and including each.
+    """
+
+    def __init__(self, shards: Sequence[Shard], columns: Mapping[str, np.ndarray] | Columns):
+        self.shards = tuple(shards)
+        self.ends = np.cumsum([s.records for s in self.shards], dtype=np.int64)
+        self._columns = columns
+
+    def __len__(self) -> int:
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """int64 [records]: first byte of a record's header."""
+        return self._columns["offsets"]
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """int64 [records]: bytes of the payload."""
+        return self._columns["lengths"]
+
+    @property
+    def checksums(self) -> np.ndarray:
+        """uint32 [records]: of the payload, as stored."""
+        return self._columns["checksums"]
+
+    def place(self, i: int) -> tuple[int, int]:
+        """(shard, place in it) of record `i`."""
+        shard = int(np.searchsorted(self.ends, i, side="right"))
+        return shard, i - (int(self.ends[shard - 1]) if shard else 0)
+
+    def rows(self, shard: int) -> slice:
+        """The records of a shard."""
+        end = int(self.ends[shard])
+        return slice(end - self.shards[shard].records, end)
+
+
+def load_index(directory: Location, split: str, shards: Sequence[Location], scan: Scan = scan_shard) -> RecordIndex:
+    """The index of `shards`, all in `directory`, from its file or by scanning what changed.
+
+    Raises UnreachableError for a directory or shard that cannot be read (what was scanned is kept),
+    DataError for shards that have changed places since they were indexed.
+    """
+    listing = list_files(directory)
+    path = index_path(directory, split)
+    known = _read(path)
+    if known is not None and _current(known, shards, listing):
+        return known
+    with alone(path):
+        known = _read(path)  # another process may have made it meanwhile
+        if known is not None and _current(known, shards, listing):
+            return known
+        return _make(path, shards, listing, known, scan)
+
+
+def list_files(directory: Location) -> dict[str, tuple[int, str]]:
+    """(size, stamp) of every file of a directory, by name, without opening one."""
+    if not is_remote(directory):
+        return retried(directory, lambda: _list_directory(directory))
+    fs = directory.fs
+    fs.invalidate_cache(directory.path)
+    found = retried(directory, lambda: fs.ls(directory.path, detail=True))
+    files = [f for f in found if f["type"] == "file"]
+    return {f["name"].rstrip("/").rsplit("/", 1)[-1]: (int(f["size"]), _stamp(f)) for f in files}
+
+
+def _list_directory(directory: Path) -> dict[str, tuple[int, str]]:
+    found = {}
+    with os.scandir(directory) as entries:
+        for entry in entries:
+            with suppress(FileNotFoundError):  # a temporary file of somebody
+                if entry.is_file():
+                    status = entry.stat()
+                    found[entry.name] = status.st_size, str(status.st_mtime_ns)
+    return found
+
+
+def index_path(directory: Location, split: str) -> Path:
+    """Where the index of a split is kept."""
+    root = os.environ.get(CACHE_VARIABLE) or Path.home() / ".cache" / "hma-jax"
+    text = str(directory) if is_remote(directory) else str(directory.absolute())
+    return Path(root) / "index" / f"{hashlib.sha256(f'{text}#{split}'.encode()).hexdigest()[:32]}.columns"
+
+
+# --- making it -----------------------------------------------------------------------------------
+
+
+def _make(
+    path: Path,
+    shards: Sequence[Location],
+    listing: Mapping[str, tuple[int, str]],
+    old: RecordIndex | None,
+    scan: Scan,
+) -> RecordIndex:
+    began, old_rows = time.time(), {}
+    if old is not None:
+        old_rows = {s.name: (s, old.rows(n)) for n, s in enumerate(old.shards)}
+    made: dict[str, tuple[Shard, dict[str, np.ndarray]]] = {}
+    for shard in shards:
+        size, stamp = listing.get(shard.name, (0, ""))
+        before = old_rows.get(shard.name)
+        if before is not None and stamp and (before[0].size, before[0].stamp) == (size, stamp):
+            made[shard.name] = before[0], {c: getattr(old, c)[before[1]] for c in COLUMNS}
+        elif shard.name not in listing:
+            made[shard.name] = Shard(shard.name, 0, "", 0, "", missing=True), _no_rows()
+    waiting = [shard for shard in shards if shard.name not in made]
+    saved, failure = time.monotonic(), None
+    for shard, found in _scan(waiting, scan):
+        if isinstance(found, DataError):
+            failure = failure or found
+            continue
+        size, stamp = listing[shard.name]
+        made[shard.name] = _described(shard, size, _settled(shard, stamp, began), *found)
+        if time.monotonic() - saved > SAVE_EVERY:
+            _write(path, shards, made)
+            saved = time.monotonic()
+    _check_places({name: s for name, (s, _) in made.items()}, {n: s for n, (s, _) in old_rows.items()}, shards, path)
+    index = _write(path, shards, made)
+    if failure is not None:
+        raise failure
+    return index
+
+
+def _scan(
+    shards: Sequence[Location], scan: Scan
+) -> Iterator[tuple[Location, tuple[ShardIndex, CorruptRecordError | None] | DataError]]:
+    """Each shard with its index, or with the error that stopped its scan; after one no more are begun."""
+    failed = False
+
+    def found(shard: Location):
+        nonlocal failed
+        if failed:
+            return UnreachableError(f"{shard}: not scanned.")
+        try:
+            return scan(shard)
+        except DataError as error:
+            failed = True
+            return error
+
+    if not shards:
+        return
+    with ThreadPoolExecutor(REMOTE_SCANS if is_remote(shards[0]) else SCANS, "index") as pool:
+        yield from zip(shards, pool.map(found, shards), strict=True)
+
+
+def _described(
+    shard: Location, size: int, stamp: str, index: ShardIndex, damage: CorruptRecordError | None
+) -> tuple[Shard, dict[str, np.ndarray]]:
+    rows = {name: getattr(index, name).astype(kind, copy=False) for name, kind in COLUMNS.items()}
+    digest = hashlib.sha256(rows["lengths"].astype("<i8").tobytes() + rows["checksums"].astype("<u4").tobytes())
+    stop = {} if damage is None else {"damage_at": damage.offset, "damage": damage.reason}
+    return Shard(shard.name, size, stamp, len(index), digest.hexdigest()[:16], **stop), rows
+
+
+def _settled(shard: Location, stamp: str, began: float) -> str:
+    """`stamp`, or "" for a file so new that it may change without one seeing it."""
+    return stamp if is_remote(shard) or int(stamp) / 1e9 < began - SETTLED else ""
+
+
+def _check_places(
+    new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Sequence[Location], path: Path
+) -> None:
+    """Two shards whose names were exchanged would exchange their episodes' names too."""
+    before = {s.digest: s.name for s in old.values() if s.records}
+    for shard in shards:
+        now = new.get(shard.name)
+        was = before.get(now.digest, shard.name) if now is not None and now.records else shard.name
+        other = new.get(was)
+        if was == shard.name or other is None or shard.name not in old or now.digest == old[shard.name].digest:
+            continue
+        if other.digest == old[shard.name].digest:
+            raise DataError(
+                f"{shard} and {was}: these two shards have changed places since they were indexed, and with "
+                f"them the names of their episodes. Rename them back; if they are right as they are, remove {path}."
+            )
+
+
+# --- its file --------------------------------------------------------------------------------------
+
+
+def _read(path: Path) -> RecordIndex | None:
+    """The index that is kept; None if there is none, or none that can be trusted."""
+    try:
+        columns = Columns(path)
+        shards = [Shard(**values) for values in columns.facts["shards"]]
+        index = RecordIndex(shards, columns)
+        whole = all(len(columns[name]) == len(index) for name in COLUMNS)
+    except (OSError, DataError, KeyError, TypeError):
+        return None  # it is made again, of the shards
+    return index if whole else None
+
+
+def _write(
+    path: Path, shards: Sequence[Location], made: Mapping[str, tuple[Shard, Mapping[str, np.ndarray]]]
+) -> RecordIndex:
+    known = [made[shard.name] for shard in shards if shard.name in made]
+    columns = {
+        name: np.concatenate([rows[name] for _, rows in known] or [np.zeros(0, kind)])
+        for name, kind in COLUMNS.items()
+    }
+    index = RecordIndex([shard for shard, _ in known], columns)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_columns(path, {"shards": [asdict(s) for s in index.shards]}, columns)
+    except OSError as error:
+        warnings.warn(
+            f"{path}: the index of the shards cannot be kept there ({error.strerror or error}), so that every start "
+            f"scans them again. Let {CACHE_VARIABLE} name a directory where you may write.",
+            stacklevel=2,
+        )
+        return index
+    return _read(path) or index  # mapped, which takes no memory of this process
+
+
+def _current(index: RecordIndex, shards: Sequence[Location], listing: Mapping[str, tuple[int, str]]) -> bool:
+    if [s.name for s in index.shards] != [p.name for p in shards]:
+        return False
+    for shard in index.shards:
+        if shard.name in listing:
+            if shard.missing or not shard.stamp or (shard.size, shard.stamp) != listing[shard.name]:
+                return False
+        elif not shard.missing:
+            return False
+    return True
+
+
+def _stamp(facts: Mapping) -> str:
+    for kind in (MARKS, TIMES):
+        for name in kind:
+            if facts.get(name):
+                return f"{name} {facts[name]}"
+    return ""
+
+
+def _no_rows() -> dict[str, np.ndarray]:
+    return {name: np.zeros(0, kind) for name, kind in COLUMNS.items()}
+
+
+@contextmanager
+def alone(path: Path) -> Iterator[None]:
+    """Waits while another process of this host makes the same index."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = open(path.with_name(f"{path.name}.lock"), "w")  # noqa: SIM115
+    except OSError:
+        yield  # nothing can be kept there, as `_write` says
+        return
+    with lock:
+        with suppress(OSError):  # a file system without locks: two make the same file
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,49 @@
+"""How many steps each episode has, kept when it became known: no shard says it before it is read.
+
+Owns a file beside the index (see `index`). Losing it costs nothing but the knowledge.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.columns import Columns, write_columns
+from data_pipelines.errors import DataError
+from data_pipelines.sources.rlds.index import RecordIndex, alone
+
+
+def load_steps(path: Path, index: RecordIndex) -> np.ndarray:
+    """int32 [records], -1 where it is not known; `path` is that of the index."""
+    try:
+        columns = Columns(_beside(path))
+        if columns.facts["index"] == _identity(index):
+            return np.array(columns["steps"], np.int32)
+    except (OSError, DataError, KeyError, TypeError):
+        pass
+    return np.full(len(index), -1, np.int32)
+
+
+def save_steps(path: Path, index: RecordIndex, steps: np.ndarray) -> None:
+    """Keeps `steps`, and what other processes have kept meanwhile."""
+    try:
+        with alone(_beside(path)):
+            kept = load_steps(path, index)
+            merged = np.where(steps >= 0, steps, kept).astype(np.int32)
+            if not np.array_equal(merged, kept):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_columns(_beside(path), {"index": _identity(index)}, {"steps": merged})
+    except OSError as error:
+        warnings.warn(f"{_beside(path)}: cannot be written ({error.strerror or error}).", stacklevel=2)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_suffix(".steps")
+
+
+def _identity(index: RecordIndex) -> str:
+    facts = "".join(f"{s.name}:{s.records}:{s.digest};" for s in index.shards)
+    return hashlib.sha256(facts.encode()).hexdigest()[:32]

@@ -1,0 +1,203 @@
+"""What every source of episodes gives: random access to the episodes of one dataset, by name.
+
+Owns the interface that inspection, tokenizer training and tokenising see, and what all formats share:
+looking up cameras and actions, and counting episodes that cannot be used.
+"""
+
+from __future__ import annotations
+
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from data_pipelines.sources.rlds.schema import FlatFeature, closest, field_slice, listing, step_key
+from hma_jax.config import ConfigError, require
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.rlds.location import Location
+
+MAX_SKIPPED = 16
+"""Default bound of the policy corrupt='skip'."""
+
+Corrupt = Literal["raise", "skip"]
+
+Fetched = bytes | np.ndarray
+"""A frame as its source holds it: encoded, or uint8 [H, W, 3] where no frame stands alone (videos)."""
+
+
+@dataclass(frozen=True)
+class RawEpisode:
+    """One episode as recorded. `images`: every `frame_step`-th of the N native frames."""
+
+    index: int
+    images: list[np.ndarray]  # uint8 [H, W, 3] each
+    actions: np.ndarray  # float32 [N, A], native rate, raw units
+    success: bool | None
+
+    @property
+    def steps(self) -> int:
+        """N, native frames."""
+        return len(self.actions)
+
+
+@dataclass(frozen=True)
+class OpenEpisode:
+    """An episode whose frames are decoded one by one, while it is open."""
+
+    index: int
+    actions: np.ndarray  # float32 [N, A], native rate, raw units
+    success: bool | None
+    fetch: Callable[[int], Fetched]
+    """Native frame n as its source holds it. One thread at a time; in ascending order nothing is read
+    twice. Raises EpisodeError."""
+    decode: Callable[[int, Fetched], np.ndarray]
+    """Native frame n from what `fetch` gave, uint8 [H, W, 3], in any thread. Raises EpisodeError."""
+
+    @property
+    def steps(self) -> int:
+        """N, native frames."""
+        return len(self.actions)
+
+    def image(self, n: int) -> np.ndarray:
+        return self.decode(n, self.fetch(n))
+
+
+class EpisodeSource(ABC):
+    """Random access to the episodes of one split, of which there are `len(source)`. Thread-safe; pickles.
+
+    `location`: where it lies. `features`: the fields of a step by their flat key, `steps/...`.
+    `runs`: the names of all its episodes, readable or not (see `identity`).
+
+    Damage: with corrupt="raise" every damaged part is an error. With "skip", what can be read is
+    listed, `skip` accepts unusable episodes, and all losses are counted in `skipped`; more than
+    `max_skipped` of them raise DataError. A place that cannot be read at all is no damage: it
+    raises UnreachableError under both.
+    """
+
+    name: str
+    version: str
+    location: Location
+    schema: Location  # the file that says which fields there are
+    features: Mapping[str, FlatFeature]
+    runs: tuple[EpisodeRun, ...]
+
+    def __init__(self, corrupt: Corrupt, max_skipped: int):
+        require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
+        self.corrupt, self.max_skipped = corrupt, max_skipped
+        self.skipped: dict[str, int] = {}  # reason -> episodes lost
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @property
+    @abstractmethod
+    def numbers(self) -> np.ndarray:
+        """int64 [episodes]: which of the episodes named by `runs` each one is."""
+
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """Hash that tells other contents apart, not another place."""
+
+    @abstractmethod
+    def sizes(self) -> np.ndarray:
+        """int64 [episodes]: bytes of each, about."""
+
+    @abstractmethod
+    def steps(self) -> np.ndarray:
+        """int32 [episodes]: native frames of each; -1 where it is not known before it is read."""
+
+    @abstractmethod
+    def open_episode(
+        self, i: int, image_key: str, action_keys: Sequence[str]
+    ) -> AbstractContextManager[OpenEpisode]:
+        """Episode `i` in bounded memory, however long: see `OpenEpisode`.
+
+        Keys are relative to a step: `observation/image_0`, `action`, `action/arm`, `action[:7]`.
+        Raises ConfigError for keys that there are not, EpisodeError for contents that cannot be used.
+        """
+
+    @functools.cached_property
+    def ids(self) -> np.ndarray:
+        """uint64 per episode of `runs`: its name as a number, what splits and subsets hash."""
+        return episode_ids(self.runs)
+
+    def remember(self) -> None:
+        """Keeps what reading has shown, as the steps of episodes, for later starts."""
+
+    def episode(
+        self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1
+    ) -> RawEpisode:
+        """Episode `i`, whole: one camera, the actions of `action_keys` concatenated, the success flag.
+
+        Raises what `open_episode` raises.
+        """
+        with self.open_episode(i, image_key, action_keys) as episode:
+            images = [episode.image(t) for t in range(0, episode.steps, frame_step)]
+            return RawEpisode(i, images, episode.actions, episode.success)
+
+    def frames(
+        self, i: int, image_key: str, choose: Callable[[int], Sequence[int]], at_least: int = 0
+    ) -> list[np.ndarray]:
+        """Some frames of episode `i`, without its actions: `choose` maps N to frame numbers.
+
+        Images may come smaller, but not smaller than `at_least` pixels, where that saves time.
+        """
+        with self.open_episode(i, image_key, ()) as episode:
+            chosen = choose(episode.steps)
+            seen = {t: episode.image(t) for t in sorted(set(chosen))}
+            return [seen[t] for t in chosen]
+
+    def check_keys(
+        self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None
+    ) -> None:
+        """Raises ConfigError unless the camera and the action fields exist, with these sizes."""
+        cameras = [k for k, f in self.features.items() if f.image]
+        numbers = [k for k, f in self.features.items() if f.size and "action" in k]
+        if step_key(image_key) not in self.features:
+            raise ConfigError(
+                f"{self.name}: no image {image_key!r} in {self.schema}; "
+                f"images there: {listing(cameras)}{closest(image_key, cameras)}. Correct image_key."
+            )
+        require(
+            self.features[step_key(image_key)].image,
+            f"{self.name}: {image_key!r} is not an image; images: {listing(cameras)}. Correct image_key.",
+        )
+        for n, key in enumerate(action_keys):
+            field, part = field_slice(key)
+            feature = self.features.get(step_key(field))
+            if feature is None or not feature.size:
+                raise ConfigError(
+                    f"{self.name}: no numeric field {field!r} in {self.schema}; "
+                    f"action fields there: {listing(numbers)}{closest(field, numbers)}. Correct action_keys."
+                )
+            size = len(range(feature.size)[part])
+            if action_dims is not None and size != action_dims[n]:
+                raise ConfigError(
+                    f"{self.name}: field {key!r} has {size} values per step in "
+                    f"{self.schema}, but {action_dims[n]} were expected. "
+                    "Correct action_dims, or read the version of the dataset it was written for."
+                )
+
+    def skip(self, error: EpisodeError) -> None:
+        """Counts an unusable episode once, or raises `error` under the policy corrupt='raise'."""
+        if self.corrupt == "raise":
+            raise error
+        if str(error) not in self.skipped:
+            self.lose(str(error), 1)
+
+    def lose(self, reason: str, episodes: int) -> None:
+        """Counts episodes that are not there. Raises DataError if they are too many."""
+        self.skipped[reason] = self.skipped.get(reason, 0) + episodes
+        lost = sum(self.skipped.values())
+        if lost > self.max_skipped:
+            raise DataError(
+                f"{self.name}: {lost} episodes are unusable, more than max_skipped={self.max_skipped}. "
+                f"The last: {reason} Raise max_skipped if the rest is worth it."
+            )
