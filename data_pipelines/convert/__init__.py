@@ -1,5 +1,4 @@
-"""Converters: other people's formats in, one RLDS directory out.
+"""The export: any source made of units (`sources.units`) as one RLDS directory, restartably.
 
-`robomimic`, `lerobot`, `epic_kitchens`, `ego4d` and `egoexo4d` each open a source and yield its
-episodes; `write.convert` writes any of them, restartably. Nothing here is needed to train.
+Nothing here is needed to train: every command reads such sources directly.
 """

@@ -18,11 +18,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from data_pipelines.convert.episode import Conversion, LeftOut, Source, UnitError, encode
+from data_pipelines.convert.episode import Conversion, encode
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
+from data_pipelines.sources.units import LeftOut, Source, UnitError
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg
 from tyro.extras import SubcommandApp
 
-from data_pipelines.convert.settings import (
+from data_pipelines.sources.settings import (
     Ego4dSettings,
     EgoExo4dSettings,
     EpicKitchensSettings,

@@ -13,8 +13,8 @@ from experiments.setting import command
 from hma_jax.config import require
 
 if TYPE_CHECKING:
-    from data_pipelines.convert.episode import Source
-    from data_pipelines.convert.settings import (
+    from data_pipelines.sources.units import Source
+    from data_pipelines.sources.settings import (
         Ego4dSettings,
         EgoExo4dSettings,
         EpicKitchensSettings,
@@ -26,32 +26,32 @@ if TYPE_CHECKING:
 
 
 def robomimic(path: Path, to: To, settings: RobomimicSettings) -> None:
-    from data_pipelines.convert.robomimic import RobomimicSource
+    from data_pipelines.sources.robomimic import RobomimicSource
 
     source = RobomimicSource(path, settings)
     _convert(source, to, f"robomimic_{source.task}")
 
 
 def lerobot(root: Path, to: To, settings: LeRobotSettings) -> None:
-    from data_pipelines.convert.lerobot import LeRobotSource
+    from data_pipelines.sources.lerobot import LeRobotSource
 
     _convert(LeRobotSource(root, settings), to, root.absolute().name)
 
 
 def epic_kitchens(frames: Path, detections: Path, to: To, settings: EpicKitchensSettings) -> None:
-    from data_pipelines.convert.epic_kitchens import NAME, EpicKitchensSource
+    from data_pipelines.sources.human.epic_kitchens import NAME, EpicKitchensSource
 
     _convert(EpicKitchensSource(frames, detections, settings), to, NAME)
 
 
 def ego4d(annotations: Path, videos: Path, to: To, settings: Ego4dSettings) -> None:
-    from data_pipelines.convert.ego4d import NAME, Ego4dSource
+    from data_pipelines.sources.human.ego4d import NAME, Ego4dSource
 
     _convert(Ego4dSource(annotations, videos, settings), to, NAME)
 
 
 def egoexo4d(root: Path, to: To, settings: EgoExo4dSettings) -> None:
-    from data_pipelines.convert.egoexo4d import NAME, EgoExo4dSource
+    from data_pipelines.sources.human.egoexo4d import NAME, EgoExo4dSource
 
     _convert(EgoExo4dSource(root, settings), to, NAME)
 

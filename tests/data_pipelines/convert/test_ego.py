@@ -7,9 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from data_pipelines.convert.ego4d import Ego4dSource
-from data_pipelines.convert.egoexo4d import EgoExo4dSource
-from data_pipelines.convert.settings import Ego4dSettings, EgoExo4dSettings
+from data_pipelines.sources.human.ego4d import Ego4dSource
+from data_pipelines.sources.human.egoexo4d import EgoExo4dSource
+from data_pipelines.sources.settings import Ego4dSettings, EgoExo4dSettings
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, number, read_back, write_video

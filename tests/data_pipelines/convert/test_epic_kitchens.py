@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_pipelines.convert.detections import read_hands
-from data_pipelines.convert.epic_kitchens import EpicKitchensSource
-from data_pipelines.convert.settings import EpicKitchensSettings
+from data_pipelines.sources.human.detections import read_hands
+from data_pipelines.sources.human.epic_kitchens import EpicKitchensSource
+from data_pipelines.sources.settings import EpicKitchensSettings
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from tests.data_pipelines.convert.sources import colour, detections, hand, number, read_back, write_epic
@@ -79,7 +79,7 @@ def test_the_best_hand_of_each_side_counts_from_the_threshold_on(tmp_path):
 
 
 def test_long_runs_are_cut_into_equal_pieces_without_losing_a_step(tmp_path, monkeypatch):
-    monkeypatch.setattr("data_pipelines.convert.epic_kitchens.MAX_STEPS", 4)
+    monkeypatch.setattr("data_pipelines.sources.human.epic_kitchens.MAX_STEPS", 4)
     frames = [moving(n) for n in range(1, 67)]  # kept: 11, so 10 steps
     done = convert(EpicKitchensSource(*write_epic(tmp_path, "P01_01", frames), SHORT), tmp_path, "epic")
     _, episodes = read_back(done.directory, "observation/image")

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from data_pipelines.convert.lerobot import LeRobotSource
-from data_pipelines.convert.settings import LeRobotSettings
+from data_pipelines.sources.lerobot import LeRobotSource
+from data_pipelines.sources.settings import LeRobotSettings
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from hma_jax.config import ConfigError

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_pipelines.convert.robomimic import RobomimicSource, succeeded
-from data_pipelines.convert.settings import RobomimicSettings
+from data_pipelines.sources.robomimic import RobomimicSource, succeeded
+from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from hma_jax.config import ConfigError

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from data_pipelines.convert.episode import Episode, Layout, LeftOut, UnitError, require_module
+from data_pipelines.sources.units import Episode, Layout, LeftOut, UnitError, require_module
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.convert.episode import require_module
+from data_pipelines.sources.units import require_module
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
 

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.convert.episode import Episode, LeftOut, UnitError
-from data_pipelines.convert.hands import LAYOUT, cut_episodes, destination
-from data_pipelines.convert.settings import EgoExo4dSettings
-from data_pipelines.convert.video import ADVICE, Video, open_video, shrink
+from data_pipelines.sources.units import Episode, LeftOut, UnitError
+from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, destination
+from data_pipelines.sources.settings import EgoExo4dSettings
+from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.rlds.writer import encode_jpeg

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data_pipelines.convert.episode import UnitError, require_module
+from data_pipelines.sources.units import UnitError, require_module
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.writer import encode_jpeg
 

@@ -26,11 +26,11 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.convert.detections import ADVICE, read_hands
-from data_pipelines.convert.episode import Episode, LeftOut, UnitError
-from data_pipelines.convert.hands import LAYOUT, cut_episodes, displacement
-from data_pipelines.convert.settings import EpicKitchensSettings
-from data_pipelines.convert.video import stored_jpeg
+from data_pipelines.sources.human.detections import ADVICE, read_hands
+from data_pipelines.sources.units import Episode, LeftOut, UnitError
+from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, displacement
+from data_pipelines.sources.settings import EpicKitchensSettings
+from data_pipelines.sources.video import stored_jpeg
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
 from hma_jax.config.json import to_dict

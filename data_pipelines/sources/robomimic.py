@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.convert.episode import Episode, Layout, UnitError, choose, require_module
-from data_pipelines.convert.settings import RobomimicSettings
-from data_pipelines.convert.video import shrink
+from data_pipelines.sources.units import Episode, Layout, UnitError, choose, require_module
+from data_pipelines.sources.settings import RobomimicSettings
+from data_pipelines.sources.video import shrink
 from data_pipelines.errors import DataError
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from hma_jax.config import ConfigError

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.convert.episode import Episode, Layout, UnitError, choose
-from data_pipelines.convert.lerobot_meta import EpisodeEntry, read_meta, read_table
-from data_pipelines.convert.settings import LeRobotSettings
-from data_pipelines.convert.video import ADVICE, open_video, shrink, stored_jpeg
+from data_pipelines.sources.units import Episode, Layout, UnitError, choose
+from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta, read_table
+from data_pipelines.sources.settings import LeRobotSettings
+from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 from data_pipelines.errors import DataError
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 

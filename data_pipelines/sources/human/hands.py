@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from data_pipelines.convert.episode import Episode, Layout, LeftOut
+from data_pipelines.sources.units import Episode, Layout, LeftOut
 from data_pipelines.sources.rlds.writer import image_field
 
 IMAGE, STATE, ACTION = "observation/image", "observation/state", "action"

@@ -1,0 +1,97 @@
+"""What a converter reads: a source made of units, each of some episodes, whole and in order.
+
+A unit is what a source reads in one go: a demonstration, an episode, a video. Owns what the formats
+that are read so have in common.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+
+from data_pipelines.errors import EpisodeError
+from data_pipelines.sources.rlds.writer import STEP_FIELDS, TEXT, Field, vector_field
+from hma_jax.config import ConfigError
+
+
+class UnitError(EpisodeError):
+    """One unit of a source is unusable; `--skip-damaged`, or corrupt='skip', leaves it out."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The fields of a source's steps, by flat key: cameras, and float32 vectors with their sizes."""
+
+    images: Mapping[str, Field]
+    vectors: Mapping[str, int]
+    knows_success: bool
+
+    def step_fields(self) -> dict[str, Field]:
+        vectors = {key: vector_field(size) for key, size in self.vectors.items()}
+        return {**self.images, **vectors, **STEP_FIELDS}
+
+    def episode_fields(self) -> dict[str, Field]:
+        success = {"success": Field("bool")} if self.knows_success else {}
+        return {"file_path": Field(TEXT), **success}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of N steps. `images`: encoded frames; `vectors`: float [N, size]."""
+
+    origin: str  # for people: where in the source it came from
+    images: Mapping[str, Sequence[bytes]]
+    vectors: Mapping[str, np.ndarray]
+    instructions: Sequence[str]
+    rewards: np.ndarray | None = None
+    success: bool | None = None
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A stretch of a unit that makes no episode, and why; reasons are counted and reported."""
+
+    reason: str
+
+
+class Source(Protocol):
+    """An opened source. Its settings and `units` decide every byte that is written."""
+
+    layout: Layout
+    hz: float
+    description: str
+    units: Sequence[str]
+
+    def identity(self) -> dict[str, Any]:
+        """JSON facts that tell another source or other settings apart."""
+        ...
+
+    def read(self, unit: int) -> Iterator[Episode | LeftOut]:
+        """The episodes of `units[unit]`, in order. Raises UnitError for a damaged unit."""
+        ...
+
+
+def require_module(name: str) -> ModuleType:
+    """An optional library of the extra `convert`; ConfigError that says how to get it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise ConfigError(
+            f"this format needs the package {name.partition('.')[0]!r}, which cannot be imported "
+            f"({error}); install the extra with: pip install 'hma-jax[convert]'"
+        ) from error
+
+
+def choose(wanted: Sequence[str], there: Sequence[str], what: str, where: str) -> tuple[str, ...]:
+    """`wanted`, or all that are there; ConfigError for one that is not."""
+    missing = [name for name in wanted if name not in there]
+    if missing:
+        raise ConfigError(
+            f"{where}: no {what} {', '.join(map(repr, missing))}; it has {', '.join(there) or 'none'}."
+        )
+    return tuple(wanted) or tuple(there)
