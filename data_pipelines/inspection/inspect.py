@@ -1,4 +1,4 @@
-"""What lies in an RLDS directory: schema, counts, lengths, cameras and the numbers of its actions.
+"""What lies in a dataset: schema, counts, lengths, cameras and the numbers of its actions.
 
 Owns the facts, read from a sample of episodes so that terabytes take as long as gigabytes.
 What the registry should say of the dataset follows from them in `suggest`; drawing and
@@ -7,6 +7,7 @@ printing are the caller's.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,11 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.loading.splits import smallest_hashes
+from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import SUCCESS_KEY, RldsDataset
 from data_pipelines.sources.rlds.images import decode_image
-from data_pipelines.sources.rlds.schema import resolve_version, step_key
+from data_pipelines.sources.rlds.schema import step_key
+from data_pipelines.sources.source import EpisodeSource, Fetched
 from hma_jax.config import require
 
 INSTRUCTION_KEYS = ("steps/language_instruction", "steps/observation/natural_language_instruction")
@@ -102,6 +105,7 @@ class Facts:
     cameras: tuple[CameraFacts, ...]
     actions: tuple[ActionFacts, ...]
     damaged: dict[str, int]  # reason -> episodes
+    hz: float | None = None  # native rate, where the files say it
 
 
 @dataclass(frozen=True)
@@ -133,9 +137,8 @@ def inspect_dataset(
     ConfigError for an unknown split.
     """
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
-    fields, splits = _read_schema(resolve_version(directory))
-    listed = sum(s.episodes for s in splits if s.name == split)
-    source = RldsDataset(directory, split, corrupt="skip", max_skipped=listed)
+    source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
+    fields, splits = _describe(source)
     cameras = {f.key: _CameraLog() for f in fields if f.per_step and f.kind == "image"}
     numbers = [f.key for f in fields if f.per_step and f.kind == "number" and "action" in f.key]
     numbers = [key for key in numbers if source.features[step_key(key)].size <= WIDEST]
@@ -163,11 +166,11 @@ def inspect_dataset(
             examples.append(_shown(int(i), count, record, times, looked))
     if not steps:
         reasons = "; ".join(source.skipped) or "it is empty"
-        raise DataError(f"{source.directory}: no episode of split {split!r} can be read: {reasons}")
+        raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}")
     return Facts(
         name=source.name,
         version=source.version,
-        directory=str(source.directory),
+        directory=str(source.location),
         fields=fields,
         splits=splits,
         split=split,
@@ -179,10 +182,24 @@ def inspect_dataset(
         cameras=tuple(log.facts(key) for key, log in cameras.items()),
         actions=tuple(ActionFacts(key, dimension_facts(rows[key])) for key in numbers),
         damaged=dict(source.skipped),
+        hz=source.hz,
     ), examples
 
 
 # --- schema -----------------------------------------------------------------------------------
+
+
+def _describe(source: EpisodeSource) -> tuple[tuple[FieldFacts, ...], tuple[SplitFacts, ...]]:
+    """Fields of a step and of the episode, and all splits."""
+    if isinstance(source, RldsDataset):
+        return _read_schema(source.directory)
+    fields = [
+        FieldFacts(key.removeprefix("steps/"), "image", (None, None, 3), "uint8", per_step=True)
+        if feature.image
+        else FieldFacts(key.removeprefix("steps/"), "number", (feature.size,), "float32", per_step=True)
+        for key, feature in source.features.items()
+    ]
+    return tuple(fields), (SplitFacts(source.split, len(source), source.files, int(source.sizes().sum())),)
 
 
 def _read_schema(directory: Path) -> tuple[tuple[FieldFacts, ...], tuple[SplitFacts, ...]]:
@@ -226,13 +243,13 @@ def _fields(feature: Any, key: str) -> list[FieldFacts]:
 # --- one episode ------------------------------------------------------------------------------
 
 
-def _read(source: RldsDataset, i: int, cameras: dict, numbers: Sequence[str]) -> dict:
+def _read(source: EpisodeSource, i: int, cameras: dict, numbers: Sequence[str]) -> dict:
     keys = [step_key(key) for key in (*cameras, *numbers)]
     record = source.record(i, [*keys, *INSTRUCTION_KEYS, SUCCESS_KEY, "steps/is_first"])
     return {key: [] for key in keys} | record
 
 
-def _steps(record: dict, source: RldsDataset, cameras: dict, numbers: Sequence[str]) -> int:
+def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence[str]) -> int:
     """Steps of an episode. Raises EpisodeError when its fields disagree."""
     counts = {key: len(record[step_key(key)]) for key in cameras}
     for key in numbers:
@@ -253,9 +270,10 @@ class _CameraLog:
         self.frames = self.blank = 0
         self.still = True
 
-    def look(self, encoded: list[bytes], times: Sequence[int]) -> list[np.ndarray]:
+    def look(self, encoded: Sequence[Fetched], times: Sequence[int]) -> list[np.ndarray]:
         """The decoded frames at `times`, noted."""
-        images = [decode_image(encoded[t]) for t in times]
+        found = (encoded[t] for t in times)
+        images = [frame if isinstance(frame, np.ndarray) else decode_image(frame) for frame in found]
         self.sizes |= {image.shape[:2] for image in images}
         self.frames += len(images)
         self.blank += sum(bool(image.std(axis=(0, 1)).max() < BLANK_STD) for image in images)

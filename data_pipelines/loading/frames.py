@@ -1,4 +1,4 @@
-"""Random camera frames straight from RLDS shards: what a tokenizer trains on.
+"""Random camera frames straight from the sources: what a tokenizer trains on.
 
 Owns the order of frames and the exclusion of held-out episodes. Row r of batch s is a pure
 function of (datasets, seed, s, r), so a run resumes from its step alone.
@@ -20,10 +20,10 @@ from data_pipelines.loading.mixture import make_mixture
 from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
 from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
-from data_pipelines.sources.source import MAX_SKIPPED
+from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4
@@ -52,14 +52,14 @@ def make_frame_loader(
 
     Datasets are drawn with p ∝ episodes^(1/tau), episodes and frames within them uniformly.
     Held-out episodes are those that the token store holds out under the same fractions.
-    Raises ConfigError and DataError as `RldsDataset` does.
+    Raises ConfigError and DataError as `open_source` does.
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     require(split in ("train", "val"), f"split must be 'train' or 'val', got {split!r}")
     require(len(datasets) >= 1, "no dataset was given to take frames from")
     streams, counts, files = {}, {}, OpenFiles()
     for spec, directory in datasets:
-        source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
+        source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
         mask = held_out(spec.name, source.ids, val_fraction, min_val, max_val)[source.numbers]
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
@@ -84,13 +84,13 @@ def make_frame_loader(
 class _Stream:
     """Endless shuffled episodes of one dataset."""
 
-    source: RldsDataset
+    source: EpisodeSource
     image_key: str
     episodes: np.ndarray  # int64, those of the split
     seed: int
 
     def read(self, i: int, draws: np.ndarray, size: int) -> list[np.ndarray]:
-        """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `RldsDataset.frames`."""
+        """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `EpisodeSource.frames`."""
         at = endless_shuffle(i, len(self.episodes), self.seed)
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])

@@ -10,18 +10,20 @@ Depth cameras are left out.
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_pipelines.sources.units import Episode, Layout, UnitError, choose
+from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta, read_table
-from data_pipelines.sources.settings import LeRobotSettings
-from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
-from data_pipelines.errors import DataError
+from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.settings import LeRobotSettings
+from data_pipelines.sources.units import Episode, Layout, UnitError, choose
+from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
 SUCCESS, REWARD = "next.success", "next.reward"
 
@@ -44,19 +46,20 @@ class LeRobotSource:
             )
         wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(there), "camera", str(self.root))
-        self._cameras = {f"observation/{name}": there[name] for name in names}
-        self._vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
-        if "action" not in {key.partition("/")[0] for key in self._vectors}:
+        self.cameras = {f"observation/{name}": there[name] for name in names}
+        self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
+        if "action" not in {key.partition("/")[0] for key in self.vectors}:
             raise DataError(
                 f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among "
                 f"{', '.join(features)}."
             )
-        sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self._vectors.items()}
-        self.layout = Layout({k: image_field(None, None) for k in self._cameras}, sizes, SUCCESS in features)
+        sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self.vectors.items()}
+        self.layout = Layout({k: image_field(None, None) for k in self.cameras}, sizes, SUCCESS in features)
         self.hz = self.meta.fps
         self.units = [f"episode {entry.index}" for entry in self.meta.episodes]
         self.description = f"LeRobot dataset {self.root.name} ({self.meta.version}), {self.hz:g} Hz."
         self._open_table: tuple[Path, Any] | None = None
+        self._lock = threading.Lock()
 
     def identity(self) -> dict[str, Any]:
         files = {e.data for e in self.meta.episodes} | {
@@ -68,7 +71,7 @@ class LeRobotSource:
             "root": self.root.name,
             "files": sizes,
             "features": json.dumps(self.meta.features, sort_keys=True),
-            "cameras": list(self._cameras),
+            "cameras": list(self.cameras),
             "hz": self.hz,
             "short_side": self.short_side,
         }
@@ -76,45 +79,30 @@ class LeRobotSource:
     def read(self, unit: int) -> Iterator[Episode]:
         entry = self.meta.episodes[unit]
         where = f"{entry.data}: episode {entry.index}"
-        table = self._rows(entry)
+        table = self.rows(entry)
         steps = table.num_rows
         if steps != entry.length:
             raise UnitError(f"{where} has {steps} rows, but the meta folder says {entry.length}. {ADVICE}")
-        times = self._times(table, where)
-        images = {key: self._images(entry, name, table, times, where) for key, name in self._cameras.items()}
-        vectors = {key: self._numbers(table, name, where) for key, name in self._vectors.items()}
+        times = self.times(table, where)
+        images = {key: self._images(entry, name, table, times, where) for key, name in self.cameras.items()}
+        vectors = {key: self.numbers(table, name, where) for key, name in self.vectors.items()}
         success = None
         if SUCCESS in self.meta.features:
-            success = bool(self._numbers(table, SUCCESS, where)[-1].any())
+            success = bool(self.numbers(table, SUCCESS, where)[-1].any())
         has_reward = REWARD in table.column_names
         yield Episode(
             origin=f"{self.root.name}/episode_{entry.index:06d}",
             images=images,
             vectors=vectors,
-            instructions=self._texts(entry, table, where),
-            rewards=self._numbers(table, REWARD, where)[:, 0] if has_reward else None,
+            instructions=self.texts(entry, table, where),
+            rewards=self.numbers(table, REWARD, where)[:, 0] if has_reward else None,
             success=success,
         )
 
-    def _rows(self, entry: EpisodeEntry) -> Any:
+    def rows(self, entry: EpisodeEntry) -> Any:
         """The episode's rows, in order; the last file is kept, as its neighbours lie in it too."""
-        if self._open_table is None or self._open_table[0] != entry.data:
-            self._open_table = None  # freed before the next one is read
-            names = ["episode_index", "frame_index", "timestamp", "task_index", SUCCESS, REWARD]
-            names += [*self._vectors.values(), *self._cameras.values()]
-            try:
-                table = read_table(entry.data)
-            except DataError as error:
-                raise UnitError(str(error)) from error
-            missing = [
-                n
-                for n in ("episode_index", "timestamp", *self._vectors.values())
-                if n not in table.column_names
-            ]
-            if missing:
-                raise UnitError(f"{entry.data}: no column {missing[0]!r}. {ADVICE}")
-            self._open_table = entry.data, table.select([n for n in names if n in table.column_names])
-        table = self._open_table[1]
+        with self._lock:
+            table = self._table(entry)
         mask = np.asarray(table["episode_index"]) == entry.index
         rows = np.flatnonzero(mask)
         if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
@@ -123,7 +111,34 @@ class LeRobotSource:
             )
         return table.slice(int(rows[0]), len(rows))
 
-    def _times(self, table: Any, where: str) -> np.ndarray:
+    def _table(self, entry: EpisodeEntry) -> Any:
+        if self._open_table is None or self._open_table[0] != entry.data:
+            self._open_table = None  # freed before the next one is read
+            names = ["episode_index", "frame_index", "timestamp", "task_index", SUCCESS, REWARD]
+            names += [*self.vectors.values(), *self.cameras.values()]
+            try:
+                table = read_table(entry.data)
+            except UnreachableError:
+                raise
+            except DataError as error:
+                raise UnitError(str(error)) from error
+            missing = [
+                n
+                for n in ("episode_index", "timestamp", *self.vectors.values())
+                if n not in table.column_names
+            ]
+            if missing:
+                raise UnitError(f"{entry.data}: no column {missing[0]!r}. {ADVICE}")
+            self._open_table = entry.data, table.select([n for n in names if n in table.column_names])
+        return self._open_table[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in self.__dict__.items() if k not in ("_lock", "_open_table")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _open_table=None, _lock=threading.Lock())
+
+    def times(self, table: Any, where: str) -> np.ndarray:
         """Seconds since the episode's first frame. Raises UnitError for a row out of step."""
         times = np.asarray(table["timestamp"], np.float64)
         expected = np.arange(len(times)) / self.hz
@@ -148,22 +163,22 @@ class LeRobotSource:
         images = []
         for row, value in enumerate(table[name].to_pylist()):
             here = f"{where}: {name!r} at row {row}"
-            images.append(stored_jpeg(self._image_bytes(value, here), self.short_side, here))
+            images.append(stored_jpeg(self.image_bytes(value, here), self.short_side, here))
         return images
 
-    def _image_bytes(self, value: Any, where: str) -> bytes:
+    def image_bytes(self, value: Any, where: str) -> bytes:
         """The bytes of an image, which lie in the table or in a file that it names."""
         if isinstance(value, dict) and value.get("bytes"):
             return value["bytes"]
         if isinstance(value, dict) and value.get("path"):
             path = self.root / value["path"]
             try:
-                return path.read_bytes()
-            except OSError as error:
+                return retried(path, path.read_bytes)
+            except FileNotFoundError as error:
                 raise UnitError(f"{where}: {path} cannot be read ({error.strerror}). {ADVICE}") from error
         raise UnitError(f"{where} holds neither bytes nor a path. {ADVICE}")
 
-    def _numbers(self, table: Any, name: str, where: str) -> np.ndarray:
+    def numbers(self, table: Any, name: str, where: str) -> np.ndarray:
         """float64 [N, size] of a feature."""
         try:
             rows = np.asarray(table[name].to_pylist(), np.float64)
@@ -173,7 +188,7 @@ class LeRobotSource:
             ) from error
         return rows.reshape(len(rows), -1)
 
-    def _texts(self, entry: EpisodeEntry, table: Any, where: str) -> list[str]:
+    def texts(self, entry: EpisodeEntry, table: Any, where: str) -> list[str]:
         if "task_index" not in table.column_names or not self.meta.tasks:
             return [entry.tasks[0] if entry.tasks else ""] * table.num_rows
         indices = table["task_index"].to_pylist()

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.sources.units import require_module
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
+from data_pipelines.sources.rlds.location import is_failure, retried
+from data_pipelines.sources.units import require_module
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 ADVICE = "Fetch the dataset again, meta folder included."
@@ -132,10 +133,16 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
 def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> Any:
     """A pyarrow table. Raises DataError for a file that is missing or damaged."""
     parquet, arrow = require_module("pyarrow.parquet"), require_module("pyarrow")
-    try:
-        return parquet.read_table(path, columns=columns, partitioning=None, **options)
-    except (OSError, arrow.ArrowException) as error:
-        raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
+
+    def read() -> Any:
+        try:
+            return parquet.read_table(path, columns=columns, partitioning=None, **options)
+        except (OSError, arrow.ArrowException) as error:
+            if is_failure(error):
+                raise  # to be tried again
+            raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
+
+    return retried(path, read)
 
 
 def _fill(info: dict[str, Any], field: str, **place: Any) -> str:

@@ -19,18 +19,19 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.sources.units import Episode, Layout, UnitError, choose, require_module
-from data_pipelines.sources.settings import RobomimicSettings
-from data_pipelines.sources.video import shrink
 from data_pipelines.errors import DataError
+from data_pipelines.sources.rlds.location import is_failure, retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.settings import RobomimicSettings
+from data_pipelines.sources.units import Episode, Layout, UnitError, choose, require_module
+from data_pipelines.sources.video import shrink
 from hma_jax.config import ConfigError
 
 CONTROL_RATE = 20.0
 SUCCESS_REWARD = 1.0
 """robosuite's reward of a solved task, sparse or shaped; shaping alone stays below it."""
 
-ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damaged."
+ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damaged (when tokenising, corrupt='skip')."
 
 
 class RobomimicSource:
@@ -43,8 +44,7 @@ class RobomimicSource:
     def __init__(self, path: str | Path, settings: RobomimicSettings = RobomimicSettings()):
         settings.check()
         self.path, self.short_side = Path(path), settings.short_side
-        self._h5py = require_module("h5py")
-        with self._open() as file:
+        with self.open() as file:
             if "data" not in file:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
@@ -67,13 +67,13 @@ class RobomimicSource:
     def read(self, unit: int) -> Iterator[Episode]:
         name = self.units[unit]
         where = f"{self.path}: data/{name}"
-        with self._open() as file:
+        with self.open() as file:
             demo = file["data"][name]
-            actions = self._array(demo, "actions", where)
+            actions = self.array(demo, "actions", where)
             steps = len(actions)
             images = {}
             for camera in self.cameras:
-                frames = self._array(demo, f"obs/{camera}_image", where)
+                frames = self.array(demo, f"obs/{camera}_image", where)
                 if (
                     frames.dtype != np.uint8
                     or frames.ndim != 4
@@ -88,7 +88,7 @@ class RobomimicSource:
             vectors = {"action": actions.reshape(steps, -1)}
             for key in self.layout.vectors:
                 if key != "action":
-                    rows = self._array(demo, _source_key(key), where)
+                    rows = self.array(demo, source_key(key), where)
                     vectors[key] = rows.reshape(len(rows), -1)
             rewards = np.asarray(demo["rewards"]) if "rewards" in demo else None
             dones = np.asarray(demo["dones"]) if "dones" in demo else None
@@ -101,17 +101,21 @@ class RobomimicSource:
             success=succeeded(rewards, dones),
         )
 
-    def _open(self) -> Any:
-        try:
-            return self._h5py.File(self.path, "r")
-        except OSError as error:
-            raise DataError(f"{self.path}: no readable HDF5 file ({error}). Fetch it again.") from error
+    def open(self) -> Any:
+        h5py = require_module("h5py")
 
-    def _array(self, demo: Any, key: str, where: str) -> np.ndarray:
-        try:
-            return np.asarray(demo[key])
-        except (KeyError, OSError) as error:
-            raise UnitError(f"{where}/{key} cannot be read ({error}). {ADVICE}") from error
+        def opened() -> Any:
+            try:
+                return h5py.File(self.path, "r")
+            except OSError as error:
+                if is_failure(error):
+                    raise  # to be tried again
+                raise DataError(f"{self.path}: no readable HDF5 file ({error}). Fetch it again.") from error
+
+        return retried(self.path, opened)
+
+    def array(self, demo: Any, key: str, where: str) -> np.ndarray:
+        return read_rows(demo, key, slice(None), where)
 
     def _read_layout(self, demo: Any, wanted: tuple[str, ...]) -> tuple[Layout, tuple[str, ...]]:
         where = f"{self.path}: {demo.name.lstrip('/')}"
@@ -136,6 +140,20 @@ class RobomimicSource:
         return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras
 
 
+def read_rows(demo: Any, key: str, rows: slice, where: str) -> np.ndarray:
+    """Some rows of a dataset of a demonstration. Raises UnitError, UnreachableError for a failing disk."""
+
+    def read() -> np.ndarray:
+        try:
+            return np.asarray(demo[key][rows])
+        except (KeyError, OSError) as error:
+            if is_failure(error):
+                raise  # to be tried again
+            raise UnitError(f"{where}/{key} cannot be read ({error}). {ADVICE}") from error
+
+    return retried(Path(demo.file.filename), read)
+
+
 def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | None:
     """Whether a demonstration reached its goal; None if the file does not say.
 
@@ -147,7 +165,7 @@ def succeeded(rewards: np.ndarray | None, dones: np.ndarray | None) -> bool | No
     return None if dones is None else bool(np.max(dones, initial=0) > 0)
 
 
-def _source_key(key: str) -> str:
+def source_key(key: str) -> str:
     return "states" if key == "observation/sim_state" else f"obs/{key.removeprefix('observation/')}"
 
 

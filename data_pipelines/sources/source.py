@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -83,10 +83,12 @@ class EpisodeSource(ABC):
 
     name: str
     version: str
+    split: str
     location: Location
     schema: Location  # the file that says which fields there are
     features: Mapping[str, FlatFeature]
     runs: tuple[EpisodeRun, ...]
+    files: int  # that hold its episodes
 
     def __init__(self, corrupt: Corrupt, max_skipped: int):
         require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
@@ -127,6 +129,16 @@ class EpisodeSource(ABC):
     def ids(self) -> np.ndarray:
         """uint64 per episode of `runs`: its name as a number, what splits and subsets hash."""
         return episode_ids(self.runs)
+
+    @abstractmethod
+    def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
+        """Fields of episode `i` by flat key, with all its cameras: numbers as arrays, texts as lists of
+        bytes, images as sequences of `Fetched`. What the episode lacks is absent. Raises EpisodeError."""
+
+    @property
+    def hz(self) -> float | None:
+        """The native rate, where the source says it."""
+        return None
 
     def remember(self) -> None:
         """Keeps what reading has shown, as the steps of episodes, for later starts."""
@@ -201,3 +213,35 @@ class EpisodeSource(ABC):
                 f"{self.name}: {lost} episodes are unusable, more than max_skipped={self.max_skipped}. "
                 f"The last: {reason} Raise max_skipped if the rest is worth it."
             )
+
+
+def join_actions(
+    record: Mapping[str, Any],
+    keys: Sequence[str],
+    features: Mapping[str, FlatFeature],
+    steps: int,
+    unusable: Callable[[str], EpisodeError],
+) -> np.ndarray:
+    """float32 [steps, A]: the fields `keys` (flat, perhaps sliced) of a record, side by side.
+
+    Raises what `unusable` makes of a reason, for fields of another length and values that are not finite.
+    """
+    columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
+    for key in keys:
+        field, part = field_slice(key)
+        values, size = record.get(field, []), features[field].size
+        if not isinstance(values, np.ndarray) or values.size != steps * size or not steps:
+            raise unusable(
+                f"{key!r} has {np.size(values)} values, but {steps} frames of {size} need "
+                f"{steps * size}. Repair the episode, or read with corrupt='skip'."
+            )
+        values = values.reshape(steps, size).astype(np.float32)
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            step = int(np.flatnonzero(~finite)[0])
+            raise unusable(
+                f"{key!r} is not finite at step {step}: {values[step].tolist()}. "
+                "Repair the episode, or read with corrupt='skip'."
+            )
+        columns.append(values[:, part])
+    return np.concatenate(columns, axis=1)

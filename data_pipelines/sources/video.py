@@ -14,11 +14,16 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data_pipelines.sources.units import UnitError, require_module
+from data_pipelines.errors import UnreachableError
 from data_pipelines.sources.rlds.images import decode_image
+from data_pipelines.sources.rlds.location import is_failure, retried
 from data_pipelines.sources.rlds.writer import encode_jpeg
+from data_pipelines.sources.units import UnitError, require_module
 
-ADVICE = "Fetch the file again, or leave it out with --skip-damaged."
+ADVICE = "Fetch the file again, or leave it out with --skip-damaged (when tokenising, corrupt='skip')."
+
+FAR = 2.0
+"""Seconds from which on a jump forward is a seek: frames in between are decoded otherwise."""
 
 
 def shrink(image: np.ndarray, short_side: int | None) -> np.ndarray:
@@ -54,33 +59,34 @@ class Video:
         self._start = self._stream.start_time or 0
         self.rate = float(self._stream.average_rate or self._stream.guessed_rate or 0)
         self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
+        self._coming: Iterator[tuple[float, Any]] | None = None
+        self._around: tuple[Any, Any] = None, None  # the last frame before a time, the first from it on
+        self._shown, self._pixels = None, None
 
     def frames(self, times: Sequence[float]) -> Iterator[np.ndarray]:
-        """The frame nearest to each of `times` (ascending), uint8 [H, W, 3], RGB.
+        """`at` each of `times` (ascending)."""
+        return map(self.at, times)
+
+    def at(self, time: float) -> np.ndarray:
+        """The frame nearest to `time`, uint8 [H, W, 3], RGB; in ascending order each is decoded once.
 
         Raises UnitError where none lies within half a frame's time.
         """
         near = 0.5 / self.rate + 1e-4
-        source = self._from(times[0]) if len(times) else iter(())
-        before: tuple[float, Any] | None = None
-        after = next(source, None)
-        shown, pixels = None, None
-        for time in times:
-            while after is not None and after[0] < time:
-                before, after = after, next(source, None)
-            nearest = min(
-                (f for f in (before, after) if f is not None), key=lambda f: abs(f[0] - time), default=None
-            )
-            if nearest is None or abs(nearest[0] - time) > near:
-                found = (
-                    "the video has no frame" if nearest is None else f"the nearest is at {nearest[0]:.4f} s"
-                )
-                raise UnitError(
-                    f"{self._path}: no frame at {time:.4f} s within {near:.4f} s: {found}. {ADVICE}"
-                )
-            if nearest[1] is not shown:
-                shown, pixels = nearest[1], nearest[1].to_ndarray(format="rgb24")
-            yield pixels
+        before, after = self._around
+        if self._coming is None or time < (before or after or (np.inf,))[0] or (after and time > after[0] + FAR):
+            self._coming = self._from(time)
+            before, after = None, next(self._coming, None)
+        while after is not None and after[0] < time:
+            before, after = after, next(self._coming, None)
+        self._around = before, after
+        nearest = min((f for f in (before, after) if f is not None), key=lambda f: abs(f[0] - time), default=None)
+        if nearest is None or abs(nearest[0] - time) > near:
+            found = "the video has no frame" if nearest is None else f"the nearest is at {nearest[0]:.4f} s"
+            raise UnitError(f"{self._path}: no frame at {time:.4f} s within {near:.4f} s: {found}. {ADVICE}")
+        if nearest[1] is not self._shown:
+            self._shown, self._pixels = nearest[1], nearest[1].to_ndarray(format="rgb24")
+        return self._pixels
 
     def _from(self, time: float) -> Iterator[tuple[float, Any]]:
         """(time, frame) in order, beginning at or before `time`."""
@@ -104,6 +110,8 @@ class Video:
             for frame in self._container.decode(self._stream):
                 yield (frame.pts - self._start) * base, frame
         except (av.FFmpegError, TypeError) as error:  # TypeError: a frame without a time
+            if is_failure(error):
+                raise UnreachableError(f"{self._path}: cannot be read ({error}). Run the same command again.") from error
             raise UnitError(f"{self._path}: it cannot be decoded ({error}). {ADVICE}") from error
 
 
@@ -111,11 +119,16 @@ class Video:
 def open_video(path: Path) -> Iterator[Video]:
     """Raises UnitError for a file that is missing or no video."""
     av = require_module("av")
-    try:
-        container = av.open(str(path))
-    except (OSError, av.FFmpegError) as error:
-        raise UnitError(f"{path}: no readable video ({error}). {ADVICE}") from error
-    with container:
+
+    def opened() -> Any:
+        try:
+            return av.open(str(path))
+        except (OSError, av.FFmpegError) as error:
+            if is_failure(error):
+                raise  # to be tried again
+            raise UnitError(f"{path}: no readable video ({error}). {ADVICE}") from error
+
+    with retried(path, opened) as container:
         if not container.streams.video:
             raise UnitError(f"{path}: it has no video stream. {ADVICE}")
         video = Video(path, container)

@@ -1,4 +1,4 @@
-"""RLDS episodes in, one dataset of the token store out.
+"""Episodes of any source in, one dataset of the token store out.
 
 Owns what is made of an episode: which are held out, which frames are kept, how frames of many
 episodes are put through the tokenizer in equal pieces. Reading ahead is in `read_ahead`; parts,
@@ -24,9 +24,9 @@ import numpy as np
 from data_pipelines.errors import EpisodeError
 from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
-from data_pipelines.sources.source import MAX_SKIPPED
+from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
 from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
@@ -71,17 +71,17 @@ def tokenize_dataset(
 
     Raises ConfigError for keys, settings or a store directory that cannot work, and for a
     dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
-    (see `RldsDataset`).
+    (see `EpisodeSource`).
     """
     require(batch >= 1, f"batch must be at least 1, got {batch}")
-    source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
+    source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = plan_dataset(
         spec, source, tokenizer, val_fraction, min_val, max_val, keep_frames=keep_frames, frame_step=frame_step
     )
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
-        Loss(reason.replace(f"{source.directory}/", ""), episodes=count)
+        Loss(reason.replace(f"{source.location}/", ""), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
@@ -101,7 +101,7 @@ def tokenize_dataset(
 
 def plan_dataset(
     spec: DatasetSpec,
-    source: RldsDataset,
+    source: EpisodeSource,
     tokenizer: Tokenizer,
     val_fraction: float,
     min_val: int,
@@ -163,7 +163,7 @@ class _Work:
     """How the parts of one dataset are made."""
 
     def __init__(
-        self, source: RldsDataset, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int
+        self, source: EpisodeSource, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int
     ):
         s = plan.settings
         self._source, self._plan, self._threads = source, plan, threads
@@ -225,7 +225,7 @@ class _Work:
 
     def _lose(self, error: EpisodeError) -> Loss:
         self._source.skip(error)
-        reason = str(error).replace(f"{self._source.directory}/", "")
+        reason = str(error).replace(f"{self._source.location}/", "")
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
         return Loss(reason, *place)
 

@@ -29,7 +29,7 @@ convert_app = SubcommandApp()
 HELP = "The registry, what a directory holds, other formats, the simulated suites."
 
 CONVERT_HELP = (
-    "Other formats into an RLDS directory, which every command reads. Needs the extra 'convert' "
+    "Other formats into an RLDS directory, as an export: LeRobot and robomimic are read directly too. Needs the extra 'convert' "
     "(pip install 'hma-jax[convert]'). The same command again goes on where it was interrupted."
 )
 
@@ -52,7 +52,7 @@ def data_list(
 
 @data_app.command(name="inspect")
 def data_inspect(
-    directory: Positional[Path],
+    directory: Positional[str],
     hz: float | None = None,
     split: str = "train",
     out: Path | None = None,
@@ -62,11 +62,12 @@ def data_inspect(
     entry: Path | None = None,
     registry: Path | None = None,
 ) -> None:
-    """Show what an RLDS directory holds, draw a contact sheet, and suggest its registry entry.
+    """Show what a dataset holds, draw a contact sheet, and suggest its registry entry.
 
     Args:
-        directory: The dataset: <name> or <name>/<version>, as tfds wrote it.
-        hz: Native rate of its frames; no file says it.
+        directory: The dataset: an RLDS directory (<name> or <name>/<version>, a path or URL), the root of a
+            LeRobot dataset, or a robomimic .hdf5 file.
+        hz: Native rate of its frames, where no file says it (LeRobot and robomimic do).
         split: The split to look at.
         out: Directory for contact_sheet.png; runs/inspect/NAME if not given.
         episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.

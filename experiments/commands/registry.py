@@ -71,7 +71,7 @@ def _table_of(title: str, specs: Sequence[DatasetSpec]):
 
 
 def inspect(
-    directory: Path,
+    directory: str,
     *,
     split: str,
     hz: float | None,
@@ -95,6 +95,7 @@ def inspect(
     with step(f"read {directory}"):
         facts, examples = inspect_dataset(directory, split, episodes=episodes)
     known = find_spec(facts.name)
+    hz = hz or facts.hz
     suggestion = suggest_entry(facts, hz or (known.hz if known else None))
     if entry is not None and (suggestion is None or not suggestion.hz):
         raise ConfigError("--entry needs the native rate, which is not in the files: add --hz")

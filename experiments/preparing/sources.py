@@ -11,18 +11,18 @@ from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
-    from data_pipelines.sources.rlds.dataset import RldsDataset
     from data_pipelines.sources.rlds.location import Location
+    from data_pipelines.sources.source import EpisodeSource
 
 Source = tuple["DatasetSpec", "Location"]
-"""A dataset: how it is read, and its RLDS directory."""
+"""A dataset: how it is read, and where it lies."""
 
 
 def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
-    """The names that RLDS directories give themselves. Raises DataError for one that is none."""
-    from data_pipelines.sources.rlds.schema import dataset_name
+    """The names of the datasets at these locations. Raises DataError for one that is none."""
+    from data_pipelines.sources.open import source_name
 
-    return tuple(map(dataset_name, data))
+    return tuple(map(source_name, data))
 
 
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
@@ -46,9 +46,9 @@ def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
     return sources
 
 
-def open_source(source: Source, settings: StoreConfig) -> RldsDataset:
-    """Indexes a dataset's shards. Raises DataError for damage that `settings` do not allow."""
-    from data_pipelines.sources.rlds.dataset import RldsDataset
+def open_source(source: Source, settings: StoreConfig) -> EpisodeSource:
+    """Opens a dataset. Raises DataError for damage that `settings` do not allow."""
+    from data_pipelines.sources import open as sources
 
     spec, path = source
-    return RldsDataset(path, spec.split, corrupt=settings.corrupt, max_skipped=settings.max_skipped)
+    return sources.open_source(path, spec.split, corrupt=settings.corrupt, max_skipped=settings.max_skipped)

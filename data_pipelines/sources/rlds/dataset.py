@@ -27,7 +27,7 @@ from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing
 from data_pipelines.sources.rlds.schema import field_slice, read_metadata, resolve_version, step_key
 from data_pipelines.sources.rlds.steps import load_steps, save_steps
 from data_pipelines.sources.rlds.tfrecord import open_record, read_parts, scan_shard
-from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, OpenEpisode
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, OpenEpisode, join_actions
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -69,6 +69,7 @@ class RldsDataset(EpisodeSource):
         self.runs = tuple(
             EpisodeRun(path.name, 0, count) for path, count in zip(meta.shards, meta.shard_lengths, strict=True)
         )
+        self.files = len(meta.shards)
         self._paths, self._in_array_records = meta.shards, meta.file_format == "array_record"
         scan = array_record.scan_shard if self._in_array_records else scan_shard
         self._index = load_index(self.directory, split, meta.shards, scan)
@@ -119,7 +120,9 @@ class RldsDataset(EpisodeSource):
         fields = [field_slice(key)[0] for key in action_keys]
         with self._open(i, [image_key, *fields, SUCCESS_KEY]) as record:
             encoded = self._frames_of(i, record, image_key)
-            actions = self._actions(i, record, action_keys, steps=len(encoded))
+            actions = join_actions(
+                record, action_keys, self.features, len(encoded), lambda what: self._unusable(i, what)
+            )
             success = record.get(SUCCESS_KEY)
             known = success is not None and len(success) == 1
             yield OpenEpisode(
@@ -228,26 +231,3 @@ class RldsDataset(EpisodeSource):
                 f"step {step} of {key!r} cannot be decoded: {error}. "
                 "Repair the episode, or read with corrupt='skip'.",
             ) from error
-
-    def _actions(self, i: int, record: dict[str, Feature], keys: list[str], steps: int) -> np.ndarray:
-        columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
-        for key in keys:
-            field, part = field_slice(key)
-            values, size = record.get(field, []), self.features[field].size
-            if not isinstance(values, np.ndarray) or len(values) != steps * size or not steps:
-                raise self._unusable(
-                    i,
-                    f"{key!r} has {len(values)} values, but {steps} frames of {size} need "
-                    f"{steps * size}. Repair the episode, or read with corrupt='skip'.",
-                )
-            values = values.reshape(steps, size).astype(np.float32)
-            finite = np.isfinite(values).all(axis=1)
-            if not finite.all():
-                step = int(np.flatnonzero(~finite)[0])
-                raise self._unusable(
-                    i,
-                    f"{key!r} is not finite at step {step}: {values[step].tolist()}. "
-                    "Repair the episode, or read with corrupt='skip'.",
-                )
-            columns.append(values[:, part])
-        return np.concatenate(columns, axis=1)

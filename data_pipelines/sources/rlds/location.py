@@ -7,9 +7,11 @@ Owns the difference between the two, which nothing else sees: a location has the
 
 from __future__ import annotations
 
+import errno
 import functools
 import os
 import random
+import re
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -29,6 +31,16 @@ T = TypeVar("T")
 
 RETRY_WAITS = (0.1, 0.5, 2.0, 6.0)
 """Seconds before a read that failed is tried again, each time by up to half more or less."""
+
+FAILURES = frozenset(
+    getattr(errno, name)
+    for name in (
+        "EIO ESTALE ETIMEDOUT EREMOTEIO ENXIO ENODEV EAGAIN EBUSY EINTR EMFILE ENFILE ENOMEM ENETDOWN "
+        "ENETUNREACH ECONNRESET ECONNABORTED ECONNREFUSED ENOTCONN EHOSTDOWN EHOSTUNREACH"
+    ).split()
+    if hasattr(errno, name)
+)
+"""What the system says of a disk, a network or itself, and never of what a file holds."""
 
 LASTING = (PermissionError, IsADirectoryError, NotADirectoryError)
 """Failures that no waiting mends."""
@@ -199,6 +211,13 @@ def retried(location: Location, request: Callable[[], T]) -> T:
                 ) from error
             time.sleep(wait * random.uniform(0.5, 1.5))
     raise AssertionError("unreachable")
+
+
+def is_failure(error: Exception) -> bool:
+    """Whether a library's error says that a file cannot be read, and nothing of its bytes."""
+    told = re.search(r"errno\s*[=:]?\s*(\d+)", str(error), re.IGNORECASE)  # HDF5 has it in its words only
+    number = getattr(error, "errno", None) or (int(told[1]) if told else 0)
+    return isinstance(error, PermissionError) or number in FAILURES
 
 
 def missing(location: Location) -> DataError:

@@ -166,7 +166,7 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
             "frame_index": pa.array(range(steps)),
             "episode_index": pa.array([e] * steps),
             "index": pa.array(range(sum(lengths[:e]), sum(lengths[:e]) + steps)),
-            "task_index": pa.array([1 - e] * steps),
+            "task_index": pa.array([(1 - e) % 2] * steps),
         }
         if camera == "image":
             rows[CAMERA] = pa.array([{"bytes": _encoded(24 * e + t), "path": None} for t in range(steps)])

@@ -1,0 +1,207 @@
+"""A LeRobot dataset read where it lies: episodes in random access, frames decoded from its videos.
+
+Owns what `lerobot` leaves open: names, sizes and the fingerprint of episodes, and one frame at a time.
+An episode's name is its `episode_index`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.errors import EpisodeError
+from data_pipelines.sources.identity import EpisodeRun
+from data_pipelines.sources.lerobot import SUCCESS, LeRobotSource
+from data_pipelines.sources.lerobot_meta import EpisodeEntry
+from data_pipelines.sources.rlds.images import decode_image
+from data_pipelines.sources.rlds.location import retried
+from data_pipelines.sources.rlds.schema import FlatFeature, field_slice, step_key
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, Fetched, OpenEpisode, join_actions
+from data_pipelines.sources.video import open_video
+from hma_jax.config import require
+
+INSTRUCTION, SUCCESS_KEY = "steps/language_instruction", "episode_metadata/success"
+
+
+class LeRobotDataset(EpisodeSource):
+    """Every episode of a LeRobot directory, versions 2.0, 2.1 and 3.0.
+
+    Cameras are `observation/<name>`, numeric features `observation/<name>` and `action`, as the export
+    to RLDS names them. Raises DataError for a directory of another layout, ConfigError for another
+    split than train: the files know no other.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str = "train",
+        *,
+        corrupt: Corrupt = "raise",
+        max_skipped: int = MAX_SKIPPED,
+    ):
+        super().__init__(corrupt, max_skipped)
+        require(split == "train", f"{root}: no split {split!r}; a LeRobot dataset has one, 'train'.")
+        self.location, self.split = Path(root), split
+        self.schema = self.location / "meta" / "info.json"
+        self.name = dataset_name(self.location)
+        self._read = LeRobotSource(root)
+        self._entries = self._read.meta.episodes
+        self.version = self._read.meta.version
+        self._cameras = {step_key(k): name for k, name in self._read.cameras.items()}
+        self._vectors = {step_key(k): name for k, name in self._read.vectors.items()}
+        sizes = {step_key(k): size for k, size in self._read.layout.vectors.items()}
+        self.features = {
+            **{key: FlatFeature(image=True, size=0) for key in self._cameras},
+            **{key: FlatFeature(image=False, size=sizes[key]) for key in self._vectors},
+        }
+        self._numbered = np.asarray([e.index for e in self._entries], np.int64)
+        self.runs = _runs(self._numbered)
+        self._lengths = np.asarray([e.length for e in self._entries], np.int64)
+        self._paths = sorted({p for e in self._entries for p in (e.data, *(f for f, _ in e.videos.values()))})
+        self.files = len(self._paths)
+        self._bytes = {path: _size(path) for path in self._paths}
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def hz(self) -> float:
+        return self._read.hz
+
+    @property
+    def numbers(self) -> np.ndarray:
+        return np.arange(len(self), dtype=np.int64)
+
+    def fingerprint(self) -> str:
+        """Hash over the meta folder, statistics of episodes included, and all files' names and sizes."""
+        digest = hashlib.sha256()
+        meta = self.location / "meta"
+        for path in sorted(p for p in meta.rglob("*") if p.is_file()):
+            content = hashlib.sha256(retried(path, path.read_bytes)).hexdigest()
+            digest.update(f"{path.relative_to(meta).as_posix()}:{content};".encode())
+        for path, size in self._bytes.items():
+            digest.update(f"{path.relative_to(self.location).as_posix()}:{size};".encode())
+        return digest.hexdigest()[:16]
+
+    def sizes(self) -> np.ndarray:
+        """int64 [episodes]: each one's share of all files, by its length."""
+        whole = sum(self._bytes.values())
+        return np.maximum(self._lengths * whole // max(int(self._lengths.sum()), 1), 1)
+
+    def steps(self) -> np.ndarray:
+        return self._lengths.astype(np.int32)
+
+    @contextmanager
+    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
+        self.check_keys(image_key, action_keys)
+        camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
+        entry, where = self._entries[i], self._where(i)
+        with ExitStack() as stack:
+            if not keys and self._cameras[camera] in entry.videos:  # frames alone: no table is needed
+                steps, actions, success = entry.length, np.zeros((entry.length, 0), np.float32), None
+                table, times = None, np.arange(steps) / self.hz
+            else:
+                table = self._table(i)
+                steps, times, success = table.num_rows, self._read.times(table, where), self._success(table, where)
+                fields = {field_slice(key)[0] for key in keys}
+                record = {f: self._read.numbers(table, self._vectors[f], where) for f in fields}
+                actions = join_actions(
+                    record, keys, self.features, steps, lambda what: EpisodeError(f"{where}: {what}").at(entry.data, -1)
+                )
+            fetch = self._fetch(stack, entry, self._cameras[camera], table, times, where)
+            yield OpenEpisode(i, actions, success, fetch, lambda n, data: _decode(data, f"{where}, step {n}"))
+
+    def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
+        table, where, entry = self._table(i), self._where(i), self._entries[i]
+        times = self._read.times(table, where)
+        found: dict[str, Any] = {}
+        for key in keys:
+            if key in self._vectors:
+                found[key] = self._read.numbers(table, self._vectors[key], where).astype(np.float32).ravel()
+            elif key in self._cameras:
+                found[key] = _Frames(self, entry, self._cameras[key], table, times, where)
+            elif key == INSTRUCTION:
+                found[key] = [text.encode() for text in self._read.texts(entry, table, where)]
+            elif key == SUCCESS_KEY and (success := self._success(table, where)) is not None:
+                found[key] = np.array([success], np.int64)
+        return found
+
+    def _where(self, i: int) -> str:
+        return f"{self.name}, episode {self._entries[i].index} ({self._entries[i].data.name})"
+
+    def _table(self, i: int) -> Any:
+        entry = self._entries[i]
+        table = self._read.rows(entry)
+        if table.num_rows != entry.length:
+            raise EpisodeError(
+                f"{self._where(i)} has {table.num_rows} rows, but the meta folder says {entry.length}. "
+                "Fetch the dataset again, or leave the episode out with corrupt='skip'."
+            ).at(entry.data, -1)
+        return table
+
+    def _success(self, table: Any, where: str) -> bool | None:
+        return bool(self._read.numbers(table, SUCCESS, where)[-1].any()) if SUCCESS in table.column_names else None
+
+    def _fetch(
+        self, stack: ExitStack, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str
+    ) -> Callable[[int], Fetched]:
+        """Frames of one camera while `stack` is open."""
+        if name in entry.videos:
+            path, begin = entry.videos[name]
+            video = stack.enter_context(open_video(path))
+            return lambda n: video.at(float(times[n] + begin))
+        if name not in table.column_names:
+            raise EpisodeError(f"{where}: no column {name!r}, though the feature is an image. Fetch it again.")
+        return lambda n: self._read.image_bytes(table[name][n].as_py(), f"{where}: {name!r} at row {n}")
+
+
+class _Frames(Sequence[Fetched]):
+    """The frames of one camera, each read when it is asked for."""
+
+    nbytes = 0  # none is held
+
+    def __init__(self, source: LeRobotDataset, entry: EpisodeEntry, *place: Any):
+        self._source, self._entry, self._place, self._length = source, entry, place, entry.length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, n: int) -> Fetched:
+        with ExitStack() as stack:
+            return self._source._fetch(stack, self._entry, *self._place)(n)
+
+
+def dataset_name(root: Path) -> str:
+    """What the directory is called, as names of datasets are written."""
+    return re.sub(r"[^a-z0-9_]+", "_", root.absolute().name.lower()).strip("_")
+
+
+def _decode(data: Fetched, where: str) -> np.ndarray:
+    if isinstance(data, np.ndarray):
+        return data
+    try:
+        return decode_image(data)
+    except ValueError as error:
+        raise EpisodeError(f"{where} cannot be decoded: {error}. Repair it, or read with corrupt='skip'.") from error
+
+
+def _runs(numbers: np.ndarray) -> tuple[EpisodeRun, ...]:
+    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 2) != 1)
+    ends = [*starts[1:].tolist(), len(numbers)]
+    return tuple(
+        EpisodeRun("episodes", int(numbers[a]), b - a) for a, b in zip(starts.tolist(), ends, strict=True)
+    )
+
+
+def _size(path: Path) -> int:
+    try:
+        return retried(path, lambda: os.stat(path)).st_size
+    except FileNotFoundError:
+        return 0  # its episodes cannot be read, as reading them says

@@ -1,0 +1,78 @@
+"""Any dataset by its location: which format lies there, and the source that reads it.
+
+Owns that choice. A new format is one more source and one line here.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from data_pipelines.sources.rlds.location import OpenFiles, is_remote, locate
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.rlds.location import Location
+
+HDF5 = (".hdf5", ".h5")
+
+FORMATS = "an RLDS directory (<name> or <name>/<version>), the root of a LeRobot dataset, or a robomimic .hdf5 file"
+"""What a location may be, for messages and help."""
+
+
+def find_format(location: str | Location) -> str:
+    """'rlds', 'lerobot' or 'robomimic', by what lies there; 'rlds' where nothing does."""
+    place = locate(location)
+    if place.suffix in HDF5 and not place.is_dir():
+        found = "robomimic"
+    elif (place / "meta" / "info.json").is_file():
+        found = "lerobot"
+    else:
+        return "rlds"
+    require(not is_remote(place), f"{place}: {found} is read from a disk only. Copy the dataset to one.")
+    return found
+
+
+def open_source(
+    location: str | Location,
+    split: str = "train",
+    *,
+    corrupt: Corrupt = "raise",
+    max_skipped: int = MAX_SKIPPED,
+    files: OpenFiles | None = None,
+) -> EpisodeSource:
+    """The episodes of one split of the dataset at `location`; `files` may be shared by several.
+
+    Raises DataError for a location that is no dataset, and for damage that `corrupt` does not allow;
+    ConfigError for an unknown split and for a library that is missing.
+    """
+    options = {"corrupt": corrupt, "max_skipped": max_skipped}
+    kind = find_format(location)
+    if kind == "lerobot":
+        from data_pipelines.sources.lerobot_dataset import LeRobotDataset
+
+        return LeRobotDataset(locate(location), split, **options)
+    if kind == "robomimic":
+        from data_pipelines.sources.robomimic_dataset import RobomimicDataset
+
+        return RobomimicDataset(locate(location), split, **options)
+    from data_pipelines.sources.rlds.dataset import RldsDataset
+
+    return RldsDataset(location, split, files=files, **options)
+
+
+def source_name(location: str | Location) -> str:
+    """The name of the dataset at `location`, by which the registry knows it. Raises DataError for none."""
+    kind = find_format(location)
+    if kind == "lerobot":
+        from data_pipelines.sources.lerobot_dataset import dataset_name
+
+        return dataset_name(locate(location))
+    if kind == "robomimic":
+        from data_pipelines.sources.robomimic import RobomimicSource
+        from data_pipelines.sources.robomimic_dataset import dataset_name as name_of
+
+        return name_of(RobomimicSource(locate(location)))
+    from data_pipelines.sources.rlds.schema import dataset_name as rlds_name
+
+    return rlds_name(location)

@@ -1,0 +1,185 @@
+"""A robomimic file read where it lies: demonstrations in random access, frames from its arrays.
+
+Owns what `robomimic` leaves open: names, sizes and the fingerprint of demonstrations, and a few frames
+at a time. A demonstration's name is that of the file and its number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.errors import EpisodeError
+from data_pipelines.sources.identity import EpisodeRun
+from data_pipelines.sources.rlds.schema import FlatFeature, field_slice, step_key
+from data_pipelines.sources.robomimic import RobomimicSource, read_rows, source_key, succeeded
+from data_pipelines.sources.settings import RobomimicSettings
+from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, Fetched, OpenEpisode, join_actions
+
+INSTRUCTION, SUCCESS_KEY = "steps/language_instruction", "episode_metadata/success"
+
+BLOCK = 16
+"""Frames read at least: files are often compressed in chunks of several."""
+
+
+class RobomimicDataset(EpisodeSource):
+    """The demonstrations of a robomimic HDF5 file: all of them as split `train`, or those of a mask.
+
+    Raises DataError for a file of another layout or without images, ConfigError for an unknown mask.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        split: str = "train",
+        *,
+        corrupt: Corrupt = "raise",
+        max_skipped: int = MAX_SKIPPED,
+    ):
+        super().__init__(corrupt, max_skipped)
+        self.location = self.schema = Path(path)
+        self.split, self.version, self.files = split, "", 1
+        self._read = RobomimicSource(path, RobomimicSettings(filter_key=None if split == "train" else split))
+        self.name = dataset_name(self._read)
+        self._demos = list(self._read.units)
+        layout = self._read.layout
+        self.features = {
+            **{step_key(key): FlatFeature(image=True, size=0) for key in layout.images},
+            **{step_key(key): FlatFeature(image=False, size=size) for key, size in layout.vectors.items()},
+        }
+        numbers = [int(name.removeprefix("demo_")) for name in self._demos]
+        self.runs = tuple(EpisodeRun(self.location.name, number, 1) for number in numbers)
+        with self._read.open() as file:
+            demos = [file["data"][name] for name in self._demos]
+            self._lengths = np.asarray([len(d["actions"]) if "actions" in d else -1 for d in demos], np.int32)
+        self._bytes = self.location.stat().st_size
+
+    def __len__(self) -> int:
+        return len(self._demos)
+
+    @property
+    def hz(self) -> float:
+        return self._read.hz
+
+    @property
+    def numbers(self) -> np.ndarray:
+        return np.arange(len(self), dtype=np.int64)
+
+    def fingerprint(self) -> str:
+        """Hash over the file's size, and the name and actions of every demonstration."""
+        digest = hashlib.sha256(f"{self._bytes};".encode())
+        with self._read.open() as file:
+            for name in self._demos:
+                digest.update(f"{name}:".encode())
+                if "actions" in file["data"][name]:
+                    rows = read_rows(file["data"][name], "actions", slice(None), f"{self.location}: data/{name}")
+                    digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
+        return digest.hexdigest()[:16]
+
+    def sizes(self) -> np.ndarray:
+        """int64 [episodes]: each one's share of the file, by its length."""
+        lengths = np.maximum(self._lengths, 0).astype(np.int64)
+        return np.maximum(lengths * self._bytes // max(int(lengths.sum()), 1), 1)
+
+    def steps(self) -> np.ndarray:
+        return self._lengths
+
+    @contextmanager
+    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
+        self.check_keys(image_key, action_keys)
+        camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
+        with self._read.open() as file:
+            demo, where = file["data"][self._demos[i]], self._where(i)
+            frames = _Frames(demo, _path(camera, image=True), where)
+            if "actions" in demo and len(frames) != len(demo["actions"]):
+                self._refuse(i, f"{len(frames)} frames of {camera!r} for {len(demo['actions'])} actions")
+            fields = {field_slice(key)[0] for key in keys}
+            record = {f: read_rows(demo, _path(f), slice(None), where) for f in fields}
+            actions = join_actions(
+                record, keys, self.features, len(frames), lambda what: EpisodeError(f"{where}: {what}").at(self.location, -1)
+            )
+            yield OpenEpisode(i, actions, self._success(demo, where), frames.__getitem__, lambda n, data: data)
+
+    def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
+        where, found = self._where(i), {}
+        with self._read.open() as file:
+            demo = file["data"][self._demos[i]]
+            for key in keys:
+                if key in self.features and self.features[key].image:
+                    found[key] = _Opened(self, i, key, len(_Frames(demo, _path(key, image=True), where)))
+                elif key in self.features:
+                    found[key] = read_rows(demo, _path(key), slice(None), where).astype(np.float32).ravel()
+                elif key == INSTRUCTION:
+                    found[key] = [self._read.task.encode()] * max(int(self._lengths[i]), 0)
+                elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
+                    found[key] = np.array([success], np.int64)
+        return found
+
+    def _where(self, i: int) -> str:
+        return f"{self.location}: data/{self._demos[i]}"
+
+    def _refuse(self, i: int, what: str) -> None:
+        raise EpisodeError(f"{self._where(i)}: {what}; leave it out with corrupt='skip'.").at(self.location, -1)
+
+    def _success(self, demo: Any, where: str) -> bool | None:
+        rewards, dones = (
+            read_rows(demo, key, slice(None), where) if key in demo else None for key in ("rewards", "dones")
+        )
+        return succeeded(rewards, dones)
+
+
+class _Frames(Sequence[Fetched]):
+    """Frames of an array of a demonstration, while its file is open. One thread at a time."""
+
+    def __init__(self, demo: Any, key: str, where: str):
+        array = demo.get(key)
+        if array is None or array.dtype != np.uint8 or array.ndim != 4 or array.shape[3] != 3:
+            what = "is not there" if array is None else f"is {array.dtype} {list(array.shape)}"
+            raise EpisodeError(f"{where}/{key} {what}; uint8 images [N, H, W, 3] were expected. Fetch the file again.")
+        self._demo, self._key, self._where, self._length = demo, key, where, len(array)
+        self._rows = max(array.chunks[0] if array.chunks else 1, BLOCK)
+        self._at, self._block = -1, np.zeros((0, 0, 0, 3), np.uint8)
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, n: int) -> np.ndarray:
+        at = n // self._rows
+        if at != self._at:
+            rows = slice(at * self._rows, (at + 1) * self._rows)
+            self._at, self._block = at, read_rows(self._demo, self._key, rows, self._where)
+        return self._block[n - at * self._rows]
+
+
+class _Opened(Sequence[Fetched]):
+    """The frames of one camera, each read when it is asked for."""
+
+    nbytes = 0  # none is held
+
+    def __init__(self, source: RobomimicDataset, i: int, key: str, length: int):
+        self._source, self._i, self._key, self._length = source, i, key, length
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, n: int) -> np.ndarray:
+        with self._source.open_episode(self._i, self._key, ()) as episode:
+            return episode.image(n)
+
+
+def dataset_name(source: RobomimicSource) -> str:
+    """`robomimic_<task>`, as names of datasets are written."""
+    return re.sub(r"[^a-z0-9_]+", "_", f"robomimic_{source.task}".lower()).strip("_")
+
+
+def _path(key: str, image: bool = False) -> str:
+    """Where a field lies in a demonstration."""
+    field = key.removeprefix("steps/")
+    path = "actions" if field == "action" else source_key(field)
+    return f"{path}_image" if image else path

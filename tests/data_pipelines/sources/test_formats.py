@@ -1,0 +1,248 @@
+"""Every format is read where it lies: the same episodes, frames and actions, by the same interface."""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import json
+import pickle
+import shutil
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
+from data_pipelines.inspection.inspect import inspect_dataset
+from data_pipelines.inspection.suggest import suggest_entry
+from data_pipelines.loading.frames import make_frame_loader
+from data_pipelines.registry import DatasetSpec
+from data_pipelines.sources.open import find_format, open_source, source_name
+from data_pipelines.sources.rlds import location
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from hma_jax.config import ConfigError
+from tests.data_pipelines.convert.sources import (
+    demo_actions,
+    lerobot_actions,
+    number,
+    write_lerobot,
+    write_robomimic,
+    write_video,
+)
+from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+
+TOP = DatasetSpec("toy_arm", "observation/top", ("action",), (3,), 10)
+VIEW = DatasetSpec("robomimic_lift", "observation/agentview", ("action",), (7,), 20)
+
+
+def check_lerobot(source, lengths=(12, 9)):
+    assert (source.name, source.hz, len(source)) == ("toy_arm", 10, len(lengths))
+    source.check_keys(TOP.image_key, TOP.action_keys, TOP.action_dims)
+    assert source.steps().tolist() == list(lengths) and (source.sizes() > 0).all()
+    for e, steps in enumerate(lengths):
+        episode = source.episode(e, TOP.image_key, TOP.action_keys)
+        assert [number(image) for image in episode.images] == [24 * e + t for t in range(steps)]
+        np.testing.assert_array_equal(episode.actions, lerobot_actions(e, steps))
+        assert episode.success is (e == 0)
+        chosen = source.frames(e, TOP.image_key, lambda n: [n - 1, 0, 3, 3])
+        assert [number(image) for image in chosen] == [24 * e + t for t in (steps - 1, 0, 3, 3)]
+
+
+@pytest.mark.parametrize("camera", ["video", "image"])
+@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v3.0"])
+def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
+    root = write_lerobot(tmp_path / "toy-arm", version, camera=camera)
+    assert find_format(root) == "lerobot" and source_name(str(root)) == "toy_arm"
+    source = open_source(root)
+    check_lerobot(source)
+    check_lerobot(pickle.loads(pickle.dumps(source)))
+    assert open_source(root).fingerprint() == source.fingerprint()
+    shutil.copytree(root, tmp_path / "elsewhere" / "toy-arm")
+    assert open_source(tmp_path / "elsewhere" / "toy-arm").fingerprint() == source.fingerprint()
+
+
+def test_lerobot_actions_alone_can_be_sliced_and_be_none(tmp_path):
+    source = open_source(write_lerobot(tmp_path / "toy-arm", "v2.1"))
+    assert source.episode(1, TOP.image_key, ("action[:2]", "observation/state")).actions[3].tolist() == [
+        *lerobot_actions(1, 9)[3, :2], 1, 3
+    ]  # fmt: skip
+    assert source.episode(1, TOP.image_key, ()).actions.shape == (9, 0)
+    with pytest.raises(ConfigError, match="toy_arm: no image 'observation/tip' in .*info.json; images there: "):
+        source.check_keys("observation/tip", ())
+
+
+def test_an_episode_of_lerobot_keeps_its_name_when_others_are_gone(tmp_path):
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1", lengths=(12, 9, 7))
+    ids = open_source(root).ids
+    path = root / "meta" / "episodes.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text(lines[0] + lines[2])
+    assert open_source(root).ids.tolist() == [ids[0], ids[2]]
+
+
+def test_robomimic_is_read_where_it_lies(tmp_path):
+    path = write_robomimic(tmp_path / "image.hdf5", lengths=(5, 23, 4))
+    assert find_format(path) == "robomimic" and source_name(str(path)) == "robomimic_lift"
+    for source in (open_source(path), pickle.loads(pickle.dumps(open_source(path)))):
+        assert (source.name, source.hz, source.steps().tolist()) == ("robomimic_lift", 20, [5, 23, 4])
+        source.check_keys(VIEW.image_key, VIEW.action_keys, VIEW.action_dims)
+        for k, steps in enumerate((5, 23, 4)):
+            episode = source.episode(k, VIEW.image_key, VIEW.action_keys)
+            assert [number(image) for image in episode.images] == [24 * k + t for t in range(steps)]
+            np.testing.assert_array_equal(episode.actions, demo_actions(k, steps).astype(np.float32))
+            assert episode.success is (k != 1)
+        backward = source.frames(1, "observation/robot0_eye_in_hand", lambda n: [0, 22, 1])
+        assert [number(image) for image in backward] == [46, 24, 45]
+    some = open_source(path, "valid")
+    assert some.episode(0, VIEW.image_key, ()).steps == 23 and some.ids.tolist() == [open_source(path).ids[1]]
+
+
+def as_array_records(directory):
+    """The same RLDS directory with ArrayRecord shards, as tfds writes them."""
+    from array_record.python.array_record_module import ArrayRecordWriter
+
+    source = RldsDataset(directory)
+    out = directory.parent.parent / "records" / "1.0.0"
+    shutil.copytree(directory, out, ignore=shutil.ignore_patterns("*tfrecord*"))
+    info = json.loads((directory / "dataset_info.json").read_text()) | {"fileFormat": "array_record"}
+    (out / "dataset_info.json").write_text(json.dumps(info))
+    from data_pipelines.sources.rlds.tfrecord import read_record
+
+    counts, i = [int(n) for n in info["splits"][0]["shardLengths"]], 0
+    for k, count in enumerate(counts):
+        name = f"{source.name}-train.array_record-{k:05d}-of-{len(counts):05d}"
+        writer = ArrayRecordWriter(str(out / name), "group_size:1")
+        for _ in range(count):
+            writer.write(read_record(*source._place(i)))
+            i += 1
+        writer.close()
+    return out
+
+
+@pytest.fixture
+def records(tmp_path):
+    return as_array_records(write_rlds(tmp_path, make_spec(), [5, 6, 7, 8, 9, 10], shards=2))
+
+
+def test_array_records_are_read_as_tfrecords_are(tmp_path, records):
+    spec = make_spec()
+    one, other = RldsDataset(tmp_path / "toy"), open_source(records)
+    assert len(other) == 6 and other.runs[1].file == "toy-train.array_record-00001-of-00002"
+    for i in (5, 0, 3):
+        a, b = (s.episode(i, spec.image_key, spec.action_keys) for s in (one, other))
+        assert np.array_equal(a.images, b.images) and np.array_equal(a.actions, b.actions)
+        assert np.array_equal(other.frames(i, spec.image_key, lambda n: [n - 1]), [a.images[-1]])
+    assert pickle.loads(pickle.dumps(other)).fingerprint() == open_source(records).fingerprint()
+
+
+def test_damage_in_array_records_is_named(records):
+    spec, shard = make_spec(), records / "toy-train.array_record-00001-of-00002"
+    data = bytearray(shard.read_bytes())
+    open_source(records)
+    for at in range(100, len(data) // 2):  # the middle of a record, whichever
+        data[at] ^= 0xFF
+    shard.write_bytes(data)
+    with pytest.raises(DataError, match="00001-of-00002"):
+        source = open_source(records)
+        for i in range(3, 6):
+            source.episode(i, spec.image_key, spec.action_keys)
+    shard.unlink()
+    with pytest.raises(DataError, match="00001-of-00002: the shard is missing"):
+        open_source(records)
+
+
+def test_a_format_that_is_not_known_is_one_clear_message(records):
+    info = json.loads((records / "dataset_info.json").read_text()) | {"fileFormat": "riegeli"}
+    (records / "dataset_info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match="only tfrecord and array_record can be read"):
+        open_source(records)
+
+
+@pytest.fixture
+def places(tmp_path, records):
+    """A dataset of each format, with its entry."""
+    return [
+        (TOP, write_lerobot(tmp_path / "toy-arm", "v3.0", lengths=(12, 9, 10, 11))),
+        (VIEW, write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4, 6))),
+        (make_spec(), records),
+    ]
+
+
+def test_every_format_is_tokenised_directly(tmp_path, places):
+    for spec, place in places:
+        tokenize_dataset(spec, place, FakeTokenizer(), tmp_path / "store", frame_step=1)
+        tokenize_dataset(spec, str(place), FakeTokenizer(), tmp_path / "again", frame_step=1, threads=1, batch=3)
+    store = TokenStore(tmp_path / "store")
+    assert store.hash() == TokenStore(tmp_path / "again").hash()
+    for spec, place in places:
+        source, manifest = open_source(place), store.manifest(spec.name)
+        assert sorted((*manifest.train.episodes, *manifest.val.episodes)) == list(range(len(source)))
+        for at, i in enumerate(manifest.train.episodes):
+            stored, raw = store.episode(spec.name, "train", at), source.episode(i, spec.image_key, spec.action_keys)
+            assert stored.episode == i and len(stored.tokens) == raw.steps
+            np.testing.assert_array_equal(stored.actions, raw.actions)
+    assert not list(tmp_path.rglob("*.jpg"))
+
+
+def test_every_format_gives_frames_to_a_tokenizer(places):
+    frames = [next(make_frame_loader([place], 8, 8, seed=0)) for place in places]
+    assert all(f.shape == (8, 8, 8, 3) for f in frames) and frames[0].std() > 1
+    mixed = list(itertools.islice(make_frame_loader(places, 8, 8, seed=0, threads=3), 4))
+    assert np.array_equal(mixed, list(itertools.islice(make_frame_loader(places, 8, 8, seed=0, threads=0), 4)))
+
+
+def test_every_format_is_inspected(places):
+    for spec, place in places[:2]:
+        facts, shown = inspect_dataset(place)
+        assert (facts.name, facts.hz, facts.episodes, facts.sampled) == (spec.name, spec.hz, 4, 4)
+        assert spec.image_key in [c.key for c in facts.cameras] and shown[0].instruction
+        assert spec.image_key in shown[0].frames and not facts.damaged
+        entry = suggest_entry(facts, facts.hz)
+        assert (entry.image_key, entry.action_keys, entry.action_dims) == (spec.image_key, spec.action_keys, spec.action_dims)
+
+
+# --- damage and failure ----------------------------------------------------------------------------
+
+
+def test_a_damaged_video_loses_its_episode_alone(tmp_path):
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1", lengths=(12, 9, 10, 11))
+    clip = sorted(root.rglob("*.mp4"))[2]
+    clip.write_bytes(clip.read_bytes()[:200])
+    with pytest.raises(EpisodeError, match=clip.name):
+        tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "a", frame_step=1)
+    manifest = tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "b", frame_step=1, corrupt="skip")
+    assert manifest.lost == 1 and 2 not in (*manifest.train.episodes, *manifest.val.episodes)
+    clip.unlink()
+    write_video(clip, [48 + t for t in range(6)], 10)  # shorter than the table says
+    with pytest.raises(EpisodeError, match="no frame at"):
+        tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "c", frame_step=1)
+
+
+def test_a_disk_that_fails_is_no_damage_of_a_video(tmp_path, monkeypatch):
+    source = open_source(write_lerobot(tmp_path / "toy-arm", "v2.1"), corrupt="skip")
+    monkeypatch.setattr(location.time, "sleep", lambda seconds: None)
+    av = pytest.importorskip("av")
+
+    def failing(path, *args, **options):
+        raise OSError(errno.ESTALE, "Stale file handle", path)
+
+    monkeypatch.setattr(av, "open", failing)
+    with pytest.raises(UnreachableError, match="Stale file handle"):
+        source.episode(0, TOP.image_key, ())
+    monkeypatch.undo()
+    assert source.episode(0, TOP.image_key, ()).steps == 12
+
+
+def test_what_is_no_dataset_is_named(tmp_path):
+    with pytest.raises(DataError, match="no such directory"):
+        open_source(tmp_path / "absent")
+    (tmp_path / "x.hdf5").write_bytes(b"no file of this kind")
+    with pytest.raises(DataError, match="x.hdf5: no readable HDF5 file"):
+        open_source(tmp_path / "x.hdf5")
+    with pytest.raises(ConfigError, match="no split 'test'"):
+        open_source(write_lerobot(tmp_path / "toy-arm", "v2.1"), "test")
+
+
+def test_corrupt_records_are_episode_errors():
+    assert issubclass(CorruptRecordError, EpisodeError) and not issubclass(UnreachableError, EpisodeError)
