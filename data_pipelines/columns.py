@@ -16,7 +16,7 @@ import hashlib
 import json
 import os
 import secrets
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np
             raise ValueError(f"column {name!r} is {array.dtype.str} {list(array.shape)}; it must be one of {DTYPES}")
         digest = hashlib.sha256(array.data).hexdigest()
         table[name], arrays[name] = [array.dtype.str, len(array), at, digest], array
-        end = at + array.nbytes
+        end = at + array.nbytes if array.nbytes else end
         at = _aligned(end)
     header = json.dumps({"facts": facts, "columns": table}, sort_keys=True).encode()
     aside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
@@ -132,6 +132,57 @@ class Columns:
 
     def _damaged(self, reason: str) -> DataError:
         return DataError(f"{self.path}: damaged: {reason}.")
+
+
+class Column(Sequence[int]):
+    """Whole numbers behind the interface of a tuple, as one array; a column of a file is read when it is used."""
+
+    def __init__(self, values: Iterable[int] | np.ndarray = (), dtype: str = "<i4"):
+        array = values if isinstance(values, np.ndarray) else np.fromiter(values, np.int64)
+        self._array: np.ndarray | None = array.astype(dtype)
+        if array.ndim != 1 or not np.array_equal(self._array, array):
+            raise ValueError(f"{array.dtype} {list(array.shape)} is no column of {dtype}")
+        self._lazy: tuple[Columns, str] | None = None
+
+    @classmethod
+    def of(cls, columns: Columns, name: str) -> Column:
+        """A column of a file, which is read, and verified, when its entries are asked for."""
+        made = cls.__new__(cls)
+        made._array, made._lazy = None, (columns, name)
+        return made
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        array = self._lazy[0][self._lazy[1]] if self._array is None else self._array
+        array = array if dtype is None else array.astype(dtype, copy=False)
+        return array.copy() if copy else array
+
+    def __len__(self) -> int:
+        return len(self._array) if self._lazy is None else self._lazy[0].entries(self._lazy[1])
+
+    def __getitem__(self, i):
+        found = np.asarray(self)[i]
+        return Column(found) if isinstance(i, slice) else int(found)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(np.asarray(self).tolist())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, (Column, tuple)) and np.array_equal(np.asarray(self), np.asarray(other))
+
+    def __hash__(self) -> int:
+        return hash(self.digest())
+
+    def __repr__(self) -> str:
+        return f"Column of {len(self):,}"
+
+    def __reduce__(self):
+        return Column, (np.asarray(self),)
+
+    def digest(self) -> str:
+        """SHA-256 of the entries; of a column of a file as it was written, without reading it."""
+        if self._lazy is not None:
+            return self._lazy[0].digest(self._lazy[1])
+        return hashlib.sha256(self._array.data).hexdigest()
 
 
 def _aligned(at: int) -> int:

@@ -190,10 +190,7 @@ def _publish(
     if not manifest.train.episodes:
         raise DataError(f"{plan.spec.name}: no usable episode is left to train on.")
     with scratch(_aside(work)) as aside:
-        text = aside / FILE
-        text.write_text(manifest.to_text())
-        sync(text)
-        os.replace(text, work / FILE)
+        manifest.save(work, aside)
     sync(work)
     try:
         os.rename(work, final)

@@ -1,19 +1,22 @@
 """The manifest of one tokenised dataset: what it was made from, how, and what it holds.
 
-Owns the facts and their JSON. It holds no path and no time, so tokenising the same data in
+Owns the facts and their files: `manifest.json`, and `episodes.columns` for what there is an entry of
+per episode, which is read when it is used. It holds no path and no time, so tokenising the same data in
 the same way gives the same manifest, and its hash identifies the data of a run.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from data_pipelines.columns import Column, Columns, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.identity import EpisodeRun
@@ -23,11 +26,12 @@ from hma_jax.model.embodiments import Embodiment
 
 FILE = "manifest.json"
 SPLITS = ("train", "val")
+COLUMNS_FILE = "episodes.columns"
 LISTS = ("episodes", "steps")
-"""Lists with an entry per episode: up to millions, so no code looks at them one by one."""
+"""Columns with an entry per episode: up to millions, so no code looks at them one by one."""
 
-FORMAT = 2
-"""Of the store's layout; 1 had one file per split."""
+FORMAT, READ = 3, (2, 3)
+"""Of the store's layout, and those that are read. 1 had one file per split, 2 the columns as JSON."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +71,20 @@ class JobSettings:
 class SplitFacts:
     """The episodes of one split, in store order."""
 
-    episodes: tuple[int, ...] = ()  # number in the source, damaged ones counted
-    steps: tuple[int, ...] = ()  # native frames N
+    episodes: Sequence[int] = ()  # number in the source, damaged ones counted
+    steps: Sequence[int] = ()  # native frames N
     content: str = ""  # hash over all records
     parts: tuple[int, ...] = ()  # episodes in each part; there is no file for 0
 
+    def __post_init__(self):
+        for name in LISTS:
+            values = getattr(self, name)
+            if len(values) and not isinstance(values, Column):
+                object.__setattr__(self, name, Column(values))
+
     @property
     def native_frames(self) -> int:
-        return sum(self.steps)
+        return int(np.sum(self.steps, dtype=np.int64))
 
 
 @dataclass(frozen=True)
@@ -142,24 +152,38 @@ class Manifest:
         )
 
     def hash(self) -> str:
-        lists = (getattr(self.split(s), name) for s in SPLITS for name in LISTS)
-        digests = [hashlib.sha256(np.asarray(x, "<i8").tobytes()).hexdigest() for x in lists]
-        return stable_hash([self._facts(), digests])
+        return stable_hash([self._facts(), list(self._digests().values())])
 
     def _facts(self) -> dict[str, Any]:
-        """All but the long lists, as plain JSON."""
+        """All but the columns, as plain JSON."""
         values = to_dict(self._without_lists())
         if not self.runs:  # of a store made before there were any, whose hash stays what it was
             del values["runs"]
         return values
 
-    def to_text(self) -> str:
-        """Deterministic JSON, long lists on one line."""
-        values = self._facts()
+    def _columns(self) -> dict[str, Column]:
+        return {f"{s}.{name}": getattr(self.split(s), name) or Column() for s in SPLITS for name in LISTS}
+
+    def _digests(self) -> dict[str, str]:
+        """SHA-256 of each column, in the width that its format has."""
+        columns = self._columns()
+        if self.format == 2:
+            columns = {name: Column(np.asarray(values), "<i8") for name, values in columns.items()}
+        return {name: values.digest() for name, values in columns.items()}
+
+    def save(self, directory: Path, aside: Path) -> None:
+        """Writes the files of the manifest by way of the directory `aside`, itself last. Raises OSError."""
+        write_columns(aside / COLUMNS_FILE, {}, {k: np.asarray(v) for k, v in self._columns().items()})
+        os.replace(aside / COLUMNS_FILE, directory / COLUMNS_FILE)
+        values = self._facts() | {"columns": self._digests()}
         for split in SPLITS:
-            values[split] |= {name: getattr(self.split(split), name) for name in LISTS}
+            values[split] = {k: v for k, v in values[split].items() if k not in LISTS}
         lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]
-        return "{\n" + ",\n".join(lines) + "\n}\n"
+        with open(aside / FILE, "w") as out:
+            out.write("{\n" + ",\n".join(lines) + "\n}\n")
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(aside / FILE, directory / FILE)
 
 
 def part_name(split: str, part: int, parts: int) -> str:
@@ -168,15 +192,20 @@ def part_name(split: str, part: int, parts: int) -> str:
 
 
 def load_manifest(path: Path) -> Manifest:
-    """Reads a manifest. Raises DataError if it is missing, damaged or of another format."""
+    """Reads a manifest of this format or the one before, whose columns lie in its JSON.
+
+    Raises DataError if it is missing, damaged or of another format.
+    """
     advice = "Remove the dataset from the store and tokenise it again."
     try:
         values = json.loads(path.read_text())
-        if values.get("format") != FORMAT:
+        if values.get("format") not in READ:
             raise DataError(
-                f"{path}: manifest format {values.get('format')!r}; this reads {FORMAT}. {advice}"
+                f"{path}: manifest format {values.get('format')!r}; this reads "
+                f"{' and '.join(map(str, READ))}. {advice}"
             )
-        lists = {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in LISTS} for s in SPLITS}
+        take = _from_json if values["format"] == 2 else _from_file
+        lists = take(path, values)
         manifest = from_dict(Manifest, values)
         return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
     except OSError as error:
@@ -187,7 +216,31 @@ def load_manifest(path: Path) -> Manifest:
         raise DataError(f"{path}: the manifest is damaged ({error}). {advice}") from error
 
 
-def _integers(values: list, name: str) -> tuple[int, ...]:
+Lists = dict[str, dict[str, Sequence[int]]]
+"""Columns by split and name."""
+
+
+def _from_json(path: Path, values: dict[str, Any]) -> Lists:
+    """Takes the columns out of a manifest of format 2."""
+    del path
+    return {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in LISTS} for s in SPLITS}
+
+
+def _from_file(path: Path, values: dict[str, Any]) -> Lists:
+    """The columns beside a manifest, which says what they are."""
+    stated = values.pop("columns")
+    columns = Columns(path.with_name(COLUMNS_FILE))
+    lists = {s: {name: Column.of(columns, f"{s}.{name}") for name in LISTS} for s in SPLITS}
+    for split, by_name in lists.items():
+        for name, column in by_name.items():
+            if stated[f"{split}.{name}"] != column.digest():
+                raise ValueError(f"{columns.path.name} is not the one it was written with")
+            if len(column) != sum(values[split]["parts"]):
+                raise ValueError(f"{split}.{name} has {len(column)} entries, not one per episode")
+    return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in lists.items()}
+
+
+def _integers(values: list, name: str) -> np.ndarray:
     array = np.asarray(values or np.zeros(0, np.int64))
     require(array.ndim == 1 and array.dtype.kind == "i", f"{name}: expected a list of integers")
-    return tuple(array.tolist())
+    return array

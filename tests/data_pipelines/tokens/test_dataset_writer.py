@@ -189,7 +189,7 @@ def test_failing_episode_is_left_out_whole_and_its_part_is_complete(rlds, undist
     with pytest.raises(EpisodeError, match="step 4 of"):
         run(bad, tmp_path / "store")
     manifest = run(bad, tmp_path / "store", corrupt="skip")
-    assert sorted(manifest.train.episodes + manifest.val.episodes) == sorted(set(range(24)) - {3, 4, 20})
+    assert sorted((*manifest.train.episodes, *manifest.val.episodes)) == sorted(set(range(24)) - {3, 4, 20})
     assert [(loss.file[-14:], loss.offset > 0) for loss in manifest.skipped] == [
         ("00000-of-00003", True), ("00000-of-00003", True), ("00002-of-00003", True)
     ]  # fmt: skip

@@ -73,7 +73,7 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
             np.testing.assert_array_equal(item.tokens, n[::2, None] + np.arange(16))
             np.testing.assert_array_equal(item.actions, np.stack([n, n / 2, -n], axis=1))
             first += steps
-    assert manifest.train.episodes + manifest.val.episodes == tuple(range(5))
+    assert (*manifest.train.episodes, *manifest.val.episodes) == tuple(range(5))
     rows = np.arange(21)
     np.testing.assert_allclose(manifest.action_mean, [10, 5, -10])
     np.testing.assert_allclose(manifest.action_std[0], rows.std())

@@ -52,7 +52,7 @@ def test_every_episode_is_stored_once_with_its_own_frames_and_actions(tmp_path, 
             seen.append(number)
     assert sorted(seen) == list(range(8))
     assert set(manifest.val.episodes) == set(np.flatnonzero(held_out("toy", RldsDataset(rlds).ids)))
-    assert files(tmp_path / "store" / "toy") == ["manifest.json", "parts", *FILES]
+    assert files(tmp_path / "store" / "toy") == ["episodes.columns", "manifest.json", "parts", *FILES]
     assert files(tmp_path / "store") == ["toy"]
 
 
@@ -190,7 +190,7 @@ def test_unusable_episode_stops_the_job_or_is_skipped_and_recorded(tmp_path):
     with pytest.raises(EpisodeError, match="not finite at step 2"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", corrupt="skip")
-    assert sorted(manifest.train.episodes + manifest.val.episodes) == [1, 2, 3, 4]
+    assert sorted((*manifest.train.episodes, *manifest.val.episodes)) == [1, 2, 3, 4]
     (loss,) = manifest.skipped
     assert (loss.file, loss.offset, loss.episodes) == ("toy-train.tfrecord-00000-of-00001", 0, 1)
     assert "episode 0" in loss.reason and str(tmp_path) not in loss.reason
@@ -229,4 +229,4 @@ def test_manifest_is_json_that_people_can_read(tmp_path, rlds):
     tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     values = json.loads((tmp_path / "store/toy/manifest.json").read_text())
     assert values["spec"]["hz"] == 4 and values["tokenizer"]["identity"] == "fake"
-    assert values["train"]["steps"] and values["settings"]["frame_step"] == 2
+    assert values["train"]["parts"] == [6] and values["settings"]["frame_step"] == 2
