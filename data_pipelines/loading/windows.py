@@ -143,6 +143,8 @@ def _windows(manifest: Manifest, split: str, frames: int, limit: int | None, see
 def _chosen(manifest: Manifest, split: str, limit: int | None, salt: str) -> np.ndarray:
     """Positions in the store's split, ascending, of `limit` episodes drawn from all that it should have."""
     present, settings = np.asarray(manifest.split(split).episodes, np.int64), manifest.settings
+    if limit is None:
+        return np.arange(len(present))
     if not manifest.runs:  # a store that names episodes by their number
         return smallest_hashes(manifest.spec.name, present, limit, salt)
     ids = episode_ids(manifest.runs)
