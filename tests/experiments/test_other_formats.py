@@ -1,0 +1,33 @@
+"""A LeRobot folder and a robomimic file, from inspection to a token store, without an RLDS directory between."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from experiments.cli.main import main
+from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
+from tests.experiments.test_cli_errors import idle_training  # noqa: F401
+
+pytest.importorskip("av")
+
+
+def test_lerobot_and_robomimic_go_from_inspection_to_tokens(tmp_path, capsys):
+    data = [
+        str(write_lerobot(tmp_path / "toy-arm", "v3.0", lengths=(24,) * 5)),
+        str(write_robomimic(tmp_path / "image.hdf5", lengths=(23, 24, 22, 24))),
+    ]
+    entries = tmp_path / "my.toml"
+    for place in data:
+        sheets = ["--out", str(tmp_path / "sheets")]
+        assert main(["data", "inspect", place, "--entry", str(entries), "--frames", "2", *sheets]) == 0
+        assert "Hz: stride" in capsys.readouterr().out  # the files say the rate
+    # frames of one colour each look blank, as they would not in a real recording
+    entries.write_text(entries.read_text().replace("video_targets = false\n", ""))
+    common = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--registry", str(entries), "--data", *data]
+    assert main(["tokenize", *common, "--set", "model.frames=2"]) == 0
+    for name, keys in (("toy_arm", "observation/top"), ("robomimic_lift", "observation/agentview")):
+        manifest = json.loads((tmp_path / "out" / "tokens" / name / "manifest.json").read_text())
+        assert manifest["spec"]["image_key"] == keys and manifest["runs"]
+    assert not list(tmp_path.rglob("*.tfrecord*"))
