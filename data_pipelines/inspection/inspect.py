@@ -19,13 +19,13 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.loading.splits import smallest_hashes
 from data_pipelines.sources.open import open_source
-from data_pipelines.sources.rlds.dataset import SUCCESS_KEY, RldsDataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import step_key
-from data_pipelines.sources.source import EpisodeSource, Fetched
+from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched
 from hma_jax.config import require
 
-INSTRUCTION_KEYS = ("steps/language_instruction", "steps/observation/natural_language_instruction")
+INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
 WIDEST = 256
 """Values of an action field at most; wider ones are embeddings or images in disguise."""
 

@@ -23,11 +23,18 @@ from data_pipelines.sources.lerobot_meta import EpisodeEntry
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.schema import FlatFeature, field_slice, step_key
-from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, Fetched, OpenEpisode, join_actions
+from data_pipelines.sources.source import (
+    INSTRUCTION_KEY,
+    MAX_SKIPPED,
+    SUCCESS_KEY,
+    Corrupt,
+    EpisodeSource,
+    Fetched,
+    OpenEpisode,
+    join_actions,
+)
 from data_pipelines.sources.video import open_video
 from hma_jax.config import require
-
-INSTRUCTION, SUCCESS_KEY = "steps/language_instruction", "episode_metadata/success"
 
 
 class LeRobotDataset(EpisodeSource):
@@ -127,7 +134,7 @@ class LeRobotDataset(EpisodeSource):
                 found[key] = self._read.numbers(table, self._vectors[key], where).astype(np.float32).ravel()
             elif key in self._cameras:
                 found[key] = _Frames(self, entry, self._cameras[key], table, times, where)
-            elif key == INSTRUCTION:
+            elif key == INSTRUCTION_KEY:
                 found[key] = [text.encode() for text in self._read.texts(entry, table, where)]
             elif key == SUCCESS_KEY and (success := self._success(table, where)) is not None:
                 found[key] = np.array([success], np.int64)

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 HDF5 = (".hdf5", ".h5")
 
-FORMATS = "an RLDS directory (<name> or <name>/<version>), the root of a LeRobot dataset, or a robomimic .hdf5 file"
-"""What a location may be, for messages and help."""
-
 
 def find_format(location: str | Location) -> str:
     """'rlds', 'lerobot' or 'robomimic', by what lies there; 'rlds' where nothing does."""

@@ -20,9 +20,16 @@ from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds.schema import FlatFeature, field_slice, step_key
 from data_pipelines.sources.robomimic import RobomimicSource, read_rows, source_key, succeeded
 from data_pipelines.sources.settings import RobomimicSettings
-from data_pipelines.sources.source import MAX_SKIPPED, Corrupt, EpisodeSource, Fetched, OpenEpisode, join_actions
-
-INSTRUCTION, SUCCESS_KEY = "steps/language_instruction", "episode_metadata/success"
+from data_pipelines.sources.source import (
+    INSTRUCTION_KEY,
+    MAX_SKIPPED,
+    SUCCESS_KEY,
+    Corrupt,
+    EpisodeSource,
+    Fetched,
+    OpenEpisode,
+    join_actions,
+)
 
 BLOCK = 16
 """Frames read at least: files are often compressed in chunks of several."""
@@ -115,7 +122,7 @@ class RobomimicDataset(EpisodeSource):
                     found[key] = _Opened(self, i, key, len(_Frames(demo, _path(key, image=True), where)))
                 elif key in self.features:
                     found[key] = read_rows(demo, _path(key), slice(None), where).astype(np.float32).ravel()
-                elif key == INSTRUCTION:
+                elif key == INSTRUCTION_KEY:
                     found[key] = [self._read.task.encode()] * max(int(self._lengths[i]), 0)
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
                     found[key] = np.array([success], np.int64)

@@ -23,6 +23,11 @@ from hma_jax.config import ConfigError, require
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
+INSTRUCTION_KEY = "steps/language_instruction"
+
+SUCCESS_KEY = "episode_metadata/success"
+"""Optional episode flag that says whether the behaviour reached its goal."""
+
 MAX_SKIPPED = 16
 """Default bound of the policy corrupt='skip'."""
 

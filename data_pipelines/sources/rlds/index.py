@@ -26,7 +26,8 @@ import numpy as np
 
 from data_pipelines.columns import Columns, write_columns
 from data_pipelines.errors import CorruptRecordError, DataError, UnreachableError
-from data_pipelines.sources.rlds.location import is_remote, retried
+from data_pipelines.sources.rlds.listing import list_files
+from data_pipelines.sources.rlds.location import is_remote
 from data_pipelines.sources.rlds.tfrecord import ShardIndex, scan_shard
 
 if TYPE_CHECKING:
@@ -42,9 +43,6 @@ SAVE_EVERY = 60.0
 
 SETTLED = 2.0
 """Seconds that a shard must be older than its scan: a later change could bear the same time."""
-
-MARKS = ("ETag", "etag", "md5Hash", "crc32c", "blob_id", "generation", "version_id", "content_md5")
-TIMES = ("LastModified", "last_modified", "updated", "mtime", "modified", "created")
 
 COLUMNS = {"offsets": np.int64, "lengths": np.int64, "checksums": np.uint32}
 
@@ -121,28 +119,6 @@ def load_index(directory: Location, split: str, shards: Sequence[Location], scan
         if known is not None and _current(known, shards, listing):
             return known
         return _make(path, shards, listing, known, scan)
-
-
-def list_files(directory: Location) -> dict[str, tuple[int, str]]:
-    """(size, stamp) of every file of a directory, by name, without opening one."""
-    if not is_remote(directory):
-        return retried(directory, lambda: _list_directory(directory))
-    fs = directory.fs
-    fs.invalidate_cache(directory.path)
-    found = retried(directory, lambda: fs.ls(directory.path, detail=True))
-    files = [f for f in found if f["type"] == "file"]
-    return {f["name"].rstrip("/").rsplit("/", 1)[-1]: (int(f["size"]), _stamp(f)) for f in files}
-
-
-def _list_directory(directory: Path) -> dict[str, tuple[int, str]]:
-    found = {}
-    with os.scandir(directory) as entries:
-        for entry in entries:
-            with suppress(FileNotFoundError):  # a temporary file of somebody
-                if entry.is_file():
-                    status = entry.stat()
-                    found[entry.name] = status.st_size, str(status.st_mtime_ns)
-    return found
 
 
 def index_path(directory: Location, split: str) -> Path:
@@ -292,14 +268,6 @@ def _current(index: RecordIndex, shards: Sequence[Location], listing: Mapping[st
         elif not shard.missing:
             return False
     return True
-
-
-def _stamp(facts: Mapping) -> str:
-    for kind in (MARKS, TIMES):
-        for name in kind:
-            if facts.get(name):
-                return f"{name} {facts[name]}"
-    return ""
 
 
 def _no_rows() -> dict[str, np.ndarray]:
