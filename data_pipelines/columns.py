@@ -32,16 +32,16 @@ _START = len(MAGIC) + 8 + 32
 
 def write_columns(path: Path, facts: Mapping[str, Any], columns: Mapping[str, np.ndarray]) -> None:
     """Writes `facts`, plain JSON values, and `columns`, arrays of one axis. Raises OSError."""
-    table, arrays, at, end = {}, {}, 0, 0
+    table, arrays, end = {}, {}, 0
     for name, values in columns.items():
         array = np.ascontiguousarray(values)
         array = array.astype(array.dtype.newbyteorder("<"), copy=False)
         if array.ndim != 1 or array.dtype.str not in DTYPES:
             raise ValueError(f"column {name!r} is {array.dtype.str} {list(array.shape)}; it must be one of {DTYPES}")
         digest = hashlib.sha256(array.data).hexdigest()
+        at = _aligned(end) if array.nbytes else 0  # an empty one lies nowhere
         table[name], arrays[name] = [array.dtype.str, len(array), at, digest], array
-        end = at + array.nbytes if array.nbytes else end
-        at = _aligned(end)
+        end = max(end, at + array.nbytes)
     header = json.dumps({"facts": facts, "columns": table}, sort_keys=True).encode()
     aside = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:

@@ -179,7 +179,7 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
         (meta / "tasks.jsonl").write_text(
             "".join(json.dumps({"task_index": i, "task": t}) + "\n" for i, t in enumerate(tasks))
         )
-        lines = [{"episode_index": e, "tasks": [tasks[1 - e]], "length": n} for e, n in enumerate(lengths)]
+        lines = [{"episode_index": e, "tasks": [tasks[(1 - e) % 2]], "length": n} for e, n in enumerate(lengths)]
         (meta / "episodes.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
         for e, table in enumerate(tables):
             path = root / info["data_path"].format(episode_chunk=0, episode_index=e)
@@ -196,7 +196,7 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
     starts = np.cumsum([0, *lengths]) / FPS
     rows = {
         "episode_index": list(range(len(lengths))),
-        "tasks": [[tasks[1 - e]] for e in range(len(lengths))],
+        "tasks": [[tasks[(1 - e) % 2]] for e in range(len(lengths))],
         "length": list(lengths),
         "data/chunk_index": [0] * len(lengths),
         "data/file_index": [0] * len(lengths),
