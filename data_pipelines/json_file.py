@@ -1,23 +1,82 @@
-"""JSON files of others: an object, or a message that says which file and what to do."""
+"""JSON files of others: an object, or a message that says which file and what to do.
+
+Owns the bounds on what is read: parsing takes many times the memory of the text, so the size of a file
+and the number of its values are looked at first.
+"""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from data_pipelines.errors import DataError
+from data_pipelines.sources.rlds.location import read_start
+
+if TYPE_CHECKING:
+    from upath import UPath
+
+MOST_BYTES = 16 * 2**20
+"""Of a file or a line that is parsed as a whole."""
+
+MOST_VALUES = 400_000
+"""Commas, colons and opening brackets of a text: none stands for more than 100 bytes of memory."""
+
+_STRUCTURE = re.compile(rb"[,:\[{]")
 
 
-def read_object(path: Path, *, if_missing: str, advice: str) -> dict[str, Any]:
+def read_object(path: Path | UPath, *, if_missing: str, advice: str) -> dict[str, Any]:
     """The JSON object in `path`. DataError with `if_missing` where there is no such file, and with
     `advice` where it cannot be read."""
-    try:
-        value = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise DataError(f"{path} is missing: {if_missing}") from None
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}). {advice}") from error
+    value = read_json(path, if_missing=if_missing, advice=advice)
     if not isinstance(value, dict):
         raise DataError(f"{path} holds no JSON object. {advice}")
     return value
+
+
+def read_json(path: Path | UPath, *, if_missing: str, advice: str) -> Any:
+    """As `read_object`, of any kind of value."""
+    return _parse(_read(path, if_missing, advice), path, advice)
+
+
+def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """(line number, object) of each line of a JSON Lines file that is not blank."""
+    try:
+        with open(path, "rb") as file:
+            number = 0
+            while line := file.readline(MOST_BYTES + 1):
+                number += 1
+                if line.isspace():
+                    continue
+                value = _parse(line, f"{path}: line {number}", advice)
+                if not isinstance(value, dict):
+                    raise DataError(f"{path}: line {number} holds no JSON object. {advice}")
+                yield number, value
+    except FileNotFoundError:
+        raise DataError(f"{path} is missing: {if_missing}") from None
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error}). {advice}") from error
+
+
+def _read(path: Path | UPath, if_missing: str, advice: str) -> bytes:
+    try:
+        return read_start(path, MOST_BYTES + 1)
+    except FileNotFoundError:
+        raise DataError(f"{path} is missing: {if_missing}") from None
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error}). {advice}") from error
+
+
+def _parse(text: bytes, where: object, advice: str) -> Any:
+    if len(text) > MOST_BYTES:
+        raise DataError(f"{where} has more than {MOST_BYTES:,} bytes, too many for what it should say. {advice}")
+    if len(text) > MOST_VALUES and sum(1 for _ in _STRUCTURE.finditer(text)) > MOST_VALUES:
+        raise DataError(f"{where} has more than {MOST_VALUES:,} values, too many for what it should say. {advice}")
+    try:
+        return json.loads(text.decode("utf-8-sig"))
+    except ValueError as error:
+        raise DataError(f"{where} cannot be read ({error}). {advice}") from error
+    except RecursionError:
+        raise DataError(f"{where} cannot be read (it is nested too deeply). {advice}") from None

@@ -10,8 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,10 +19,14 @@ from data_pipelines.inspection.action_stats import DimensionFacts, dimension_fac
 from data_pipelines.loading.splits import smallest_hashes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
 from data_pipelines.sources.rlds.images import decode_image
-from data_pipelines.sources.rlds.schema import step_key
+from data_pipelines.sources.rlds.schema import read_features, read_info, step_key
 from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched
 from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.sources.rlds.location import Location
 
 INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
 WIDEST = 256
@@ -121,7 +124,7 @@ class Shown:
 
 
 def inspect_dataset(
-    directory: str | Path,
+    directory: str | Location,
     split: str = "train",
     *,
     episodes: int = 32,
@@ -202,42 +205,23 @@ def _describe(source: EpisodeSource) -> tuple[tuple[FieldFacts, ...], tuple[Spli
     return tuple(fields), (SplitFacts(source.split, len(source), source.files, int(source.sizes().sum())),)
 
 
-def _read_schema(directory: Path) -> tuple[tuple[FieldFacts, ...], tuple[SplitFacts, ...]]:
-    """Fields of a step and of the episode, and all splits, through tfds."""
-    import tensorflow_datasets as tfds
-    from google.protobuf.json_format import ParseError
-
-    try:
-        info = tfds.builder_from_directory(str(directory)).info
-        splits = [
-            SplitFacts(name, sum(s.shard_lengths), len(s.shard_lengths), int(s.num_bytes))
-            for name, s in sorted(info.splits.items())
-        ]
-    except (OSError, ValueError, KeyError, ParseError) as error:
-        raise DataError(
-            f"{directory}: dataset_info.json or features.json is missing or damaged ({error}). "
-            "Restore both as tfds wrote them."
-        ) from error
-    return tuple(_fields(info.features, "")), tuple(splits)
+def _read_schema(directory: Location) -> tuple[tuple[FieldFacts, ...], tuple[SplitFacts, ...]]:
+    """Fields of a step and of the episode, and all splits."""
+    splits = [
+        SplitFacts(name, sum(split.shard_lengths), len(split.shard_lengths), split.bytes)
+        for name, split in sorted(read_info(directory).splits.items())
+    ]
+    fields = [_field(key, feature) for key, feature in sorted(read_features(directory).items())]
+    return tuple(fields), tuple(splits)
 
 
-def _fields(feature: Any, key: str) -> list[FieldFacts]:
-    import tensorflow_datasets as tfds
-
-    if isinstance(feature, tfds.features.FeaturesDict):
-        found = []
-        for name, child in sorted(feature.items()):
-            found += _fields(child, f"{key}/{name}" if key else name)
-        return found
-    if isinstance(feature, (tfds.features.Dataset, tfds.features.Sequence)):
-        return _fields(feature.feature, key)
-    shape, dtype = tuple(feature.shape), np.dtype(feature.np_dtype)
-    if isinstance(feature, tfds.features.Image):
-        kind = "image" if shape[-1] == 3 and dtype == np.uint8 else "depth"
+def _field(key: str, feature: FlatFeature) -> FieldFacts:
+    if feature.image:
+        kind = "image" if feature.shape[-1] == 3 and feature.dtype == "uint8" else "depth"
     else:
-        kind = "number" if dtype.kind in "fiub" and None not in shape else "text"
-    dtype = dtype.name if dtype.kind in "fiub" else "string"
-    return [FieldFacts(key.removeprefix("steps/"), kind, shape, dtype, per_step=key.startswith("steps/"))]
+        kind = "number" if feature.dtype in NUMBERS and None not in feature.shape else "text"
+    dtype = feature.dtype if feature.dtype in NUMBERS else "string"
+    return FieldFacts(key.removeprefix("steps/"), kind, feature.shape, dtype, key.startswith("steps/"))
 
 
 # --- one episode ------------------------------------------------------------------------------

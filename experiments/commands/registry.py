@@ -152,14 +152,14 @@ def print_facts(facts: Facts) -> None:
     schema = tidy_table("Fields", "field", "kind", "shape", "type")
     for f in facts.fields:
         shape = "x".join("?" if d is None else str(d) for d in f.shape)
-        schema.add_row(f.key, f.kind, shape or "one", f.dtype)
+        schema.add_row(escape(f.key), f.kind, shape or "one", f.dtype)
     console.print(schema)
     cameras = tidy_table("Cameras", "camera", "height x width", "frames seen", "blank")
     cameras.add_column("remark")
     for c in facts.cameras:
         sizes = ", ".join(f"{h}x{w}" for h, w in c.sizes)
         remark = "blank: shows one colour" if c.is_blank else "stands still" if c.still else ""
-        cameras.add_row(c.key, sizes, f"{c.frames}", f"{c.blank}", remark)
+        cameras.add_row(escape(c.key), sizes, f"{c.frames}", f"{c.blank}", remark)
     console.print(cameras)
     for action in facts.actions:
         table = tidy_table(escape(action.key), "value", "min", "max", "mean", "std", "distinct", "roughness")

@@ -112,6 +112,18 @@ def open_ranges(location: Location) -> Iterator[Ranges]:
         file.close()
 
 
+def read_start(location: Location, most: int) -> bytes:
+    """Up to `most` bytes from a file's beginning on.
+
+    Raises FileNotFoundError if there is none, OSError where a disk fails, UnreachableError where a
+    remote store does.
+    """
+    if is_remote(location):
+        return _RemoteFile(location).read(0, most)
+    with open(location, "rb") as file:
+        return file.read(most)
+
+
 class OpenFiles:
     """Files of a disk that stay open between reads: the `limit` read last.
 

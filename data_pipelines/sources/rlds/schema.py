@@ -1,44 +1,76 @@
-"""The schema of an RLDS directory: where its version lies, what a step holds, which shards.
+"""The metadata of an RLDS directory: where its version lies, what a step holds, which shards.
 
-Owns what is read through tfds, which is metadata only. Reads no record. The metadata of a
-remote directory is copied aside for tfds, which then needs to know nothing of remote stores.
+Owns reading features.json and dataset_info.json as tfds wrote them. Reads no record, and neither imports
+tfds nor what the files name; they may come from anywhere and lie on a disk or in a remote store.
 """
 
 from __future__ import annotations
 
 import difflib
-import json
 import re
-import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from data_pipelines.errors import DataError
-from data_pipelines.sources.rlds.location import is_remote, locate
+from data_pipelines.json_file import read_object
+from data_pipelines.names import NAME_RULE, is_name, shown
+from data_pipelines.sources.rlds.features import FlatFeature, parse_features
+from data_pipelines.sources.rlds.location import locate
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
 
-METADATA = (".json", ".txt")
-"""How the files end that tfds writes beside the shards."""
+INFO, FEATURES = "dataset_info.json", "features.json"
+TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
+"""How tfds calls shards where dataset_info.json does not say."""
+
+MOST_SHARDS = 2**15
+"""Of one split."""
+
+IF_MISSING = "fetch it too; it lies beside the shards."
+ADVICE = "Restore it as tfds wrote it."
 
 FILE_FORMATS = ("tfrecord", "array_record")
 """How records may lie in shards, as dataset_info.json says it."""
 
 
 @dataclass(frozen=True)
-class FlatFeature:
-    """A field of the schema: an image, or `size` numbers per step (0: text and the like)."""
+class SplitInfo:
+    """What dataset_info.json says of one split."""
 
-    image: bool
-    size: int
+    name: str
+    shard_lengths: tuple[int, ...]  # records in each shard
+    bytes: int
+    template: str  # of the shards' names
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """What dataset_info.json says of a dataset."""
+
+    name: str
+    version: str
+    file_format: str
+    splits: dict[str, SplitInfo]
+
+    def shard_names(self, split: str) -> list[str]:
+        """The files of a split. Raises ValueError for a name that is none."""
+        of = self.splits[split]
+        count = len(of.shard_lengths)
+        digits = max(len(str(count)), 5)
+        fields = {"DATASET": self.name, "SPLIT": split, "FILEFORMAT": self.file_format}
+        names = []
+        for n in range(count):
+            here, all_ = f"{n:0{digits}d}", f"{count:0{digits}d}"
+            fields |= {"SHARD_INDEX": here, "NUM_SHARDS": all_, "SHARD_X_OF_Y": f"{here}-of-{all_}"}
+            name = re.sub(r"\{([A-Z_]+)\}", lambda m: fields.get(m[1], m[0]), of.template)
+            name = name.rpartition("/")[2]
+            if not 0 < len(name) <= 255 or not name.isprintable() or name.startswith(".") or "{" in name:
+                raise ValueError(f"split {split!r}: {shown(name)}, of filepathTemplate, is no name of a shard")
+            names.append(name)
+        return names
 
 
 @dataclass(frozen=True)
@@ -80,83 +112,92 @@ def dataset_name(directory: str | Location) -> str:
 
     Raises DataError for a directory that is none.
     """
-    path = resolve_version(directory) / "dataset_info.json"
-    try:
-        return str(json.loads(path.read_text())["name"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        message = f"{path}: it does not name the dataset ({error}). Restore it as tfds wrote it."
-        raise DataError(message) from error
+    return read_info(resolve_version(directory)).name
 
 
 def read_metadata(directory: Location, split: str) -> SplitMetadata:
     """Metadata of one split. Raises DataError for damaged files, ConfigError for an unknown split."""
-    # Imported here: it takes half a second that readers of a token store need not pay.
-    import tensorflow_datasets as tfds
-    from google.protobuf.json_format import ParseError
-
-    try:
-        with _on_disk(directory) as here:
-            info = tfds.builder_from_directory(str(here)).info
-        file_format = json.loads((directory / "dataset_info.json").read_text()).get("fileFormat", "tfrecord")
-    except (OSError, ValueError, KeyError, ParseError) as error:
-        raise DataError(
-            f"{directory}: dataset_info.json or features.json is missing or damaged ({error}). "
-            "Restore both as tfds wrote them."
-        ) from error
-    if file_format not in FILE_FORMATS:
+    info = read_info(directory)
+    features = read_features(directory)
+    if info.file_format not in FILE_FORMATS:
         known = " and ".join(FILE_FORMATS)
-        raise DataError(f"{directory}: fileFormat is {file_format!r}; only {known} can be read.")
+        raise DataError(f"{directory}: fileFormat is {shown(info.file_format)}; only {known} can be read.")
     require(
         split in info.splits,
         f"{info.name}: no split {split!r} in {directory}; splits there: {listing(sorted(info.splits))}",
     )
+    try:
+        shards = info.shard_names(split)
+    except ValueError as error:
+        raise DataError(f"{directory / INFO}: {error}. {ADVICE}") from error
     return SplitMetadata(
         name=info.name,
-        version=str(info.version),
-        features=_flatten(info.features, ""),
-        shards=[directory / Path(p).name for p in info.splits[split].filepaths],
+        version=info.version,
+        features=features,
+        shards=[directory / name for name in shards],
         shard_lengths=list(info.splits[split].shard_lengths),
-        file_format=file_format,
+        file_format=info.file_format,
     )
 
 
-@contextmanager
-def _on_disk(directory: Location) -> Iterator[Location]:
-    """`directory`, or a copy of its metadata if it is remote."""
-    if not is_remote(directory):
-        yield directory
-        return
-    copy = Path(tempfile.mkdtemp(prefix="hma-metadata-"))
+def read_features(directory: Location) -> dict[str, FlatFeature]:
+    """Every field of a record, by its flat key. Raises DataError for a file that is missing or damaged."""
+    path = directory / FEATURES
+    schema = read_object(path, if_missing=IF_MISSING, advice=ADVICE)
     try:
-        for file in directory.iterdir():
-            if file.name.endswith(METADATA):
-                (copy / file.name).write_bytes(file.read_bytes())
-        yield copy
-    finally:
-        shutil.rmtree(copy)
+        return parse_features(schema)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}. {ADVICE}") from error
 
 
-def _flatten(feature, key: str) -> dict[str, FlatFeature]:
-    """Fields by the flat key under which tfds stores them in a record."""
-    import tensorflow_datasets as tfds
+def read_info(directory: Location) -> DatasetInfo:
+    """Raises DataError for a dataset_info.json that is missing or damaged."""
+    path = directory / INFO
+    values = read_object(path, if_missing=IF_MISSING, advice=ADVICE)
+    try:
+        splits = [_split(split) for split in _list(values.get("splits", []), "splits")]
+        name, version = values.get("name"), values.get("version")
+        file_format = values.get("fileFormat", values.get("file_format")) or "tfrecord"
+        for text, what in ((name, "name"), (version, "version"), (file_format, "fileFormat")):
+            if not is_name(text):
+                raise ValueError(f"{what} is {shown(text)}: {NAME_RULE}")
+    except ValueError as error:
+        raise DataError(f"{path}: {error}. {ADVICE}") from error
+    return DatasetInfo(name, version, file_format, {split.name: split for split in splits})
 
-    if isinstance(feature, tfds.features.FeaturesDict):
-        flat = {}
-        for name, child in feature.items():
-            flat |= _flatten(child, f"{key}/{name}" if key else name)
-        return flat
-    if isinstance(feature, tfds.features.Image):
-        return {key: FlatFeature(image=True, size=0)}
-    if isinstance(feature, (tfds.features.Dataset, tfds.features.Sequence)):
-        return _flatten(feature.feature, key)
-    spec = feature.get_tensor_info()
-    numeric = not isinstance(spec, dict) and np.dtype(spec.np_dtype).kind in "fiub" and None not in spec.shape
-    return {key: FlatFeature(image=False, size=int(np.prod(spec.shape)) if numeric else 0)}
+
+def _split(values: Any) -> SplitInfo:
+    if not isinstance(values, dict) or not is_name(values.get("name")):
+        raise ValueError("a split has no usable name")
+    name = values["name"]
+    template = values.get("filepathTemplate", values.get("filepath_template")) or TEMPLATE
+    if not isinstance(template, str) or len(template) > 256:
+        raise ValueError(f"split {name!r}: filepathTemplate is {shown(template)}")
+    lengths = _list(values.get("shardLengths", values.get("shard_lengths", [])), f"shardLengths of {name!r}")
+    if len(lengths) > MOST_SHARDS:
+        raise ValueError(f"split {name!r}: {len(lengths):,} shards, more than {MOST_SHARDS:,}")
+    size = _count(values.get("numBytes", values.get("num_bytes", 0)), f"numBytes of {name!r}")
+    return SplitInfo(name, tuple(_count(n, f"shardLengths of {name!r}") for n in lengths), size, template)
+
+
+def _list(value: Any, what: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError(f"{what}: {shown(value)} is no list")
+    return value
+
+
+def _count(value: Any, what: str) -> int:
+    """A number below 2^63; the JSON of a message has such numbers as strings."""
+    if isinstance(value, str) and len(value) <= 19 and value.isascii() and value.isdecimal():
+        value = int(value)
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise ValueError(f"{what}: {shown(value)} is no count")
+    return value
 
 
 def field_slice(key: str) -> tuple[str, slice]:
     """The field of an action key, and which of its values: `action[:7]` is ("action", slice(0, 7))."""
-    match = re.fullmatch(r"(.+)\[(\d*):(\d*)\]", key)
+    match = re.fullmatch(r"(.+)\[(\d{0,9}):(\d{0,9})\]", key)
     if not match:
         return key, slice(0, None)
     field, start, stop = match.groups()

@@ -118,13 +118,13 @@ def test_no_dataset_info(directory):
 @pytest.mark.parametrize("content", ["", "{", "[]", "{}"])
 def test_damaged_metadata(directory, file, content):
     (directory / file).write_text(content)
-    with pytest.raises(DataError, match="missing or damaged"):
+    with pytest.raises(DataError, match=f"{file}.* Restore it as tfds wrote it"):
         RldsDataset(directory)
 
 
 def test_missing_features(directory):
     (directory / "features.json").unlink()
-    with pytest.raises(DataError, match="missing or damaged"):
+    with pytest.raises(DataError, match="features.json is missing"):
         RldsDataset(directory)
 
 

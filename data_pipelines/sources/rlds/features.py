@@ -1,0 +1,173 @@
+"""features.json, the schema that tfds writes beside its shards, as the fields of a record.
+
+Owns the forms of that file: the JSON of tfds's `Feature` message, and the `type` and `content` of tfds 4.0
+to 4.4. What a field is follows from its content; the Python classes that the file names are neither
+imported nor asked for, so that a schema of unknown origin is data only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from data_pipelines.names import shown
+
+MOST_FIELDS = 4096
+DEEPEST = 32
+LONGEST_KEY = 512
+MOST_NUMBERS = 2**28
+"""Values of one field in one step: 1 GiB of float32."""
+
+NUMBERS = ("bool", "float16", "float32", "float64") + tuple(
+    f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+)
+"""Types whose values a record holds as numbers; of others it holds bytes."""
+
+_FORMS = {
+    "featuresDict": ("FeaturesDict",),
+    "sequence": ("Sequence", "Dataset"),
+    "tensor": ("TensorFeature", "Tensor", "Scalar"),
+    "image": ("ImageFeature", "Image", "LabeledImage"),
+    "video": ("VideoFeature", "Video"),
+    "classLabel": ("ClassLabel",),
+    "boundingBox": ("BoundingBoxFeature", "BBoxFeature"),
+    "audio": ("AudioFeature", "Audio"),
+    "text": ("TextFeature", "Text"),
+    "translation": ("TranslationFeature", "Translation", "TranslationVariableLanguages"),
+}
+"""A field's content in the message, and the last part of the names of classes and messages that have it."""
+
+_FORM_OF = {name: form for form, names in _FORMS.items() for name in names}
+
+
+@dataclass(frozen=True)
+class FlatFeature:
+    """A field of the schema: an image, or `size` numbers per step (0: text and the like)."""
+
+    image: bool
+    size: int
+    shape: tuple[int | None, ...] = ()
+    dtype: str = "string"
+
+
+def parse_features(schema: Any) -> dict[str, FlatFeature]:
+    """Fields by the flat key under which a record holds them, as `steps/observation/image`.
+
+    Raises ValueError, naming the field, for what is no schema or beyond the bounds of this module.
+    """
+    found: dict[str, FlatFeature] = {}
+    for key, feature in _fields(schema, "", 0):
+        found[key] = feature
+        if len(found) > MOST_FIELDS:
+            raise ValueError(f"more than {MOST_FIELDS} fields")
+    return found
+
+
+def _fields(node: Any, key: str, depth: int) -> Iterator[tuple[str, FlatFeature]]:
+    if depth > DEEPEST:
+        raise ValueError(f"{_field(key)}: fields are nested more than {DEEPEST} deep")
+    form, content = _content(node, key)
+    if form == "featuresDict":
+        children = content if "features" not in content else _mapping(content["features"], key)
+        for name, child in children.items():
+            if not name or not name.isprintable() or len(key) + len(name) > LONGEST_KEY:
+                raise ValueError(f"{_field(key)}: a field cannot be called {shown(name)}")
+            yield from _fields(child, f"{key}/{name}" if key else name, depth + 1)
+    elif form == "sequence":
+        yield from _fields(content.get("feature"), key, depth + 1)
+    elif form == "translation":
+        for language in _list(content.get("languages", []), key):
+            yield f"{key}/{str(language)[:LONGEST_KEY]}", FlatFeature(image=False, size=0)
+    elif form in ("image", "video"):
+        shape = _shape(content, key) or (None, None, 3)
+        yield key, FlatFeature(True, 0, shape[-3:], _dtype(content) or "uint8")
+    elif form == "classLabel":
+        yield key, FlatFeature(False, 1, (), "int64")
+    elif form == "boundingBox":
+        yield key, FlatFeature(False, 4, (4,), "float32")
+    elif form in ("tensor", "audio"):
+        yield key, _numbers(_shape(content, key), _dtype(content), key)
+    else:  # text, and what a class of somebody else's holds
+        yield key, FlatFeature(image=False, size=0)
+
+
+def _field(key: str) -> str:
+    return f"field {shown(key)}" if key else "its top level"
+
+
+def _content(node: Any, key: str) -> tuple[str, Mapping[str, Any]]:
+    """The form of a field and what describes it; form "" for one that is not known."""
+    node = _mapping(node, key)
+    if "type" in node:
+        return _old_content(node.get("proto_cls") or node["type"], node.get("content"), key)
+    own = node.get("jsonFeature", node.get("json_feature"))
+    if own is not None:
+        return _old_content(_either(node, "pythonClassName"), _mapping(own, key).get("json"), key)
+    present = [form for form in _FORMS if _either(node, form) is not None]
+    if len(present) != 1:
+        raise ValueError(f"{_field(key)}: it has {len(present)} descriptions, not one")
+    return present[0], _mapping(_either(node, present[0]), key)
+
+
+def _old_content(name: Any, content: Any, key: str) -> tuple[str, Mapping[str, Any]]:
+    if not isinstance(name, str):
+        raise ValueError(f"{_field(key)}: it names no class")
+    if isinstance(content, str):
+        try:
+            content = json.loads(content)
+        except RecursionError:
+            raise ValueError(f"{_field(key)}: its content is nested too deeply") from None
+    return _FORM_OF.get(name.rpartition(".")[2], ""), _mapping(content or {}, key)
+
+
+def _either(node: Mapping[str, Any], name: str) -> Any:
+    """A field of a message by either of the two names that JSON may give it."""
+    snake = "".join(f"_{c.lower()}" if c.isupper() else c for c in name)
+    return node.get(name, node.get(snake))
+
+
+def _mapping(value: Any, key: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{_field(key)}: {shown(value)} where a description should stand")
+    return value
+
+
+def _list(value: Any, key: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise ValueError(f"{_field(key)}: {shown(value)} where a list should stand")
+    return value
+
+
+def _shape(content: Mapping[str, Any], key: str) -> tuple[int | None, ...]:
+    """Sizes, None for one that differs between records."""
+    shape = content.get("shape") or []
+    if isinstance(shape, dict):
+        shape = shape.get("dimensions") or []
+    sizes: list[int | None] = []
+    for size in _list(shape, key):
+        if isinstance(size, str) and len(size) <= 12 and size.isascii() and size.removeprefix("-").isdecimal():
+            size = int(size)  # the JSON of a message has 64-bit numbers as strings
+        if size is not None and (type(size) is not int or not -1 <= size <= MOST_NUMBERS):
+            raise ValueError(f"{_field(key)}: {shown(size)} cannot be one of its sizes")
+        sizes.append(None if size == -1 else size)
+    if len(sizes) > 8:
+        raise ValueError(f"{_field(key)}: {len(sizes)} dimensions")
+    return tuple(sizes)
+
+
+def _dtype(content: Mapping[str, Any]) -> str:
+    dtype = content.get("dtype")
+    return dtype[:32] if isinstance(dtype, str) and dtype.isprintable() else ""
+
+
+def _numbers(shape: tuple[int | None, ...], dtype: str, key: str) -> FlatFeature:
+    dtype = {"float": "float32", "double": "float64", "int": "int64"}.get(dtype, dtype)
+    if dtype not in NUMBERS or None in shape:
+        return FlatFeature(False, 0, shape, dtype if dtype in NUMBERS else "string")
+    size = math.prod(shape)
+    if size > MOST_NUMBERS:
+        raise ValueError(f"{_field(key)}: {list(shape)} makes {size:,} numbers in one step")
+    return FlatFeature(False, size, shape, dtype)
