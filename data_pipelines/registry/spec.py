@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
+from data_pipelines.names import NAME_RULE, is_name, shown
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import require
 
@@ -45,11 +47,15 @@ class DatasetSpec:
 
     def __post_init__(self):
         name = self.name
+        require(is_name(name), f"dataset {shown(name)}: no name of a dataset: {NAME_RULE}")
         require(
             len(self.action_keys) == len(self.action_dims),
             f"dataset {name!r}: action_keys and action_dims must have the same length",
         )
-        require(self.hz > 0, f"dataset {name!r}: hz, the native rate, must be positive, got {self.hz}")
+        require(
+            0 < self.hz < math.inf,
+            f"dataset {name!r}: hz, the native rate, must be positive and finite, got {self.hz}",
+        )
         require(
             all(d >= 1 for d in self.action_dims),
             f"dataset {name!r}: action_dims must be at least 1, got {self.action_dims}",

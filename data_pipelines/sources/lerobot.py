@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
+from data_pipelines.names import inside
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta, read_table
 from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
@@ -171,7 +172,10 @@ class LeRobotSource:
         if isinstance(value, dict) and value.get("bytes"):
             return value["bytes"]
         if isinstance(value, dict) and value.get("path"):
-            path = self.root / value["path"]
+            try:
+                path = inside(self.root, value["path"])
+            except ValueError as error:
+                raise UnitError(f"{where}: {error}. {ADVICE}") from error
             try:
                 return retried(path, path.read_bytes)
             except FileNotFoundError as error:

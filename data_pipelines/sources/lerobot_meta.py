@@ -7,19 +7,24 @@ parquet tables that say in which file, and at what time of a video, each one beg
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+import math
+import re
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from data_pipelines.errors import DataError
-from data_pipelines.json_file import read_object
+from data_pipelines.json_file import read_lines, read_object
+from data_pipelines.names import inside, shown
 from data_pipelines.sources.rlds.location import is_failure, retried
 from data_pipelines.sources.units import require_module
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 ADVICE = "Fetch the dataset again, meta folder included."
+
+MOST = 10**9
+"""Of an episode's number, its length, a chunk, a task, or the values of a feature."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     for field in ("fps", "features", "data_path"):
         if not info.get(field):
             raise DataError(f"{info_path}: no {field!r}. {ADVICE}")
+    _check_info(info, info_path)
     features = info["features"]
     videos = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if videos and not info.get("video_path"):
@@ -69,17 +75,14 @@ def read_meta(root: Path) -> LeRobotMeta:
 
 
 def _episodes_2(root: Path, info: dict[str, Any], videos: list[str]) -> list[EpisodeEntry]:
-    path, chunk_size = root / "meta" / "episodes.jsonl", int(info.get("chunks_size") or 1000)
+    path, chunk_size = root / "meta" / "episodes.jsonl", info.get("chunks_size") or 1000
     entries = []
-    for line, row in enumerate(_json_lines(path), 1):
-        try:
-            index, length = int(row["episode_index"]), int(row["length"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{path}: line {line} has no usable {error}. {ADVICE}") from error
+    for line, row in _json_lines(path):
+        index, length = (_count(row, name, f"{path}: line {line}") for name in ("episode_index", "length"))
         place = {"episode_chunk": index // chunk_size, "episode_index": index}
-        clips = {k: (root / _fill(info, "video_path", video_key=k, **place), 0.0) for k in videos}
-        tasks = tuple(map(str, row.get("tasks") or ()))
-        entries.append(EpisodeEntry(index, length, root / _fill(info, "data_path", **place), clips, tasks))
+        clips = {k: (_place(root, info, "video_path", video_key=k, **place), 0.0) for k in videos}
+        tasks = _texts(row, f"{path}: line {line}")
+        entries.append(EpisodeEntry(index, length, _place(root, info, "data_path", **place), clips, tasks))
     return sorted(entries, key=lambda e: e.index)
 
 
@@ -96,17 +99,16 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
             raise DataError(f"{path}: no column {missing[0]!r}. {ADVICE}")
         wanted = [*columns, *(["tasks"] if "tasks" in table.column_names else [])]
         for line, row in enumerate(table.select(wanted).to_pylist()):
-            empty = [c for c in columns if row[c] is None]
-            if empty:
-                raise DataError(f"{path}: row {line} has no {empty[0]!r}. {ADVICE}")
+            where = f"{path}: row {line}"
+            number = {c: (_seconds if c.endswith("timestamp") else _count)(row, c, where) for c in columns}
             clips = {}
             for key, (chunk, file, begin) in places.items():
-                name = _fill(info, "video_path", video_key=key, chunk_index=row[chunk], file_index=row[file])
-                clips[key] = (root / name, float(row[begin]))
-            place = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
-            data = root / _fill(info, "data_path", **place)
-            tasks = tuple(map(str, row.get("tasks") or ()))
-            entries.append(EpisodeEntry(row["episode_index"], row["length"], data, clips, tasks))
+                place = {"chunk_index": number[chunk], "file_index": number[file]}
+                clips[key] = (_place(root, info, "video_path", video_key=key, **place), number[begin])
+            place = {"chunk_index": number["data/chunk_index"], "file_index": number["data/file_index"]}
+            data = _place(root, info, "data_path", **place)
+            tasks = _texts(row, where)
+            entries.append(EpisodeEntry(number["episode_index"], number["length"], data, clips, tasks))
     return sorted(entries, key=lambda e: e.index)
 
 
@@ -115,7 +117,9 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
         path = root / "meta" / "tasks.jsonl"
         rows = _json_lines(path) if path.exists() else []
         return {
-            int(row["task_index"]): str(row["task"]) for row in rows if "task_index" in row and "task" in row
+            _count(row, "task_index", f"{path}: line {line}"): str(row["task"])
+            for line, row in rows
+            if "task_index" in row and "task" in row
         }
     path = root / "meta" / "tasks.parquet"
     if not path.exists():
@@ -145,13 +149,66 @@ def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> 
     return retried(path, read)
 
 
-def _fill(info: dict[str, Any], field: str, **place: Any) -> str:
+_PLACE = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")
+"""A place in a path, as `{episode_index:06d}`. Nothing else of Python's formats, which can ask for
+attributes and for gigabytes."""
+
+
+def _place(root: Path, info: dict[str, Any], field: str, **place: Any) -> Path:
+    """The file that `info[field]` names. Raises DataError where it lies outside of `root`."""
     try:
-        return info[field].format(**place)
-    except (KeyError, ValueError, IndexError) as error:
+        text = _PLACE.sub(lambda m: f"{place[m[1]]:0{m[2]}d}" if m[2] else str(place[m[1]]), info[field])
+        if "{" in text:
+            raise ValueError(f"{shown(text)} is left")
+        return inside(root, text)
+    except (KeyError, ValueError) as error:
         raise DataError(
-            f"meta/info.json: {field} {info[field]!r} cannot be filled in ({error}). {ADVICE}"
+            f"{root / 'meta' / 'info.json'}: {field} {shown(info[field])} cannot be filled in ({error}). {ADVICE}"
         ) from error
+
+
+def _check_info(info: dict[str, Any], path: Path) -> None:
+    """Raises DataError for a field of info.json of the wrong kind."""
+    fps, features = info["fps"], info["features"]
+    if type(fps) not in (int, float) or not 0 < fps < math.inf:
+        raise DataError(f"{path}: fps is {shown(fps)}, not a rate. {ADVICE}")
+    for field in ("data_path", "video_path"):
+        if not isinstance(info.get(field) or "", str):
+            raise DataError(f"{path}: {field} is {shown(info[field])}, not a path. {ADVICE}")
+    if info.get("chunks_size") is not None:
+        _count(info, "chunks_size", str(path))
+    if not isinstance(features, dict):
+        raise DataError(f"{path}: features is {shown(features)}, not an object. {ADVICE}")
+    for name, feature in features.items():
+        usable = isinstance(feature, dict) and isinstance(feature.get("dtype"), str) and name.isprintable()
+        shape = feature.get("shape") if usable else None
+        sizes = isinstance(shape, list) and all(type(n) is int and 0 <= n for n in shape)
+        if not sizes or math.prod(shape) > MOST:
+            raise DataError(f"{path}: feature {shown(name)} has no usable dtype and shape. {ADVICE}")
+        for key in ("info", "video_info"):
+            if not isinstance(feature.get(key) or {}, dict):
+                raise DataError(f"{path}: feature {shown(name)}: {key} is no object. {ADVICE}")
+
+
+def _count(row: Mapping[str, Any], name: str, where: str) -> int:
+    value = row.get(name)
+    if type(value) is not int or not 0 <= value <= MOST:
+        raise DataError(f"{where} has no usable {name!r} ({shown(value)}). {ADVICE}")
+    return value
+
+
+def _seconds(row: Mapping[str, Any], name: str, where: str) -> float:
+    value = row.get(name)
+    if type(value) not in (int, float) or not 0 <= value <= MOST:
+        raise DataError(f"{where} has no usable {name!r} ({shown(value)}). {ADVICE}")
+    return float(value)
+
+
+def _texts(row: Mapping[str, Any], where: str) -> tuple[str, ...]:
+    tasks = row.get("tasks") or []
+    if not isinstance(tasks, list):
+        raise DataError(f"{where} has no usable 'tasks' ({shown(tasks)}). {ADVICE}")
+    return tuple(map(str, tasks))
 
 
 def _json(path: Path) -> dict[str, Any]:
@@ -159,8 +216,5 @@ def _json(path: Path) -> dict[str, Any]:
     return read_object(path, if_missing=missing, advice=ADVICE)
 
 
-def _json_lines(path: Path) -> list[dict[str, Any]]:
-    try:
-        return [json.loads(line) for line in path.read_text().splitlines() if line.strip()]
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} cannot be read ({error}). {ADVICE}") from error
+def _json_lines(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    return read_lines(path, if_missing=ADVICE, advice=ADVICE)

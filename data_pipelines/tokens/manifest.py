@@ -210,7 +210,7 @@ def load_manifest(path: Path) -> Manifest:
         return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
     except OSError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
-    except (ValueError, AttributeError, TypeError, KeyError) as error:
+    except (ValueError, AttributeError, TypeError, KeyError, OverflowError, RecursionError) as error:
         if isinstance(error, ConfigError):
             raise DataError(f"{path}: not a manifest of this program: {error}. {advice}") from error
         raise DataError(f"{path}: the manifest is damaged ({error}). {advice}") from error

@@ -12,6 +12,7 @@ Files are mapped, not read. Knows nothing of the token store (see `import_tokens
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,13 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
+from data_pipelines.names import shown
 from hma_jax.config import ConfigError
 
 ADVICE = "Fetch the folder again."
+DTYPES = ("uint8", "uint16", "uint32", "int32", "float16", "float32")
+MOST = 10**9
+"""Of every number in metadata.json."""
 FACTOR_VOCAB = 512
 """The released models read an id of 2^18 as two digits of this base."""
 
@@ -70,28 +75,35 @@ def open_folder(path: str | Path) -> ReleaseFolder:
     if not parts:
         raise DataError(f"{path / 'actions'}: no *.bin in it. {ADVICE}")
     actions = np.concatenate([_actions(part, frames) for part in parts], axis=1)
-    if "action_dim" in meta and actions.shape[1] != meta["action_dim"]:
+    if meta.get("action_dim") is not None and actions.shape[1] != meta["action_dim"]:
         raise DataError(
             f"{path / 'actions'}: {actions.shape[1]} values per frame, but metadata.json says action_dim "
             f"{meta['action_dim']}. {ADVICE}"
         )
-    steps = np.diff(segments)
-    if (steps < 0).any():
-        frame = int(np.flatnonzero(steps < 0)[0])
+    falls = segments[1:] < segments[:-1]
+    if falls.any():
+        frame = int(np.flatnonzero(falls)[0])
         raise DataError(
             f"{path / 'segment_ids.bin'}: the episode falls from {segments[frame]} to "
             f"{segments[frame + 1]} at frame {frame + 1}; they must not decrease. {ADVICE}"
         )
-    bounds = np.concatenate([[0], np.flatnonzero(steps) + 1, [frames]]).astype(np.int64)
+    bounds = np.concatenate([[0], np.flatnonzero(segments[1:] != segments[:-1]) + 1, [frames]]).astype(np.int64)
     return ReleaseFolder(path, str(meta.get("name") or path.name), meta, video, actions, bounds)
 
 
 def _metadata(path: Path) -> dict[str, Any]:
     missing = "give a folder of the release, with video.bin beside it."
     meta = read_object(path, if_missing=missing, advice=ADVICE)
-    for field in ("num_images", "h", "w"):
-        if type(meta.get(field)) is not int or meta[field] < 1:
-            raise DataError(f"{path}: {field} is {meta.get(field)!r}, not a positive number. {ADVICE}")
+    for field in ("num_images", "h", "w", "latent_channels", "action_dim"):
+        value = meta.get(field)
+        if value is None and field in ("latent_channels", "action_dim"):
+            continue
+        if type(value) is not int or not 1 <= value <= MOST:
+            raise DataError(f"{path}: {field} is {shown(value)}, not a positive number. {ADVICE}")
+    if meta.get("token_dtype", "uint32") not in DTYPES:
+        raise DataError(
+            f"{path}: token_dtype is {shown(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}"
+        )
     return meta
 
 
@@ -104,18 +116,19 @@ def _video_shape(path: Path, meta: dict[str, Any]) -> tuple[int, tuple[int, ...]
             f"{path / 'metadata.json'}: a grid of {grid[0]} x {grid[1]}; only square ones can be read."
         )
     if dtype.kind == "f":
-        return frames, (frames, int(channels or 4), *grid), dtype
+        return frames, (frames, channels or 4, *grid), dtype
     if dtype == np.uint8:
         raise ConfigError(
             f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents."
         )
-    if type(meta.get("vocab_size")) is not int or meta["vocab_size"] < 2:
-        raise DataError(f"{path / 'metadata.json'}: vocab_size is {meta.get('vocab_size')!r}. {ADVICE}")
+    vocab_size = meta.get("vocab_size")
+    if type(vocab_size) is not int or not 2 <= vocab_size <= 2**32:
+        raise DataError(f"{path / 'metadata.json'}: vocab_size is {shown(vocab_size)}. {ADVICE}")
     return frames, (frames, *grid), dtype
 
 
 def _map(path: Path, dtype: Any, shape: tuple[int, ...], because: str) -> np.ndarray:
-    expected = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    expected = math.prod(shape) * np.dtype(dtype).itemsize
     try:
         found = path.stat().st_size
         if found != expected:
@@ -129,7 +142,7 @@ def _map(path: Path, dtype: Any, shape: tuple[int, ...], because: str) -> np.nda
 
 
 def _actions(path: Path, frames: int) -> np.ndarray:
-    size = path.stat().st_size
+    size = path.stat().st_size if path.is_file() else 0
     if not size or size % (4 * frames):
         raise DataError(
             f"{path}: {size} bytes are no float32 [{frames}, A], for the num_images "

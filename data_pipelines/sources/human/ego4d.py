@@ -31,6 +31,7 @@ from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, destination
 from data_pipelines.sources.settings import Ego4dSettings
 from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
+from data_pipelines.names import is_name, shown
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.rlds.writer import encode_jpeg
 from hma_jax.config.json import to_dict
@@ -62,6 +63,9 @@ class Ego4dSource:
         if not isinstance(data, dict) or not isinstance(data.get("videos"), list):
             raise DataError(f"{self.path}: no list 'videos' in it; give fho_main.json of the v2 annotations.")
         labels = {str(label.get("video_uid")): label for label in data["videos"] if isinstance(label, dict)}
+        wrong = [uid for uid in labels if not is_name(uid)]
+        if wrong:
+            raise DataError(f"{self.path}: video_uid {shown(wrong[0])} names no file. Fetch it again.")
         self._labels = {uid: label for uid, label in labels.items() if self._video(uid).is_file()}
         self.units = list(self._labels)
         if not self.units:
@@ -116,7 +120,10 @@ class Ego4dSource:
             for frame in action.get("frames") or ():
                 row = self._centres(frame, size, f"{where}, frame {frame.get('frame_number')}")
                 if row is not None:
-                    found.setdefault(int(self._field(frame, "frame_number", where)), row)
+                    number = self._field(frame, "frame_number", where)
+                    if type(number) is not int or not 0 <= number < video.most_frames:
+                        raise UnitError(f"{self.path}: {where} has frame_number {shown(number)}. {ADVICE}")
+                    found.setdefault(number, row)
         numbers = sorted(found)
         return np.array(numbers) / rate, np.array([found[n] for n in numbers]).reshape(-1, 4)
 
@@ -144,7 +151,7 @@ class Ego4dSource:
             text = self.path.read_bytes()
             self._hash = hashlib.sha256(text).hexdigest()[:16]
             return json.loads(text)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise DataError(f"{self.path} cannot be read ({error}). Fetch it again.") from error
 
     def _video(self, uid: str) -> Path:

@@ -24,6 +24,7 @@ from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, destination
 from data_pipelines.sources.settings import EgoExo4dSettings
 from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
+from data_pipelines.names import is_name, shown
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.rlds.writer import encode_jpeg
 from hma_jax.config.json import to_dict
@@ -50,10 +51,14 @@ class EgoExo4dSource:
         self.root, self.settings, self.camera = Path(root), settings, settings.camera
         self._poses = self.root / "annotations" / "ego_pose" / settings.split / "hand" / "automatic"
         takes = _json(self.root / "takes.json", DataError)
-        if not isinstance(takes, list) or not all(isinstance(t, dict) and "take_uid" in t for t in takes):
-            raise DataError(
-                f"{self.root / 'takes.json'}: not a list of takes with a take_uid. Fetch it again."
-            )
+        if not isinstance(takes, list) or not all(isinstance(t, dict) for t in takes):
+            raise DataError(f"{self.root / 'takes.json'}: not a list of takes. Fetch it again.")
+        for take in takes:
+            for field in ("take_uid", "take_name"):
+                if not is_name(take.get(field)):
+                    raise DataError(
+                        f"{self.root / 'takes.json'}: {field} {shown(take.get(field))} names no file. Fetch it again."
+                    )
         self._takes = [t for t in takes if self._pose(t).is_file() and self._video(t) is not None]
         self.units = [str(t.get("take_name")) for t in self._takes]
         if not self.units:
@@ -77,6 +82,10 @@ class EgoExo4dSource:
             numbers, positions = self._wrists(take, video)
             if not len(numbers):
                 return
+            if numbers[-1] >= video.most_frames:
+                raise UnitError(
+                    f"{self._pose(take)}: frame {numbers[-1]}, but {path} has {video.most_frames} at most. {ADVICE}"
+                )
             rows = np.full((int(numbers[-1]) + 1, 4), np.nan)
             rows[numbers] = positions
             if abs(video.rate - HZ) > 0.02 * HZ:
@@ -107,14 +116,12 @@ class EgoExo4dSource:
                 joints = people[0]["annotation2D"].get(self.camera) or {}
                 if all(joints.get(wrist) for wrist in WRISTS):
                     xy = [float(joints[wrist][axis]) for wrist in WRISTS for axis in ("x", "y")]
-                    found[int(frame)] = np.array(xy) / size
+                    found[_frame_number(frame)] = np.array(xy) / size
             except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
                 raise UnitError(
                     f"{path}: frame {frame!r} has no usable annotation2D ({error!r}). {ADVICE}"
                 ) from error
         numbers = sorted(found)
-        if numbers and numbers[0] < 0:
-            raise UnitError(f"{path}: frame {numbers[0]} is negative. {ADVICE}")
         return np.array(numbers, np.int64), np.array([found[n] for n in numbers]).reshape(-1, 4)
 
     def _full_size(self, video: Video) -> np.ndarray:
@@ -146,8 +153,14 @@ class EgoExo4dSource:
         return [pose, str(video.relative_to(self.root)), video.stat().st_size]
 
 
+def _frame_number(text: str) -> int:
+    if not (len(text) <= 9 and text.isascii() and text.isdecimal()):
+        raise ValueError(f"{shown(text)} is no frame number")
+    return int(text)
+
+
 def _json(path: Path, kind: type[DataError]) -> Any:
     try:
         return json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise kind(f"{path} cannot be read ({error}). {ADVICE}") from error

@@ -13,6 +13,9 @@ from PIL import Image, UnidentifiedImageError
 
 JPEG_MAGIC = b"\xff\xd8\xff"
 
+MOST_PIXELS = 2**25
+"""Of an image that is decoded, more than 8K video has; a few bytes can claim billions."""
+
 
 def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     """uint8 [H, W, 3] from JPEG or PNG bytes (grey images become RGB, alpha is dropped).
@@ -20,19 +23,29 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     The fast DCT is what TensorFlow's decoder uses by default, so pixels equal those that
     RLDS pipelines built on TensorFlow see. With `at_least`, a JPEG image may come smaller, as its
     coefficients allow, but no side shorter than that: what is resized anyway costs half as much.
-    Raises ValueError if the bytes are no image.
+    Raises ValueError if the bytes are no image, or one of more than MOST_PIXELS.
     """
     if data.startswith(JPEG_MAGIC):
+        _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
         return simplejpeg.decode_jpeg(
             data, colorspace="RGB", fastdct=True, min_height=at_least, min_width=at_least
         )
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+            _check_pixels(data, *image.size)
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
         raise ValueError(f"{len(data)} bytes that are neither JPEG nor PNG") from error
     except Image.DecompressionBombError as error:
         raise ValueError(f"{len(data)} bytes of an image too large to be a frame ({error})") from error
+
+
+def _check_pixels(data: bytes, height: int, width: int) -> None:
+    if height * width > MOST_PIXELS:
+        raise ValueError(
+            f"{len(data)} bytes of an image too large to be a frame "
+            f"({height * width:,} pixels, more than {MOST_PIXELS:,})"
+        )
 
 
 def fit_image(image: np.ndarray, size: int) -> np.ndarray:

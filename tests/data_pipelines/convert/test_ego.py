@@ -193,6 +193,9 @@ def test_the_release_keeps_what_is_too_short_and_we_do_not(tmp_path):
     [
         ({"3": [{}]}, {}, "uid-1.json: frame '3' has no usable annotation2D"),
         ({"x": pose(3)}, {}, "uid-1.json: frame 'x' has no usable annotation2D"),
+        ({"3": pose(3), "-1": pose(3)}, {}, "uid-1.json: frame '-1' has no usable annotation2D"),
+        ({"3": pose(3), "4" * 9: pose(3)}, {}, "uid-1.json: frame 444444444, but .*cam01.mp4 has .* at most"),
+        ({"3": pose(3), "4" * 10: pose(3)}, {}, "uid-1.json: frame '4444444444' has no usable annotation2D"),
         ({"3": pose(3)}, {"fps": 25}, "cam01.mp4: 25 frames per second, not 30"),
         ({"3": pose(3)}, {"size": (64, 64)}, "64 x 64 pixels is no copy of one of 3840 x 2160"),
     ],
@@ -200,6 +203,31 @@ def test_the_release_keeps_what_is_too_short_and_we_do_not(tmp_path):
 def test_malformed_takes_are_named(tmp_path, poses, options, message):
     with pytest.raises(DataError, match=message):
         convert(egoexo4d(tmp_path, poses, **options), tmp_path, "exoego4d")
+
+
+@pytest.mark.parametrize("field", ["take_uid", "take_name"])
+@pytest.mark.parametrize("value", ["../../elsewhere", "/etc/passwd", "a/b", None])
+def test_takes_stay_below_their_root(tmp_path, field, value):
+    egoexo4d(tmp_path, {"3": pose(3)})
+    takes = json.loads((tmp_path / "takes.json").read_text())
+    (tmp_path / "takes.json").write_text(json.dumps([takes[0] | {field: value}]))
+    with pytest.raises(DataError, match=f"takes.json: {field} .* names no file"):
+        EgoExo4dSource(tmp_path)
+
+
+def test_annotated_videos_stay_below_their_folder(tmp_path):
+    ego4d(tmp_path, action(annotated(3)))
+    text = (tmp_path / "fho_main.json").read_text().replace(f'"{UID}"', '"../full_scale/0a1b"')
+    (tmp_path / "fho_main.json").write_text(text)
+    with pytest.raises(DataError, match="fho_main.json: video_uid .* names no file"):
+        Ego4dSource(tmp_path / "fho_main.json", tmp_path / "full_scale")
+
+
+@pytest.mark.parametrize("number", [-1, 10**12, "3", True])
+def test_annotated_frame_beyond_its_video_is_named(tmp_path, number):
+    source = ego4d(tmp_path, action(annotated(3) | {"frame_number": number}))
+    with pytest.raises(DataError, match=r"fho_main.json: 0a1b, interval 0 has frame_number"):
+        list(source.read(0))
 
 
 def test_a_root_without_takes_is_refused(tmp_path):

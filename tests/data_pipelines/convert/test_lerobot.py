@@ -138,6 +138,58 @@ def test_info_of_another_kind_is_named(tmp_path, change, message):
         LeRobotSource(root)
 
 
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("field", ["data_path", "video_path"])
+@pytest.mark.parametrize(
+    "path", ["../{episode_index}", "/etc/{file_index}", "data/../../x", "{video_key.__class__}", "{0}",
+             "{chunk_index:>9999999999}", "{episode_index!r}", "a\\b", "x" * 2000],
+)  # fmt: skip
+def test_files_stay_below_the_root(tmp_path, version, field, path):
+    root = write_lerobot(tmp_path / "toy", version)
+    info = json.loads((root / "meta/info.json").read_text()) | {field: path}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match=rf"meta/info.json: {field} .* cannot be filled in"):
+        LeRobotSource(root)
+
+
+def test_image_stays_below_the_root(tmp_path):
+    import pyarrow as pa
+
+    (tmp_path / "secret.png").write_bytes(b"secret")
+
+    def outside(e, rows):
+        rows[CAMERA] = pa.array([{"bytes": None, "path": "../secret.png"}] * len(rows["task_index"]))
+
+    source = LeRobotSource(write_lerobot(tmp_path / "toy", "v2.1", camera="image", change=outside))
+    with pytest.raises(DataError, match="at row 0: '../secret.png' leaves the dataset's directory"):
+        convert(source, tmp_path, "arm")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fps": "fast"}, {"fps": float("inf")}, {"features": [1]}, {"features": {"action": 7}},
+        {"features": {"action": {"dtype": "float32"}}}, {"features": {"a": {"dtype": "x", "shape": [2**40, 2**40]}}},
+        {"data_path": 7}, {"chunks_size": -1}, {"chunks_size": "x"},
+    ],
+)  # fmt: skip
+def test_info_of_the_wrong_kind_is_named(tmp_path, change):
+    root = write_lerobot(tmp_path / "toy", "v2.1")
+    info = json.loads((root / "meta/info.json").read_text()) | change
+    (root / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match="meta/info.json.* Fetch the dataset again"):
+        LeRobotSource(root)
+
+
+@pytest.mark.parametrize("line", ["[1]", "7", "{}", '{"episode_index": "1e999", "length": 3}', '{"episode_index": -1}'])
+def test_line_that_describes_no_episode_is_named(tmp_path, line):
+    root = write_lerobot(tmp_path / "toy", "v2.1")
+    with open(root / "meta/episodes.jsonl", "a") as file:
+        file.write(f"\n{line}\n")
+    with pytest.raises(DataError, match="episodes.jsonl: line 4"):
+        LeRobotSource(root)
+
+
 def test_a_directory_that_is_none_is_refused(tmp_path):
     with pytest.raises(DataError, match="info.json is missing: give the root of a LeRobot dataset"):
         LeRobotSource(tmp_path)

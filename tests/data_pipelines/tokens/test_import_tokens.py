@@ -244,6 +244,36 @@ def test_raw_images_and_odd_vocabularies_are_refused(tmp_path, pair):
         import_tokens(*pair, tmp_path / "store", hz=4)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"token_dtype": "nonsense"}, {"token_dtype": "O"}, {"token_dtype": [1]}, {"latent_channels": -4},
+        {"latent_channels": "4"}, {"h": 10**4000, "w": 10**4000}, {"num_images": True}, {"vocab_size": 2**40},
+        {"action_dim": "x"},
+    ],
+)  # fmt: skip
+def test_metadata_of_the_wrong_kind_is_named(tmp_path, change):
+    with pytest.raises(DataError, match=r"metadata.json: .* Fetch the folder again"):
+        open_folder(write_folder(tmp_path / "toy_train", **change))
+
+
+def test_name_of_a_folder_is_no_path(tmp_path):
+    pair = [write_folder(tmp_path / f"toy_{split}", name="../../elsewhere") for split in ("train", "val")]
+    with pytest.raises(DataError, match=r"toy_train/metadata.json: name is '../../elsewhere'; use up to 128 letters"):
+        import_tokens(*pair, tmp_path / "store", hz=4)
+    assert import_tokens(*pair, tmp_path / "store", name="mine", hz=4).spec.name == "mine"
+
+
+def test_episode_numbers_at_both_ends_of_their_type(tmp_path):
+    """Their difference does not fit into the type."""
+    folder = write_folder(tmp_path / "toy_train", lengths=(2, 2))
+    rewrite("segment_ids.bin", np.array([-(2**31), -(2**31), 2**31 - 1, 2**31 - 1], np.int32))(folder)
+    assert len(open_folder(folder)) == 2
+    rewrite("segment_ids.bin", np.array([2**31 - 1, 2**31 - 1, -(2**31), -(2**31)], np.int32))(folder)
+    with pytest.raises(DataError, match="segment_ids.bin: the episode falls"):
+        open_folder(folder)
+
+
 def test_pairs_are_found_by_name(tmp_path, pair):
     assert pair_folders([pair[0]]) == pair_folders(list(pair)) == [("toy", *pair)]
     with pytest.raises(ConfigError, match="must end in _train or _val"):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from data_pipelines.sources.rlds import images
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.images import decode_image, fit_image
 from tests.data_pipelines.fakes import REAL_DATA, png
@@ -49,6 +50,37 @@ def test_image_that_would_fill_the_memory_is_refused(monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
     with pytest.raises(ValueError, match="too large to be a frame"):
         decode_image(png(np.zeros((8, 8, 3), np.uint8)))
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG"])
+def test_image_of_too_many_pixels_is_refused_before_it_is_decoded(kind, monkeypatch):
+    """A header of a few bytes: nothing of its size is allocated."""
+    data = io.BytesIO()
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(data, kind)
+    encoded = data.getvalue()
+    assert decode_image(encoded).shape == (8, 8, 3)
+    monkeypatch.setattr(images, "MOST_PIXELS", 63)
+    with pytest.raises(ValueError, match=r"too large to be a frame \(64 pixels, more than 63\)"):
+        decode_image(encoded)
+    with pytest.raises(ValueError, match="too large to be a frame"):
+        decode_image(encoded, at_least=1)
+
+
+def test_jpeg_that_claims_billions_of_pixels_is_refused():
+    data = io.BytesIO()
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(data, "JPEG")
+    encoded = bytearray(data.getvalue())
+    at = encoded.index(b"\xff\xc0") + 5  # height and width of the frame header
+    encoded[at : at + 4] = b"\xff\x00\xff\x00"
+    with pytest.raises(ValueError, match="4,261,478,400 pixels"):
+        decode_image(bytes(encoded))
+
+
+def test_other_formats_are_not_tried():
+    data = io.BytesIO()
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(data, "TIFF")
+    with pytest.raises(ValueError, match="neither JPEG nor PNG"):
+        decode_image(data.getvalue())
 
 
 @pytest.mark.parametrize("shape", [(40, 64), (64, 40), (720, 1280), (1440, 1920), (31, 33)])

@@ -1,0 +1,61 @@
+"""Names and paths that files of others give."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.names import LONGEST_NAME, inside, is_name, shown
+from data_pipelines.registry import DatasetSpec, all_specs
+from data_pipelines.registry.toml_file import load_entries
+from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import make_spec
+
+GOOD = ["toy", "bridge_dataset", "fractal20220817_data", "_x", "0", "A.b-c", "x" * LONGEST_NAME]
+BAD = ["", ".", "..", ".hidden", "../x", "/x", "a/b", "a\\b", "a b", "a\n", "-rf", "ä", "\x00", "x" * (LONGEST_NAME + 1)]
+
+
+def test_every_name_of_the_registry_is_one():
+    assert all(is_name(spec.name) for spec in all_specs())
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_name(name):
+    assert is_name(name) and make_spec(name).name == name
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_text_that_is_no_name(name):
+    assert not is_name(name)
+    with pytest.raises(ConfigError, match="no name of a dataset: use up to 128 letters"):
+        make_spec(name)
+
+
+@pytest.mark.parametrize("name", ["../x", "/x", ".x"])
+def test_entry_of_a_file_cannot_be_called_like_a_path(tmp_path, name):
+    path = tmp_path / "own.toml"
+    path.write_text(f'["{name}"]\nimage_key = "image"\naction_keys = ["action"]\naction_dims = [7]\nhz = 5\n')
+    with pytest.raises(ConfigError, match="own.toml: dataset .* no name of a dataset"):
+        load_entries(path)
+
+
+def test_part_of_a_field_with_a_huge_number_is_no_crash():
+    with pytest.raises(ConfigError):
+        DatasetSpec("toy", "image", ("action[:" + "9" * 5000 + "]",), (7, 7), 5.0)
+
+
+@pytest.mark.parametrize("text", ["a", "a/b", "..a/b..", "a/./b", "videos/x/chunk-000/file.mp4"])
+def test_path_inside(text):
+    assert inside(Path("/root"), text) == Path("/root") / text
+
+
+@pytest.mark.parametrize("text", ["", "..", "../a", "a/../../b", "/a", "a\\..\\b", "a\0b", "a\nb", "a" * 1025, 7, None])
+def test_path_that_may_leave(text):
+    with pytest.raises(ValueError):
+        inside(Path("/root"), text)
+
+
+def test_values_of_others_are_shown_on_one_short_line():
+    for value in ("\x1b[31m" * 99, b"\n" * 999, ["x"] * 999, {"a": "\ud800"}, None):
+        assert shown(value).isprintable() and len(shown(value)) < 100
