@@ -98,7 +98,7 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
         if missing:
             raise DataError(f"{path}: no column {missing[0]!r}. {ADVICE}")
         wanted = [*columns, *(["tasks"] if "tasks" in table.column_names else [])]
-        for line, row in enumerate(table.select(wanted).to_pylist()):
+        for line, row in enumerate(_rows(table.select(wanted), path)):
             where = f"{path}: row {line}"
             number = {c: (_seconds if c.endswith("timestamp") else _count)(row, c, where) for c in columns}
             clips = {}
@@ -131,7 +131,15 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
         raise DataError(
             f"{path}: the columns are {', '.join(table.column_names)}; task and task_index are needed."
         )
-    return dict(zip(table["task_index"].to_pylist(), map(str, table[text[0]].to_pylist()), strict=True))
+    rows = enumerate(_rows(table.select(["task_index", text[0]]), path))
+    return {_count(row, "task_index", f"{path}: row {line}"): str(row[text[0]]) for line, row in rows}
+
+
+def _rows(table: Any, path: Path) -> list[dict[str, Any]]:
+    try:
+        return table.to_pylist()
+    except ValueError as error:  # texts that are none; of pyarrow's errors most are ValueErrors too
+        raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
 
 
 def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> Any:

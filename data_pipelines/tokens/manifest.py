@@ -207,6 +207,7 @@ def load_manifest(path: Path) -> Manifest:
         take = _from_json if values["format"] == 2 else _from_file
         lists = take(path, values)
         manifest = from_dict(Manifest, values)
+        manifest.embodiment()  # its parts fit each other
         return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
     except OSError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error

@@ -2,8 +2,8 @@
 
 Owns reading what tfds wrote: schema, shards, records, one camera and the action of an
 episode. Knows neither tokenizers nor windows nor which dataset has which camera (see
-`registry`). tfds is asked for metadata only; records go through `tfrecord` and `example`,
-and lie on a disk or in a remote store (see `location`).
+`registry`). Metadata goes through `schema`, records through `tfrecord` and `example`; both
+lie on a disk or in a remote store (see `location`).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError, UnreachableError
+from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds import array_record
-from data_pipelines.sources.rlds.example import Feature, parse_example
+from data_pipelines.sources.rlds.example import Feature, parse_record
 from data_pipelines.sources.rlds.frame_places import FramePlaces
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.index import index_path, load_index
@@ -175,13 +175,7 @@ class RldsDataset(EpisodeSource):
         path, offset, length = self._place(i)
         opened = array_record.open_record if self._in_array_records else open_record
         with opened(path, offset, length) as payload:
-            try:
-                record = parse_example(payload, keys, lazy)
-            except UnreachableError:
-                raise
-            except DataError as error:
-                raise CorruptRecordError(path, offset, str(error)) from error
-            yield record
+            yield parse_record(payload, path, offset, keys, lazy)
 
     def _check_shards(self, expected: Sequence[int]) -> None:
         """Raises what is wrong with the shards, or counts the episodes that it costs."""

@@ -12,17 +12,25 @@ Message (protobuf field numbers): Example{1: Features}, Features{1: map entries 
 from __future__ import annotations
 
 import struct
+from array import array
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import CorruptRecordError, DataError, UnreachableError
 
 if TYPE_CHECKING:
+    from data_pipelines.sources.rlds.location import Location
     from data_pipelines.sources.rlds.tfrecord import FileView
 
 Feature = np.ndarray | Sequence[bytes]
+
+MOST_FEATURES = 10_000
+"""Of a record: a feature of a few bytes takes hundreds in memory."""
+
+BATCH = 2**16
+"""Bytes of varints that are decoded at once, for which fifty times as much is needed."""
 
 _BYTES, _FLOAT, _INT = 1, 2, 3  # field numbers inside Feature
 _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5  # wire types
@@ -31,15 +39,31 @@ _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5  # wire types
 class LazyBytes(Sequence[bytes]):
     """The n values of a bytes feature, each cut from the record when it is asked for."""
 
-    def __init__(self, data: bytes | FileView, spans: Sequence[tuple[int, int]]):
-        self._data, self.spans = data, spans
+    def __init__(self, data: bytes | FileView, spans: np.ndarray):
+        self._data, self.spans = data, spans  # int64 [n, 2]
 
     def __len__(self) -> int:
         return len(self.spans)
 
     def __getitem__(self, i: int) -> bytes:
-        start, end = self.spans[i]
+        start, end = self.spans[i].tolist()
         return self._data[start:end]
+
+
+def parse_record(
+    payload: bytes | FileView,
+    path: Location,
+    offset: int,
+    keys: Collection[str] | None = None,
+    lazy: bool = False,
+) -> dict[str, Feature]:
+    """`parse_example` of the record at byte `offset` of `path`, which a CorruptRecordError names."""
+    try:
+        return parse_example(payload, keys, lazy)
+    except UnreachableError:
+        raise
+    except DataError as error:
+        raise CorruptRecordError(path, offset, str(error)) from error
 
 
 def parse_example(
@@ -71,6 +95,8 @@ def parse_example(
                         value = (a, b)
                 if wanted is None or key in wanted:
                     found[key.decode()] = _parse_feature(data, *value, lazy)
+                    if len(found) > MOST_FEATURES:
+                        raise ValueError(f"more than {MOST_FEATURES:,} features")
     except (IndexError, ValueError, struct.error) as error:
         raise DataError(f"the record is not a tf.train.Example ({error})") from error
     return found
@@ -138,78 +164,76 @@ def _skip(data: bytes | FileView, at: int, wire: int) -> int:
 
 
 def _parse_feature(data: bytes | FileView, start: int, end: int, lazy: bool) -> Feature:
-    kind, parts = 0, []
+    kind, parts = 0, array("q")
     for number, a, b in _messages(data, start, end):
         if number != kind:  # a oneof: the last kind wins, pieces of one kind are joined
-            kind, parts = number, []
-        parts.append((a, b))
+            kind, parts = number, array("q")
+        parts.extend((a, b))
     if kind == _FLOAT:
-        return _join([piece for a, b in parts for piece in _floats(data, a, b)], np.float32)
+        return np.frombuffer(_numbers(data, parts, _FIXED32), "<f4")
     if kind == _INT:
-        return _join([piece for a, b in parts for piece in _ints(data, a, b)], np.int64)
-    spans = [(x, y) for a, b in parts for number, x, y in _messages(data, a, b) if number == 1]
-    return LazyBytes(data, spans) if lazy else [data[x:y] for x, y in spans]
+        return _varints(np.frombuffer(_numbers(data, parts, _VARINT), np.uint8))
+    found = array("q")
+    for k in range(0, len(parts), 2):
+        for number, x, y in _messages(data, parts[k], parts[k + 1]):
+            if number == 1:
+                found.extend((x, y))
+    values = LazyBytes(data, np.frombuffer(found, np.int64).reshape(-1, 2))
+    return values if lazy else list(values)
 
 
-def _join(pieces: list[np.ndarray], dtype: type) -> np.ndarray:
-    if len(pieces) == 1:
-        return pieces[0]
-    return np.concatenate(pieces) if pieces else np.zeros(0, dtype)
-
-
-def _floats(data: bytes | FileView, at: int, end: int):
-    while at < end:
-        tag, at = _varint(data, at)
-        if tag == (1 << 3 | _LENGTH):  # packed, what every writer does
-            length, at = _varint(data, at)
-            _check_inside(at + length, end)
-            if length % 4:
-                raise ValueError(f"a list of floats at byte {at} is {length} bytes long")
-            yield np.frombuffer(data[at : at + length], "<f4")
-            at += length
-        elif tag == (1 << 3 | _FIXED32):
-            _check_inside(at + 4, end)
-            yield np.frombuffer(data[at : at + 4], "<f4")
-            at += 4
-        else:
-            at = _skip(data, at, tag & 7)
-
-
-def _ints(data: bytes | FileView, at: int, end: int):
-    while at < end:
-        tag, at = _varint(data, at)
-        if tag == (1 << 3 | _LENGTH):
-            length, at = _varint(data, at)
-            _check_inside(at + length, end)
-            yield _varints(np.frombuffer(data[at : at + length], np.uint8))
-            at += length
-        elif tag == (1 << 3 | _VARINT):
+def _numbers(data: bytes | FileView, parts: array, single: int) -> bytes | bytearray:
+    """The encoded numbers of the lists that lie at `parts`, joined: packed as every writer does it, or
+    one by one with the wire type `single`."""
+    spans = array("q")
+    for k in range(0, len(parts), 2):
+        at, end = parts[k], parts[k + 1]
+        while at < end:
+            tag, at = _varint(data, at)
             start = at
-            _, at = _varint(data, at)
-            yield _varints(np.frombuffer(data[start:at], np.uint8))
-        else:
-            at = _skip(data, at, tag & 7)
-
-
-def _check_inside(stop: int, end: int) -> None:
-    if stop > end:
-        raise ValueError(f"a list of numbers runs past the end of its message at byte {end}")
+            if tag == (1 << 3 | _LENGTH):
+                length, start = _varint(data, at)
+                at = start + length
+            elif tag == (1 << 3 | single):
+                at = _skip(data, at, single)
+            else:
+                at = _skip(data, at, tag & 7)
+                continue
+            if at > end:
+                raise ValueError(f"a list of numbers runs past the end of its message at byte {end}")
+            if single == _FIXED32 and (at - start) % 4:
+                raise ValueError(f"a list of floats at byte {start} is {at - start} bytes long")
+            if single == _VARINT and at > start and data[at - 1] >= 0x80:
+                raise ValueError("a varint is cut off")
+            spans.extend((start, at))
+    if len(spans) == 2:
+        return data[spans[0] : spans[1]]
+    joined = bytearray()
+    for k in range(0, len(spans), 2):
+        joined += data[spans[k] : spans[k + 1]]
+    return joined
 
 
 def _varints(raw: np.ndarray) -> np.ndarray:
-    """int64 values of packed varints (uint8 bytes), all at once."""
+    """int64 values of packed varints (uint8 bytes), the last of which is whole; many at once."""
     last = raw < 0x80
     if last.all():  # flags and small numbers
         return raw.astype(np.int64)
-    if not last[-1]:
-        raise ValueError("a varint is cut off")
-    ends = np.flatnonzero(last)
-    starts = np.concatenate([[0], ends[:-1] + 1])
-    if (ends - starts).max() > 9:
-        raise ValueError("a varint is longer than 10 bytes")
-    position = np.arange(raw.size) - np.repeat(starts, ends - starts + 1)
-    bits = (raw & 0x7F).astype(np.uint64) << (7 * position).astype(np.uint64)
-    return np.bitwise_or.reduceat(bits, starts).view(np.int64)
+    values = np.empty(np.count_nonzero(last), np.int64)
+    start = done = 0
+    while start < raw.size:
+        ends = np.flatnonzero(last[start : start + BATCH])
+        if not ends.size:
+            raise ValueError("a varint is longer than 10 bytes")
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        if (ends - starts).max() > 9:
+            raise ValueError("a varint is longer than 10 bytes")
+        piece = raw[start : start + ends[-1] + 1]
+        position = np.arange(piece.size) - np.repeat(starts, ends - starts + 1)
+        bits = (piece & 0x7F).astype(np.uint64) << (7 * position).astype(np.uint64)
+        values[done : done + ends.size] = np.bitwise_or.reduceat(bits, starts).view(np.int64)
+        start, done = start + piece.size, done + ends.size
+    return values
 
 
 # --- writing ---------------------------------------------------------------------------------

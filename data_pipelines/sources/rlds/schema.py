@@ -121,7 +121,7 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
     features = read_features(directory)
     if info.file_format not in FILE_FORMATS:
         known = " and ".join(FILE_FORMATS)
-        raise DataError(f"{directory}: fileFormat is {shown(info.file_format)}; only {known} can be read.")
+        raise DataError(f"{directory / INFO}: fileFormat is {shown(info.file_format)}; only {known} can be read.")
     require(
         split in info.splits,
         f"{info.name}: no split {split!r} in {directory}; splits there: {listing(sorted(info.splits))}",
