@@ -34,6 +34,12 @@ def inside(root: Path, text: object) -> Path:
     return root / text
 
 
+def brief(text: object, longest: int = 500) -> str:
+    """A message that may quote a file of others, of bounded length."""
+    text = str(text)
+    return text if len(text) <= longest else f"{text[:longest]} ..."
+
+
 def shown(value: object, longest: int = 80) -> str:
     """A value of others for a message: on one line, of bounded length."""
     text = ascii(value[:longest]) if isinstance(value, (str, bytes)) else ascii(value)

@@ -148,8 +148,10 @@ def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> 
 
     def read() -> Any:
         try:
-            return parquet.read_table(path, columns=columns, partitioning=None, **options)
-        except (OSError, arrow.ArrowException) as error:
+            table = parquet.read_table(path, columns=columns, partitioning=None, **options)
+            table.column_names  # noqa: B018  that they are text is found out here
+            return table
+        except (OSError, ValueError, arrow.ArrowException) as error:
             if is_failure(error):
                 raise  # to be tried again
             raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
@@ -178,7 +180,7 @@ def _place(root: Path, info: dict[str, Any], field: str, **place: Any) -> Path:
 def _check_info(info: dict[str, Any], path: Path) -> None:
     """Raises DataError for a field of info.json of the wrong kind."""
     fps, features = info["fps"], info["features"]
-    if type(fps) not in (int, float) or not 0 < fps < math.inf:
+    if type(fps) not in (int, float) or not 0 < fps <= MOST:
         raise DataError(f"{path}: fps is {shown(fps)}, not a rate. {ADVICE}")
     for field in ("data_path", "video_path"):
         if not isinstance(info.get(field) or "", str):

@@ -18,6 +18,7 @@ import numpy as np
 
 from data_pipelines.columns import Column, Columns, write_columns
 from data_pipelines.errors import DataError
+from data_pipelines.names import brief
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.identity import EpisodeRun
 from hma_jax.config import ConfigError, require
@@ -213,8 +214,8 @@ def load_manifest(path: Path) -> Manifest:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
     except (ValueError, AttributeError, TypeError, KeyError, OverflowError, RecursionError) as error:
         if isinstance(error, ConfigError):
-            raise DataError(f"{path}: not a manifest of this program: {error}. {advice}") from error
-        raise DataError(f"{path}: the manifest is damaged ({error}). {advice}") from error
+            raise DataError(f"{path}: not a manifest of this program: {brief(error)}. {advice}") from error
+        raise DataError(f"{path}: the manifest is damaged ({brief(error)}). {advice}") from error
 
 
 Lists = dict[str, dict[str, Sequence[int]]]

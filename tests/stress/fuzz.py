@@ -26,7 +26,7 @@ from pathlib import Path
 
 from data_pipelines.errors import DataError
 from hma_jax.config import ConfigError
-from tests.stress.mutate import make_input
+from tests.stress.mutate import blow_up, make_input
 from tests.stress.targets import TARGETS, Target, make_target
 
 SECONDS = 5.0
@@ -34,7 +34,7 @@ SECONDS = 5.0
 
 EXTRA_MEMORY = 64 * 2**20
 PAGE = os.sysconf("SC_PAGE_SIZE")
-SAVE_EVERY = 1000
+SAVE_EVERY, BLOW_UP_EVERY = 1000, 2999
 
 
 class Hang(BaseException):
@@ -135,6 +135,8 @@ def _work(name: str, inputs: int, seconds: float, state: Path) -> None:
 
     def one(data: bytes) -> None:
         check(data)
+        if check.count % BLOW_UP_EVERY == 0:  # not left to libFuzzer, which would go on from large inputs
+            check(blow_up(random.Random(check.count), data))
         if check.count % SAVE_EVERY == 0 or check.count >= last:
             save()
             if check.count >= last or time.perf_counter() - begin > seconds:
@@ -143,7 +145,7 @@ def _work(name: str, inputs: int, seconds: float, state: Path) -> None:
     if last <= 0:
         return
     if importlib.util.find_spec("atheris") is None:
-        for n in range(last):
+        for n in range(last):  # `one` ends the process
             one(make_input(random.Random(f"{name}:{done['inputs'] + n}"), target.seeds, target.structured))
     import atheris
 
@@ -156,10 +158,10 @@ def _work(name: str, inputs: int, seconds: float, state: Path) -> None:
             return atheris.Mutate(data, most)
         return make_input(rng, [data, rng.choice(target.seeds)], target.structured)[:most]
 
-    atheris.instrument_all() if os.environ.get("HMA_FUZZ_ALL") else _instrument(atheris)
+    _instrument(atheris)
     atheris.Setup(
-        [sys.argv[0], "-timeout=0", "-rss_limit_mb=0", "-max_len=1100000", "-print_final_stats=0", "-verbosity=0",
-         f"-seed={done['inputs'] + 1}", str(home / "kept")],
+        [sys.argv[0], "-timeout=1000", "-rss_limit_mb=0", "-max_len=16384", "-print_final_stats=0", "-verbosity=0",
+         f"-seed={done['inputs'] + 1}", f"-artifact_prefix={home}/", str(home / "kept")],
         one, custom_mutator=mutate,
     )  # fmt: skip
     atheris.Fuzz()

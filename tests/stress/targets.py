@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.convert.lerobot_meta import read_meta
 from data_pipelines.errors import DataError
+from data_pipelines.sources.lerobot_meta import read_meta
 from data_pipelines.sources.rlds.example import encode_example, parse_record
 from data_pipelines.sources.rlds.schema import FEATURES, INFO, read_features, read_info, read_metadata
 from data_pipelines.sources.rlds.tfrecord import masked_crc32c, open_record, read_record, scan_shard
