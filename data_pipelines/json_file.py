@@ -64,8 +64,6 @@ def _read(path: Path | UPath, if_missing: str, advice: str) -> bytes:
         return read_start(path, MOST_BYTES + 1)
     except FileNotFoundError:
         raise DataError(f"{path} is missing: {if_missing}") from None
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error}). {advice}") from error
 
 
 def _parse(text: bytes, where: object, advice: str) -> Any:

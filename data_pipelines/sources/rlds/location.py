@@ -115,13 +115,16 @@ def open_ranges(location: Location) -> Iterator[Ranges]:
 def read_start(location: Location, most: int) -> bytes:
     """Up to `most` bytes from a file's beginning on.
 
-    Raises FileNotFoundError if there is none, OSError where a disk fails, UnreachableError where a
-    remote store does.
+    Raises FileNotFoundError if there is none, UnreachableError where the disk or the store fails.
     """
     if is_remote(location):
         return _RemoteFile(location).read(0, most)
-    with open(location, "rb") as file:
-        return file.read(most)
+
+    def read() -> bytes:
+        with open(location, "rb") as file:
+            return file.read(most)
+
+    return retried(location, read)
 
 
 class OpenFiles:

@@ -16,7 +16,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_object
 from data_pipelines.names import NAME_RULE, is_name, shown
 from data_pipelines.sources.rlds.features import FlatFeature, parse_features
-from data_pipelines.sources.rlds.location import locate
+from data_pipelines.sources.rlds.location import locate, retried
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -88,23 +88,24 @@ class SplitMetadata:
 def resolve_version(directory: str | Location) -> Location:
     """The version directory: `directory` itself or its newest version."""
     directory = locate(directory)
-    if not directory.is_dir():
+    if not retried(directory, directory.is_dir):
         raise DataError(f"{directory}: no such directory. Give the path of an RLDS dataset.")
-    if (directory / "dataset_info.json").is_file():
+    if _has_info(directory):
         return directory
-    versions = [
-        d
-        for d in directory.iterdir()
-        if re.fullmatch(r"\d+\.\d+\.\d+", d.name) and (d / "dataset_info.json").is_file()
-    ]
+    inside = retried(directory, lambda: list(directory.iterdir()))
+    versions = [d for d in inside if re.fullmatch(r"\d+\.\d+\.\d+", d.name) and _has_info(d)]
     if versions:
         return max(versions, key=lambda d: tuple(map(int, d.name.split("."))))
-    entries = sorted(p.name for p in directory.iterdir())
+    entries = sorted(p.name for p in inside)
     raise DataError(
         f"{directory}: no RLDS dataset: neither it nor a version directory such as 1.0.0 in it has a "
         f"dataset_info.json (it holds {listing(entries[:6]) or 'nothing'}). "
         "Give the directory that tfds wrote, <name> or <name>/<version>."
     )
+
+
+def _has_info(directory: Location) -> bool:
+    return retried(directory, (directory / INFO).is_file)
 
 
 def dataset_name(directory: str | Location) -> str:
