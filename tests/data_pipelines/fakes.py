@@ -123,11 +123,11 @@ def write_rlds(
     for k, part in enumerate(np.array_split(np.arange(len(records)), shards)):
         path = directory / f"{spec.name}-train.tfrecord-{k:05d}-of-{shards:05d}"
         counts.append(write_shard(path, [records[i] for i in part]))
-    _write_metadata(directory, spec, counts)
+    write_metadata(directory, spec, counts)
     return directory
 
 
-def _write_metadata(directory: Path, spec: DatasetSpec, counts: list[int]) -> None:
+def write_metadata(directory: Path, spec: DatasetSpec, counts: list[int]) -> None:
     from tensorflow_datasets import features as tf
 
     def tensor(size: int):
