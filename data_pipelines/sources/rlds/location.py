@@ -253,6 +253,6 @@ class _RemoteFile:
             return b""
         place = self._location
         try:
-            return retried(place, lambda: place.fs.cat_file(place.path, offset, end))
+            return retried(place, lambda: place.fs.cat_file(place.path, start=offset, end=end))
         except FileNotFoundError:
             raise missing(place) from None
