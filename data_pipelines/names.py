@@ -42,5 +42,7 @@ def brief(text: object, longest: int = 500) -> str:
 
 def shown(value: object, longest: int = 80) -> str:
     """A value of others for a message: on one line, of bounded length."""
+    if isinstance(value, (list, dict)):  # of any depth
+        return f"a {type(value).__name__} of {len(value):,}"
     text = ascii(value[:longest]) if isinstance(value, (str, bytes)) else ascii(value)
     return text if len(text) <= longest + 8 else f"{text[:longest]}..."

@@ -242,7 +242,7 @@ def _from_file(path: Path, values: dict[str, Any]) -> Lists:
     return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in lists.items()}
 
 
-def _integers(values: list, name: str) -> np.ndarray:
+def _integers(values: list, name: str) -> Sequence[int]:
     array = np.asarray(values or np.zeros(0, np.int64))
     require(array.ndim == 1 and array.dtype.kind == "i", f"{name}: expected a list of integers")
-    return array
+    return array if len(array) else ()

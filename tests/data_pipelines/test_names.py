@@ -57,5 +57,8 @@ def test_path_that_may_leave(text):
 
 
 def test_values_of_others_are_shown_on_one_short_line():
-    for value in ("\x1b[31m" * 99, b"\n" * 999, ["x"] * 999, {"a": "\ud800"}, None):
+    deep = []
+    for _ in range(5000):
+        deep = [deep]
+    for value in (deep, "\x1b[31m" * 99, b"\n" * 999, ["x"] * 999, {"a": "\ud800"}, None):
         assert shown(value).isprintable() and len(shown(value)) < 100

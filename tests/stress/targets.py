@@ -5,6 +5,7 @@ A target lays a sound dataset into a directory, puts an input in the place of on
 
 from __future__ import annotations
 
+import hashlib
 import json
 import random
 import struct
@@ -14,12 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
+from data_pipelines.columns import _START as START
+from data_pipelines.columns import MAGIC
 from data_pipelines.errors import DataError
 from data_pipelines.sources.lerobot_meta import read_meta
 from data_pipelines.sources.rlds.example import encode_example, parse_record
 from data_pipelines.sources.rlds.schema import FEATURES, INFO, read_features, read_info, read_metadata
 from data_pipelines.sources.rlds.tfrecord import masked_crc32c, open_record, read_record, scan_shard
-from data_pipelines.tokens.manifest import load_manifest
+from data_pipelines.tokens.manifest import COLUMNS_FILE, FILE, LISTS, SPLITS, load_manifest
 from data_pipelines.tokens.release_folder import open_folder
 from tests.data_pipelines.fakes import REAL_DATA, OneDataset, make_features, make_spec
 from tests.stress.mutate import change_bytes, change_json
@@ -185,16 +188,47 @@ def _change_rest(rng: random.Random, data: bytes) -> bytes:
 
 
 def _manifest(root: Path) -> Target:
-    path = root / "manifest.json"
-    sound = OneDataset([5, 6, 7], dims=(3,)).manifest("toy")
-    named = replace(sound, spec=replace(make_spec(dims=(2, 1)), camera="front"))
+    sound = replace(
+        OneDataset([5, 6, 7]).manifest("toy"), spec=replace(make_spec(dims=(2, 1)), camera="a")
+    )
+    sound = replace(sound, train=replace(sound.train, parts=(2, 1)))
+    now, before = root / "now", root / "before"
+    for home in (now, before):
+        home.mkdir()
+        sound.save(home, root)
+    values = json.loads((now / FILE).read_text())  # and as format 2 had it
+    del values["columns"]
+    values["format"] = 2
+    for split in SPLITS:
+        values[split] |= {name: list(getattr(sound.split(split), name)) for name in LISTS}
+    (before / FILE).write_text(json.dumps(values))
+    places = [(path, path.read_bytes()) for path in (now / FILE, before / FILE, now / COLUMNS_FILE)]
 
     def parse(data: bytes) -> None:
-        path.write_bytes(data)
-        manifest = load_manifest(path)
-        manifest.embodiment(), manifest.hash(), manifest.to_text(), manifest.train.native_frames
+        path, there = places[data[0] % len(places) if data else 0]
+        path.write_bytes(data[1:])
+        try:
+            manifest = load_manifest(path.with_name(FILE))
+            manifest.embodiment(), manifest.hash(), manifest.train.native_frames, list(manifest.val.episodes)
+        finally:
+            path.write_bytes(there)
 
-    return Target(path, [m.to_text().encode() for m in (sound, named)], change_json, parse)
+    def structured(rng: random.Random, data: bytes) -> bytes:
+        return _change_columns(rng, data) if MAGIC in data[:20] else _change_rest(rng, data)
+
+    seeds = [bytes([n]) + there for n, (_, there) in enumerate(places)]
+    return Target(root, seeds, structured, parse)
+
+
+def _change_columns(rng: random.Random, data: bytes) -> bytes:
+    """Another header of a file of columns, under a hash that is right."""
+    kind, start, rest = data[:1], data[1 : 1 + START], data[1 + START :]
+    length = int.from_bytes(start[len(MAGIC) : len(MAGIC) + 8], "little")
+    header, rest = rest[:length], rest[length:]
+    header = change_json(rng, header)
+    lied = rng.choice((len(header), len(header), 2**40, 2**63))
+    size = lied.to_bytes(8, "little")
+    return kind + MAGIC + size + hashlib.sha256(header).digest() + header + rest
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {

@@ -176,3 +176,12 @@ def test_a_column_that_claims_more_than_its_file_is_refused(tmp_path):
     with pytest.raises(DataError, match="does not lie inside"):
         columns["x"]
     assert json.dumps(columns.facts) == "{}"
+
+
+def test_manifest_of_format_2_with_an_empty_split_has_its_hash(tmp_path):
+    values = json.loads(FORMAT_2)
+    values["val"] |= {"episodes": [], "steps": [], "parts": []}
+    path = tmp_path / "manifest.json"
+    path.write_text(json.dumps(values))
+    manifest = load_manifest(path)
+    assert len(manifest.val.episodes) == 0 and manifest.hash()
