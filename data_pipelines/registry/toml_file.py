@@ -28,6 +28,8 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
         raise ConfigError(f"{path}: the registry file cannot be read ({error.strerror})") from error
     except ValueError as error:  # of which TOMLDecodeError and UnicodeDecodeError are kinds
         raise ConfigError(f"{path}: not a TOML file: {error}") from error
+    except RecursionError:
+        raise ConfigError(f"{path}: not a TOML file of entries: it is nested too deeply") from None
     entries = []
     for name, fields in tables.items():
         try:

@@ -40,6 +40,13 @@ def test_entry_of_a_file_cannot_be_called_like_a_path(tmp_path, name):
         load_entries(path)
 
 
+def test_file_of_entries_that_is_nested_too_deeply_is_named(tmp_path):
+    path = tmp_path / "own.toml"
+    path.write_text("a = " + "[" * 5000)
+    with pytest.raises(ConfigError, match="own.toml: not a TOML file"):
+        load_entries(path)
+
+
 def test_part_of_a_field_with_a_huge_number_is_no_crash():
     with pytest.raises(ConfigError):
         DatasetSpec("toy", "image", ("action[:" + "9" * 5000 + "]",), (7, 7), 5.0)

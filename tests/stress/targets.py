@@ -52,7 +52,7 @@ def _tfrecord(root: Path) -> Target:
         path.write_bytes(data)
         index, damage = scan_shard(path)
         for offset, length in zip(index.offsets.tolist(), index.lengths.tolist(), strict=True):
-            assert 0 <= offset and offset + length + 16 <= len(data)
+            assert offset >= 0 and offset + length + 16 <= len(data)
             try:
                 assert len(read_record(path, offset, length)) == length
             except DataError as error:
