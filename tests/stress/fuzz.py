@@ -34,7 +34,7 @@ SECONDS = 5.0
 
 EXTRA_MEMORY = 64 * 2**20
 PAGE = os.sysconf("SC_PAGE_SIZE")
-SAVE_EVERY, BLOW_UP_EVERY = 1000, 2999
+SAVE_EVERY, BLOW_UP_EVERY = 1000, 29_999
 
 
 class Hang(BaseException):
@@ -156,7 +156,7 @@ def _work(name: str, inputs: int, seconds: float, state: Path) -> None:
         rng = random.Random(seed)
         if rng.random() < 0.4:
             return atheris.Mutate(data, most)
-        return make_input(rng, [data, rng.choice(target.seeds)], target.structured)[:most]
+        return make_input(rng, [data, rng.choice(target.seeds)], target.structured, large=0.0)[:most]
 
     _instrument(atheris)
     atheris.Setup(

@@ -105,11 +105,14 @@ def _places(holder: Any):
 
 
 def make_input(
-    rng: random.Random, seeds: list[bytes], structured: Callable[[random.Random, bytes], bytes]
+    rng: random.Random,
+    seeds: list[bytes],
+    structured: Callable[[random.Random, bytes], bytes],
+    large: float = 0.0005,
 ) -> bytes:
-    """One input from a seed."""
+    """One input from a seed; `large` is the share of those that are blown up."""
     seed = rng.choice(seeds)
-    if rng.random() < 0.0005:
+    if rng.random() < large:
         return blow_up(rng, seed)
     if rng.random() < 0.6:
         seed = structured(rng, seed)
