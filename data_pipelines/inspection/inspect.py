@@ -144,7 +144,7 @@ def inspect_dataset(
     fields, splits = _describe(source)
     cameras = {f.key: _CameraLog() for f in fields if f.per_step and f.kind == "image"}
     numbers = [f.key for f in fields if f.per_step and f.kind == "number" and "action" in f.key]
-    numbers = [key for key in numbers if source.features[step_key(key)].size <= WIDEST]
+    numbers = [key for key in numbers if source.features[step_key(key)].size in range(1, WIDEST + 1)]
     rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
     steps, examples, bytes_read = [], [], 0
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
@@ -235,6 +235,10 @@ def _read(source: EpisodeSource, i: int, cameras: dict, numbers: Sequence[str]) 
 
 def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence[str]) -> int:
     """Steps of an episode. Raises EpisodeError when its fields disagree."""
+    for key in (*cameras, *numbers):
+        values = record[step_key(key)]
+        if len(values) and isinstance(values, np.ndarray) != (key in numbers):
+            raise EpisodeError(f"an episode whose {key} holds {'bytes' if key in numbers else 'numbers'}")
     counts = {key: len(record[step_key(key)]) for key in cameras}
     for key in numbers:
         counts[key] = len(record[step_key(key)]) / source.features[step_key(key)].size

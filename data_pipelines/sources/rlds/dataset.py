@@ -217,6 +217,8 @@ class RldsDataset(EpisodeSource):
         encoded = record.get(key, ())
         if not len(encoded):
             raise self._unusable(i, f"it has no frames in {key!r}; leave it out with corrupt='skip'")
+        if isinstance(encoded, np.ndarray):
+            raise self._unusable(i, f"{key!r} holds numbers, not images; leave it out with corrupt='skip'")
         self._steps[i] = len(encoded)
         return encoded
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import CorruptRecordError, DataError, EpisodeError
+from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.tfrecord import index_shard
 from hma_jax.config import ConfigError
@@ -247,6 +248,24 @@ def test_episode_without_frames_is_unusable(tmp_path):
     for keys in (SPEC.action_keys, ()):
         with pytest.raises(EpisodeError, match="episode 0 .*no frames"):
             dataset.episode(0, SPEC.image_key, keys)
+
+
+def test_fields_of_another_kind_than_the_schema_says_are_unusable(tmp_path):
+    def spoil(episode, features):
+        if episode == 0:
+            features["steps/observation/image"] = np.zeros(6, np.float32)
+        if episode == 1:
+            features["steps/action"] = [b"x"] * 18
+
+    directory = write_rlds(tmp_path, SPEC, [6, 6, 6], change=spoil)
+    with pytest.raises(EpisodeError, match="episode 0 .*'steps/observation/image' holds numbers, not images"):
+        RldsDataset(directory).episode(0, *KEYS)
+    with pytest.raises(EpisodeError, match="episode 0 .*holds numbers, not images"):
+        RldsDataset(directory).frames(0, SPEC.image_key, lambda n: [0])
+    with pytest.raises(EpisodeError, match="episode 1 .*'steps/action' has 18 values"):
+        RldsDataset(directory).episode(1, *KEYS)
+    facts, _ = inspect_dataset(directory)
+    assert facts.sampled == 1 and sorted(facts.damaged.values()) == [1, 1]
 
 
 def test_image_that_cannot_be_decoded_names_the_step(tmp_path):
