@@ -10,7 +10,8 @@ last line of the output has all figures as JSON:
     index_mb, index_rss_mb     the kept index, and the memory of a process that has all of it open
     tokenise_s, store_mb       every episode into the token store, by a tokenizer that costs nothing
     manifest_mb, manifest_s    all manifests: their size, and opening the store and parsing them
-    draw_us, frames_per_s      one window of the training loader on one core, and frames of windows per second
+    draw_us, frames_per_s      one window of the training loader on one core, and frames of windows per second;
+    draw_cpu_us, frames_per_cpu_s  the same by the time that the process was running, for a machine that is shared
     rss_*_mb, open_files       of that process after the first and the last window, and at most
 """
 
@@ -147,13 +148,14 @@ def measure_training(out: Path, windows: int) -> dict:
     )
     next(loader)
     ready = time.perf_counter()
-    first, most_files, spent = _resident(), 0, 0.0
+    first, most_files, spent, running = _resident(), 0, 0.0, time.process_time()
     for n in range(windows // BATCH):
         at = time.perf_counter()
         next(loader)
         spent += time.perf_counter() - at
         if n % 200 == 0:
             most_files = max(most_files, len(os.listdir("/proc/self/fd")))
+    running = time.process_time() - running
     return {
         "train_episodes": episodes,
         "manifest_mb": sum(p.stat().st_size for p in files) / 1e6,
@@ -161,6 +163,8 @@ def measure_training(out: Path, windows: int) -> dict:
         "first_batch_s": ready - parsed,
         "draw_us": spent / windows * 1e6,
         "frames_per_s": windows * FRAMES / spent,
+        "draw_cpu_us": running / windows * 1e6,
+        "frames_per_cpu_s": windows * FRAMES / running,
         "rss_first_mb": first,
         "rss_last_mb": _resident(),
         "rss_most_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

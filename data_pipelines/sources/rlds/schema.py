@@ -29,7 +29,6 @@ TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 MOST_SHARDS = 2**15
 """Of one split."""
 
-IF_MISSING = "fetch it too; it lies beside the shards."
 ADVICE = "Restore it as tfds wrote it."
 
 FILE_FORMATS = ("tfrecord", "array_record")
@@ -144,7 +143,7 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
 def read_features(directory: Location) -> dict[str, FlatFeature]:
     """Every field of a record, by its flat key. Raises DataError for a file that is missing or damaged."""
     path = directory / FEATURES
-    schema = read_object(path, if_missing=IF_MISSING, advice=ADVICE)
+    schema = read_object(path, if_missing=ADVICE, advice=ADVICE)
     try:
         return parse_features(schema)
     except ValueError as error:
@@ -154,7 +153,7 @@ def read_features(directory: Location) -> dict[str, FlatFeature]:
 def read_info(directory: Location) -> DatasetInfo:
     """Raises DataError for a dataset_info.json that is missing or damaged."""
     path = directory / INFO
-    values = read_object(path, if_missing=IF_MISSING, advice=ADVICE)
+    values = read_object(path, if_missing=ADVICE, advice=ADVICE)
     try:
         splits = [_split(split) for split in _list(values.get("splits", []), "splits")]
         name, version = values.get("name"), values.get("version")
