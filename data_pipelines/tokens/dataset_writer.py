@@ -1,12 +1,13 @@
-"""A dataset of the token store, made part by part by one process or many, and published at once.
+"""A dataset of the token store, made part by part by any number of processes, and published at once.
 
 Owns the work directory, who makes which part, what is kept after a crash, and publishing. What
 goes into a part is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
 
 Parts gather in `<store>/.<name>.<hash of the plan>`, where no reader looks and no job with
-another plan. When the last is there, the manifest is added and the directory renamed to
-`<store>/<name>`. Every step is repeatable and writes the same bytes, so that it does not
-matter how often a process is killed, or whether two make the same part or publish at once.
+another plan. Every process takes the next part that is neither there nor claimed by another one
+(`<work directory>.claims`, see `publishing`), so that processes may come, go and be killed at any
+time: the part of a dead one is free again. When the last is there, whoever claims the publishing
+adds the manifest and renames the directory to `<store>/<name>`.
 """
 
 from __future__ import annotations
@@ -15,27 +16,27 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 from data_pipelines.errors import DataError
+from data_pipelines.publishing.claims import Claim, claim, living_claim, pauses_between_looks
+from data_pipelines.publishing.files import remove, sync
 from data_pipelines.tokens.manifest import FILE, SPLITS, Loss, Manifest, SplitFacts, load_manifest
 from data_pipelines.tokens.moments import merge_all
-from data_pipelines.tokens.part import FACTS, Made, Part, PartFacts, read_part, sync, write_part
-from data_pipelines.tokens.scratch import scratch
-from data_pipelines.tokens.share import Share
+from data_pipelines.tokens.part import FACTS, Made, Part, PartFacts, read_part, write_part
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, stable_hash
+from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
 """Bytes of records in one part: what a killed process has to do again, at most."""
 
-MOST_PARTS = 1024
-"""Parts of a dataset: of one larger than this many times PART_SIZE the parts are larger."""
-
 Progress = Callable[[int, int], None]
-"""Called with the episodes done and all, of this process's share."""
+"""Called with the episodes done, by whichever process, and all of them."""
 
 
 def write_dataset(
@@ -44,13 +45,13 @@ def write_dataset(
     parts: Sequence[Part],
     make: Callable[[Part], Iterable[Made]],
     *,
-    share: Share = Share(),
     lost: Sequence[Loss] = (),
     max_lost: int = 0,
     overwrite: bool = False,
+    wait: bool = True,
     progress: Progress | None = None,
 ) -> Manifest | None:
-    """Makes this process's missing parts of `<store_root>/<plan.spec.name>`; publishes what is complete.
+    """Makes the missing parts of `<store_root>/<plan.spec.name>` that no other process makes, and publishes it.
 
     `plan`: the manifest without statistics and splits. `parts` cover the source in order, as
     `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or a Loss
@@ -58,31 +59,32 @@ def write_dataset(
     in no part. A dataset that is there, made from the same source in the same way, is kept; one
     made otherwise is refused or, with `overwrite`, removed.
 
-    Returns the manifest, or None while parts of other processes are missing. Raises ConfigError
-    for another dataset in its place and a directory that cannot be written, DataError for more
-    than `max_lost` lost episodes or no training episode at all, and what `make` raises.
+    Parts that other processes are making are waited for, and made here if those die; without
+    `wait` None is returned instead of the manifest. Raises ConfigError for another dataset in its
+    place, or one that other processes are making there, and a directory that cannot be written;
+    DataError for more than `max_lost` lost episodes, those that other processes lost included, or no
+    training episode at all; and what `make` raises.
     """
-    root, name = Path(store_root), plan.spec.name
-    final = root / name
+    root = Path(store_root)
+    final = root / plan.spec.name
     try:
         if overwrite:
             _remove_others(root, plan, parts)
-        work = _work_directory(root, plan, parts)
-        manifest = _published(final, plan)
-        if manifest is not None:
-            _remove_work(work)  # of a process that was killed after it had published
-            return manifest
-        (work / FACTS).mkdir(parents=True, exist_ok=True)
-        try:
-            _make_parts(work, final, plan, share.of(parts, name), make, max_lost, progress)
-            manifest = _publish(work, final, plan, parts, lost, max_lost)
-        except FileNotFoundError:
-            manifest = _published(final, plan)  # published meanwhile by a process that did the same
-            if manifest is None:
-                raise
-        if manifest is not None:
-            _remove_work(work)
-        return manifest
+        job = _Job(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
+        pauses = pauses_between_looks()
+        while True:
+            try:
+                manifest = job.attempt(make, progress)
+            except FileNotFoundError:  # all of it is removed by the process that publishes it
+                manifest = _published(final, plan)
+                if manifest is None:
+                    raise
+            if manifest is not None:
+                _remove_work(job.work)
+                return manifest
+            if not wait:
+                return None
+            time.sleep(next(pauses))
     except OSError as error:
         raise ConfigError(
             f"{final}: the token store cannot be written there ({error.strerror or error}). "
@@ -99,19 +101,12 @@ def differences(store_root: str | Path, plan: Manifest) -> list[str]:
     return _changes(load_manifest(final / FILE), plan) if final.exists() else []
 
 
-def missing_parts(store_root: str | Path, plan: Manifest, parts: Sequence[Part]) -> int:
-    """How many parts of a dataset that is not published are still to be made."""
-    work = _work_directory(Path(store_root), plan, parts)
-    return sum(read_part(work, part) is None for part in parts)
-
-
-def cut_parts(sizes: Sequence[int], part_size: int, most: int) -> list[Part]:
-    """Ranges of consecutive items of about `part_size` together; larger if it were more than `most`."""
-    target = max(part_size, -(-int(sum(sizes)) // most))
+def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
+    """Ranges of consecutive items of about `part_size` together."""
     ends, held = [], 0
     for i, size in enumerate(sizes):
         held += int(size)
-        if held >= target:
+        if held >= part_size:
             ends.append(i + 1)
             held = 0
     if not ends or ends[-1] < len(sizes):
@@ -127,81 +122,127 @@ def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
     return root / f".{plan.spec.name}.{stable_hash([plan, list(parts)])[:12]}"
 
 
-def _aside(work: Path) -> Path:
-    return work.with_name(f"{work.name}.aside")
+def _claims(work: Path) -> Path:
+    """Where parts, and the publishing, are claimed, and written before they get to their place."""
+    return work.with_name(f"{work.name}.claims")
 
 
-def _make_parts(
-    work: Path,
-    final: Path,
-    plan: Manifest,
-    parts: Sequence[Part],
-    make: Callable[[Part], Iterable[Made]],
-    max_lost: int,
-    progress: Progress | None,
-) -> None:
-    # A part with losses was made when they were allowed. Made again, it says what is wrong.
-    kept = {p for p in parts if (f := read_part(work, p)) and (max_lost or not f.lost)}
-    total, done = sum(len(p.episodes) for p in parts), sum(len(p.episodes) for p in kept)
-    keep = {"none": set(), "val": {"val"}, "all": set(SPLITS)}[plan.settings.keep_frames]
+@dataclass
+class _Job:
+    """What this process knows of a dataset that is being made."""
 
-    def report(more: int = 0) -> None:
-        if progress is not None:
-            progress(done + more, total)
+    work: Path
+    final: Path
+    plan: Manifest
+    parts: Sequence[Part]
+    lost: tuple[Loss, ...]  # episodes in no part
+    max_lost: int
+    done: dict[int, tuple[Loss, ...]] = field(default_factory=dict)  # what each part that is there lost
 
-    report()
-    with scratch(_aside(work)) as aside:
-        for part in parts:
-            if part in kept:
-                continue
-            if final.exists():
+    def attempt(self, make: Callable[[Part], Iterable[Made]], progress: Progress | None) -> Manifest | None:
+        """Makes every part that is free and publishes the dataset if it is complete; None if it is not."""
+        manifest = _published(self.final, self.plan)
+        if manifest is not None:
+            return manifest
+        (self.work / FACTS).mkdir(parents=True, exist_ok=True)
+        self._make_free_parts(make, progress)
+        if all(self._there(part) for part in self.parts):
+            self._publish()
+        return _published(self.final, self.plan)
+
+    def _make_free_parts(self, make: Callable[[Part], Iterable[Made]], progress: Progress | None) -> None:
+        missing = [part for part in self.parts if not self._there(part)]
+        self._check_losses()
+        total = sum(len(part.episodes) for part in self.parts)
+        report = (lambda done: progress(done, total)) if progress else (lambda done: None)
+        report(self._episodes_there())
+        others: list[Part] = []  # of other processes
+        for part in missing:
+            if self.final.exists():
                 return
-            counted = _counted(make(part), report)
-            write_part(work, part, counted, aside, plan.spec.action_dim, keep)
-            done += len(part.episodes)
+            try:
+                with claim(_claims(self.work) / f"{part.number:05d}") as held:
+                    if not self._there(part):  # made between the look and the claim
+                        self._make(part, make, held, report)
+            except Held:
+                others.append(part)
+            others = [part for part in others if not self._there(part)]
+            self._check_losses()
 
+    def _make(
+        self, part: Part, make: Callable[[Part], Iterable[Made]], held: Claim, report: Callable[[int], None]
+    ) -> None:
+        before = self._episodes_there()
 
-def _counted(made: Iterable[Made], report: Callable[[int], None]) -> Iterable[Made]:
-    for n, item in enumerate(made, start=1):
-        yield item
-        report(n)
+        def counted() -> Iterator[Made]:
+            lost: list[Loss] = []
+            for n, item in enumerate(make(part), start=1):
+                if isinstance(item, Loss):
+                    lost.append(item)
+                    self._check_losses(lost)
+                yield item
+                report(before + n)
 
+        keep = {"none": set(), "val": {"val"}, "all": set(SPLITS)}[self.plan.settings.keep_frames]
+        try:
+            facts = write_part(self.work, part, counted(), held.scratch, self.plan.spec.action_dim, keep)
+        except FileNotFoundError:
+            if not held.lost():
+                raise
+            return  # this process had been stopped for so long that another host took the part over
+        self.done[part.number] = facts.lost
 
-def _publish(
-    work: Path,
-    final: Path,
-    plan: Manifest,
-    parts: Sequence[Part],
-    lost: Sequence[Loss],
-    max_lost: int,
-) -> Manifest | None:
-    facts = []
-    for part in parts:
-        known = read_part(work, part)
-        if known is None:
-            return _published(final, plan)  # None, unless another process was faster
-        facts.append(known)
-    manifest = _merge(plan, facts, lost)
-    if manifest.lost > max_lost:
-        raise DataError(
-            f"{plan.spec.name}: {manifest.lost} episodes are unusable, more than max_skipped={max_lost}. "
-            f"The last: {manifest.skipped[-1].reason} Raise max_skipped if the rest is worth it."
-        )
-    if not manifest.train.episodes:
-        raise DataError(f"{plan.spec.name}: no usable episode is left to train on.")
-    with scratch(_aside(work)) as aside:
-        text = aside / FILE
-        text.write_text(manifest.to_text())
-        sync(text)
-        os.replace(text, work / FILE)
-    sync(work)
-    try:
-        os.rename(work, final)
-    except OSError:
-        if not final.exists():  # otherwise another process published the same
-            raise
-    sync(final.parent)
-    return _published(final, plan)
+    def _there(self, part: Part) -> bool:
+        """Whether a part is finished, by whichever process.
+
+        One with losses was made when they were allowed. Made again, it says what is wrong.
+        """
+        if part.number not in self.done:
+            facts = read_part(self.work, part)
+            if facts is None or (facts.lost and not self.max_lost):
+                return False
+            self.done[part.number] = facts.lost
+        return True
+
+    def _episodes_there(self) -> int:
+        return sum(len(part.episodes) for part in self.parts if part.number in self.done)
+
+    def _check_losses(self, more: Sequence[Loss] = ()) -> None:
+        """DataError if too many episodes are lost by all processes together, and `more` in the part at hand."""
+        losses = [*self.lost, *chain.from_iterable(self.done.values()), *more]
+        lost = sum(loss.episodes for loss in losses)
+        if lost > self.max_lost:
+            raise DataError(
+                f"{self.plan.spec.name}: {lost} episodes are unusable, more than max_skipped={self.max_lost}. "
+                f"The last: {losses[-1].reason} Raise max_skipped if the rest is worth it."
+            )
+
+    def _publish(self) -> None:
+        """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
+        try:
+            with claim(_claims(self.work) / "publish") as held:
+                facts = [read_part(self.work, part) for part in self.parts]
+                damaged = [part.number for part, known in zip(self.parts, facts, strict=True) if known is None]
+                for number in damaged:
+                    del self.done[number]
+                if damaged:
+                    return
+                manifest = _merge(self.plan, facts, self.lost)
+                if not manifest.train.episodes:
+                    raise DataError(f"{self.plan.spec.name}: no usable episode is left to train on.")
+                text = held.scratch / FILE
+                text.write_text(manifest.to_text())
+                sync(text)
+                os.replace(text, self.work / FILE)
+                sync(self.work)
+                try:
+                    os.rename(self.work, self.final)
+                except OSError:
+                    if not self.final.exists():  # otherwise another process published the same
+                        raise
+                sync(self.final.parent)
+        except Held:
+            pass
 
 
 def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[Loss]) -> Manifest:
@@ -247,24 +288,30 @@ def _changes(there: Manifest, plan: Manifest) -> list[str]:
 
 
 def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
-    """A dataset of this name that was made otherwise, and what unfinished jobs left of it."""
+    """A dataset of this name that was made otherwise, and what unfinished jobs left of it.
+
+    Raises Held if a living process is making one.
+    """
     name = plan.spec.name
     final, work = root / name, _work_directory(root, plan, parts)
+    unfinished = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{12}}")
+    others = [p for p in sorted(root.glob(f".{name}.*")) if unfinished.fullmatch(p.name) and p != work]
+    for other in others:
+        if held := living_claim(_claims(other)):
+            raise Held(
+                f"{final}: {held.who} is making this dataset in another way; wait for it or stop it", held.holder
+            )
     if final.exists():
         try:
             outdated = bool(_changes(load_manifest(final / FILE), plan))
         except DataError:  # damaged, or of an older format
             outdated = True
         if outdated:
-            gone = root / f".{name}.removed"
-            shutil.rmtree(gone, ignore_errors=True)
-            os.rename(final, gone)  # out of sight first
-    unfinished = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{12}}|removed)")
-    for other in root.glob(f".{name}.*"):
-        if unfinished.fullmatch(other.name) and other != work:
-            _remove_work(other)
+            remove(final)
+    for other in others:
+        _remove_work(other)
 
 
 def _remove_work(work: Path) -> None:
-    for directory in (_aside(work), work):
+    for directory in (_claims(work), work):
         shutil.rmtree(directory, ignore_errors=True)

@@ -20,7 +20,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec, find_spec
-from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
 from data_pipelines.tokens.part import Made, Part
@@ -74,7 +74,7 @@ def import_tokens(
 
     frame_bytes = folders["train"].video[0].nbytes
     sizes = [int(n) * frame_bytes for folder in folders.values() for n in np.diff(folder.bounds)]
-    return write_dataset(store_root, plan, cut_parts(sizes, PART_SIZE, MOST_PARTS), make, progress=progress)
+    return write_dataset(store_root, plan, cut_parts(sizes, PART_SIZE), make, progress=progress)
 
 
 def _plan(

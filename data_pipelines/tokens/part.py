@@ -21,6 +21,7 @@ from pathlib import Path
 
 from array_record.python import array_record_module
 
+from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
 from data_pipelines.tokens.moments import Moments, merge_all
@@ -68,15 +69,15 @@ class PartFacts:
 
 
 def write_part(
-    directory: Path, part: Part, made: Iterable[Made], aside: Path, action_dim: int, keep_frames: set[str]
+    directory: Path, part: Part, made: Iterable[Made], scratch: Path, action_dim: int, keep_frames: set[str]
 ) -> PartFacts:
-    """Writes `made` as the part of the dataset in `directory`, by way of the directory `aside`.
+    """Writes `made` as the part of the dataset in `directory`, by way of the directory `scratch`.
 
     A part is there as a whole or not at all; one that is there is replaced. `keep_frames`:
     splits whose records hold frames. Raises OSError.
     """
     writers = {
-        split: _SplitWriter(aside / part_name(split, part.number, part.count), split in keep_frames)
+        split: _SplitWriter(scratch / part_name(split, part.number, part.count), split in keep_frames)
         for split in SPLITS
     }
     lost: list[Loss] = []
@@ -91,16 +92,16 @@ def write_part(
         writers[split].add(episode)
     splits = [writers[split].close() for split in SPLITS]
     facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost))
-    facts_aside = aside / "facts.json"
-    facts_aside.write_text(json.dumps(to_dict(facts)))
-    sync(facts_aside)
+    new_facts = scratch / "facts.json"
+    new_facts.write_text(json.dumps(to_dict(facts)))
+    sync(new_facts)
     for split, values in zip(SPLITS, splits, strict=True):
         place = directory / part_name(split, part.number, part.count)
         if values.size:
-            os.replace(aside / place.name, place)
+            os.replace(scratch / place.name, place)
         else:
             place.unlink(missing_ok=True)
-    os.replace(facts_aside, _facts_path(directory, part))
+    os.replace(new_facts, _facts_path(directory, part))
     sync(directory)
     return facts
 
@@ -120,15 +121,6 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
         if size != getattr(facts, split).size:
             return None
     return facts if facts.part == part else None
-
-
-def sync(path: Path) -> None:
-    """What was written to `path` survives a loss of power."""
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def _facts_path(directory: Path, part: Part) -> Path:

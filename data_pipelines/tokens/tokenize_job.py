@@ -26,12 +26,11 @@ from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
-from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
 from data_pipelines.tokens.part import Made, Part
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
-from data_pipelines.tokens.share import Share
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -54,19 +53,20 @@ def tokenize_dataset(
     part_size: int = PART_SIZE,
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: int = MAX_SKIPPED,
-    share: Share = Share(),
     overwrite: bool = False,
+    wait: bool = True,
     progress: Progress | None = None,
 ) -> Manifest | None:
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
     `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz
     frames), 1 stores all phases; it must divide the stride. `batch` images are encoded at a
-    time, `threads` (default: as many as cores, up to 8) decode. `progress(done, total)` counts
-    episodes of this process's `share`. If the store already has this dataset made from the
-    same shards in the same way, nothing is done; what a killed job had finished is kept. The
-    bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of
-    JobSettings; on nothing else. None: parts of other processes are still missing.
+    time, `threads` (default: as many as cores, up to 8) decode. If the store already has this
+    dataset made from the same shards in the same way, nothing is done. Any number of processes
+    may do the same at a time, start and be killed: each makes parts that no other one makes.
+    `progress(done, total)` counts the episodes of all. `wait`: until parts of others are there;
+    without it, None is returned while they are not. The bytes of the dataset depend on `spec`,
+    source, tokenizer, `part_size` and the settings of JobSettings; on nothing else.
 
     Raises ConfigError for keys, settings or a store directory that cannot work, and for a
     dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
@@ -86,12 +86,12 @@ def tokenize_dataset(
     return write_dataset(
         store_root,
         plan,
-        cut_parts(source.sizes(), part_size, MOST_PARTS),
+        cut_parts(source.sizes(), part_size),
         work.make,
-        share=share,
         lost=lost,
         max_lost=max_skipped if corrupt == "skip" else 0,
         overwrite=overwrite,
+        wait=wait,
         progress=progress,
     )
 
@@ -218,7 +218,8 @@ class _Work:
             )
 
     def _lose(self, error: EpisodeError) -> Loss:
-        self._source.skip(error)
+        if self._source.corrupt == "raise":
+            raise error
         reason = str(error).replace(f"{self._source.directory}/", "")
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
         return Loss(reason, *place)
