@@ -219,6 +219,7 @@ class _Job:
 
     def _publish(self) -> None:
         """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
+        self._check_losses()
         try:
             with claim(_claims(self.work) / "publish") as held:
                 facts = [read_part(self.work, part) for part in self.parts]

@@ -50,6 +50,7 @@ def made(out: Path) -> dict[str, bytes]:
     return contents(out / "tokens") | {name: (out / name).read_bytes() for name in files}
 
 
+@pytest.mark.slow
 def test_two_processes_at_the_same_time_make_one_store_and_its_windows(data, tokenizer, whole, tmp_path):
     command = [sys.executable, "-m", "experiments.cli", "tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
     started = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
@@ -57,17 +58,6 @@ def test_two_processes_at_the_same_time_make_one_store_and_its_windows(data, tok
     assert [process.returncode for process in started] == [0, 0], said
     assert made(tmp_path) == whole
     assert all("eval_manifest.json" in text and "held out" in text for text in said)
-
-
-def claim_part(out: Path, name: str) -> tuple[Path, ExitStack]:
-    """Holds the only part of a dataset, as a process that makes it, from the moment that it can be held."""
-    until = time.monotonic() + 60
-    while not (work := list((out / "tokens").glob(f".{name}.????????????"))):
-        assert time.monotonic() < until
-        time.sleep(0.002)
-    stack = ExitStack()
-    stack.enter_context(claim(work[0].with_name(f"{work[0].name}.claims") / "00000"))
-    return work[0], stack
 
 
 def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does(
@@ -79,8 +69,9 @@ def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does
     with pytest.raises(Stopped):
         main(arguments)  # it had come to its first part
     monkeypatch.undo()
-    _, part = claim_part(tmp_path, ARM.name)
-    holder = ExitStack()
+    (work,) = (tmp_path / "tokens").glob(f".{ARM.name}.????????????")
+    part, holder = ExitStack(), ExitStack()
+    part.enter_context(claim(work.with_name(f"{work.name}.claims") / "00000"))
     holder.enter_context(Workspace(tmp_path).claimed())
     with ThreadPoolExecutor(1) as pool:
         joined = pool.submit(main, arguments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
@@ -157,6 +158,20 @@ def test_the_part_of_a_dead_process_is_made_again_and_what_it_left_removed(rlds,
     process.join()
     run(rlds, tmp_path)
     assert contents(tmp_path) == undisturbed and list(tmp_path.iterdir()) == [tmp_path / "toy"]
+
+
+def test_the_part_of_another_host_is_left_to_it_until_its_lease_expires(rlds, undisturbed, tmp_path):
+    """Where the file system does not show the locks of other hosts."""
+    work = begin(rlds, tmp_path)
+    lock = claims_of(work) / "00007.lock"
+    lock.parent.mkdir(exist_ok=True)
+    other = {"process": 7, "host": "other", "since": "then", "machine": "other", "token": "x"}
+    lock.write_text(json.dumps(other))
+    assert run(rlds, tmp_path, wait=False) is None
+    assert json.loads(lock.read_text()) == other and not (work / "parts/00007.json").exists()
+    os.utime(lock, (0, 0))
+    assert run(rlds, tmp_path, wait=False) is not None
+    assert contents(tmp_path) == undisturbed
 
 
 def test_a_process_whose_part_was_taken_over_goes_on(rlds, undisturbed, tmp_path):
