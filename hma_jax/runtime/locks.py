@@ -6,10 +6,10 @@ directory, making one dataset or one part of it (`data_pipelines.publishing`).
 What is promised depends on the file system, which carries flock or does not:
 
 * A local disk, or a shared one that carries flock between hosts (NFS 4, NFS 3 with its lock service, Lustre
-  mounted with `flock`): one holder at a time; a process that dies by SIGKILL or power loss holds nothing.
-* A shared disk that carries it within a host only (NFS with `nolock` or `local_lock`, Lustre with `localflock`):
-  one holder on each host. With a *lease*, one holder on all hosts, except that two which ask within the same
-  moment may both get it, and that a lock of a host that died is free after EXPIRES seconds.
+  mounted with the option flock): one holder at a time; a process that dies by SIGKILL or power loss holds nothing.
+* A shared disk that carries it within a host only (NFS with the options nolock or local_lock, Lustre with the
+  option localflock): one holder on each host. With a *lease*, one holder on all hosts, except that two which ask
+  within the same moment may both get it, and that a lock of a host that died is free after EXPIRES seconds.
 * One that does not take flock at all: a warning; with a lease, as between hosts.
 
 A lease is the lock file's time of change, which its holder renews. It is compared with the file system's own
