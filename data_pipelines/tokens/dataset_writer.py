@@ -1,7 +1,7 @@
 """A dataset of the token store, made part by part by any number of processes, and published at once.
 
-Owns the work directory, who makes which part, what is kept after a crash, and publishing. What
-goes into a part is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
+Owns the work directory, what is kept after a crash, and publishing. Who makes which part is in
+`part_maker`; what goes into it is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
 
 Parts gather in `<store>/.<name>.<hash of the plan>`, where no reader looks and no job with
 another plan. Every process takes the next part that is neither there nor claimed by another one
@@ -17,17 +17,17 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import chain
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from data_pipelines.errors import DataError
-from data_pipelines.publishing.claims import Claim, claim, living_claim, pauses_between_looks
+from data_pipelines.publishing.claims import claim, living_claim, pauses_between_looks
 from data_pipelines.publishing.files import remove, sync
-from data_pipelines.tokens.manifest import FILE, SPLITS, Loss, Manifest, SplitFacts, load_manifest
+from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts, load_manifest
 from data_pipelines.tokens.moments import merge_all
-from data_pipelines.tokens.part import FACTS, Made, Part, PartFacts, read_part, write_part
+from data_pipelines.tokens.part_files import Part, PartFacts, read_part
+from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, claims_of
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, stable_hash
 from hma_jax.runtime.locks import Held
@@ -35,17 +35,14 @@ from hma_jax.runtime.locks import Held
 PART_SIZE = 256 * 2**20
 """Bytes of records in one part: what a killed process has to do again, at most."""
 
-Progress = Callable[[int, int], None]
-"""Called with the episodes done, by whichever process, and all of them."""
-
 
 def write_dataset(
     store_root: str | Path,
     plan: Manifest,
     parts: Sequence[Part],
-    make: Callable[[Part], Iterable[Made]],
+    make: Make,
     *,
-    lost: Sequence[Loss] = (),
+    lost: Sequence[LostEpisodes] = (),
     max_lost: int = 0,
     overwrite: bool = False,
     wait: bool = True,
@@ -54,7 +51,7 @@ def write_dataset(
     """Makes the missing parts of `<store_root>/<plan.spec.name>` that no other process makes, and publishes it.
 
     `plan`: the manifest without statistics and splits. `parts` cover the source in order, as
-    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or a Loss
+    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or LostEpisodes
     for one that cannot be used; equal parts must give equal items. `lost` are episodes that are
     in no part. A dataset that is there, made from the same source in the same way, is kept; one
     made otherwise is refused or, with `overwrite`, removed.
@@ -70,17 +67,17 @@ def write_dataset(
     try:
         if overwrite:
             _remove_others(root, plan, parts)
-        job = _Job(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
+        maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
         pauses = pauses_between_looks()
         while True:
             try:
-                manifest = job.attempt(make, progress)
+                manifest = _attempt(maker, make, progress)
             except FileNotFoundError:  # all of it is removed by the process that publishes it
                 manifest = _published(final, plan)
                 if manifest is None:
                     raise
             if manifest is not None:
-                _remove_work(job.work)
+                _remove_work(maker.work)
                 return manifest
             if not wait:
                 return None
@@ -122,131 +119,49 @@ def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
     return root / f".{plan.spec.name}.{stable_hash([plan, list(parts)])[:12]}"
 
 
-def _claims(work: Path) -> Path:
-    """Where parts, and the publishing, are claimed, and written before they get to their place."""
-    return work.with_name(f"{work.name}.claims")
+def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifest | None:
+    """Makes every part that is free and publishes the dataset if it is complete; None if it is not."""
+    manifest = _published(maker.final, maker.plan)
+    if manifest is not None:
+        return manifest
+    maker.make_free_parts(make, progress)
+    if maker.complete():
+        _publish(maker)
+    return _published(maker.final, maker.plan)
 
 
-@dataclass
-class _Job:
-    """What this process knows of a dataset that is being made."""
-
-    work: Path
-    final: Path
-    plan: Manifest
-    parts: Sequence[Part]
-    lost: tuple[Loss, ...]  # episodes in no part
-    max_lost: int
-    done: dict[int, tuple[Loss, ...]] = field(default_factory=dict)  # what each part that is there lost
-
-    def attempt(self, make: Callable[[Part], Iterable[Made]], progress: Progress | None) -> Manifest | None:
-        """Makes every part that is free and publishes the dataset if it is complete; None if it is not."""
-        manifest = _published(self.final, self.plan)
-        if manifest is not None:
-            return manifest
-        (self.work / FACTS).mkdir(parents=True, exist_ok=True)
-        self._make_free_parts(make, progress)
-        if all(self._there(part) for part in self.parts):
-            self._publish()
-        return _published(self.final, self.plan)
-
-    def _make_free_parts(self, make: Callable[[Part], Iterable[Made]], progress: Progress | None) -> None:
-        missing = [part for part in self.parts if not self._there(part)]
-        self._check_losses()
-        total = sum(len(part.episodes) for part in self.parts)
-        report = (lambda done: progress(done, total)) if progress else (lambda done: None)
-        report(self._episodes_there())
-        others: list[Part] = []  # of other processes
-        for part in missing:
-            if self.final.exists():
-                return
-            try:
-                with claim(_claims(self.work) / f"{part.number:05d}") as held:
-                    if not self._there(part):  # made between the look and the claim
-                        self._make(part, make, held, report)
-            except Held:
-                others.append(part)
-            others = [part for part in others if not self._there(part)]
-            self._check_losses()
-
-    def _make(
-        self, part: Part, make: Callable[[Part], Iterable[Made]], held: Claim, report: Callable[[int], None]
-    ) -> None:
-        before = self._episodes_there()
-
-        def counted() -> Iterator[Made]:
-            lost: list[Loss] = []
-            for n, item in enumerate(make(part), start=1):
-                if isinstance(item, Loss):
-                    lost.append(item)
-                    self._check_losses(lost)
-                yield item
-                report(before + n)
-
-        keep = {"none": set(), "val": {"val"}, "all": set(SPLITS)}[self.plan.settings.keep_frames]
-        try:
-            facts = write_part(self.work, part, counted(), held.scratch, self.plan.spec.action_dim, keep)
-        except FileNotFoundError:
-            if not held.lost():
-                raise
-            return  # this process had been stopped for so long that another host took the part over
-        self.done[part.number] = facts.lost
-
-    def _there(self, part: Part) -> bool:
-        """Whether a part is finished, by whichever process.
-
-        One with losses was made when they were allowed. Made again, it says what is wrong.
-        """
-        if part.number not in self.done:
-            facts = read_part(self.work, part)
-            if facts is None or (facts.lost and not self.max_lost):
-                return False
-            self.done[part.number] = facts.lost
-        return True
-
-    def _episodes_there(self) -> int:
-        return sum(len(part.episodes) for part in self.parts if part.number in self.done)
-
-    def _check_losses(self, more: Sequence[Loss] = ()) -> None:
-        """DataError if too many episodes are lost by all processes together, and `more` in the part at hand."""
-        losses = [*self.lost, *chain.from_iterable(self.done.values()), *more]
-        lost = sum(loss.episodes for loss in losses)
-        if lost > self.max_lost:
-            raise DataError(
-                f"{self.plan.spec.name}: {lost} episodes are unusable, more than max_skipped={self.max_lost}. "
-                f"The last: {losses[-1].reason} Raise max_skipped if the rest is worth it."
-            )
-
-    def _publish(self) -> None:
-        """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
-        self._check_losses()
-        try:
-            with claim(_claims(self.work) / "publish") as held:
-                facts = [read_part(self.work, part) for part in self.parts]
-                damaged = [part.number for part, known in zip(self.parts, facts, strict=True) if known is None]
-                for number in damaged:
-                    del self.done[number]
-                if damaged:
+def _publish(maker: PartMaker) -> None:
+    """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
+    work, final, plan = maker.work, maker.final, maker.plan
+    maker.check_losses()
+    try:
+        with claim(claims_of(work) / "publish") as held:
+            facts = []
+            for part in maker.parts:
+                known = read_part(work, part)
+                if known is None:
+                    maker.forget(part)
                     return
-                manifest = _merge(self.plan, facts, self.lost)
-                if not manifest.train.episodes:
-                    raise DataError(f"{self.plan.spec.name}: no usable episode is left to train on.")
-                text = held.scratch / FILE
-                text.write_text(manifest.to_text())
-                sync(text)
-                os.replace(text, self.work / FILE)
-                sync(self.work)
-                try:
-                    os.rename(self.work, self.final)
-                except OSError:
-                    if not self.final.exists():  # otherwise another process published the same
-                        raise
-                sync(self.final.parent)
-        except Held:
-            pass
+                facts.append(known)
+            manifest = _merge(plan, facts, maker.lost)
+            if not manifest.train.episodes:
+                raise DataError(f"{plan.spec.name}: no usable episode is left to train on.")
+            text = held.scratch / FILE
+            text.write_text(manifest.to_text())
+            sync(text)
+            os.replace(text, work / FILE)
+            sync(work)
+            try:
+                os.rename(work, final)
+            except OSError:
+                if not final.exists():  # otherwise another process published the same
+                    raise
+            sync(final.parent)
+    except Held:
+        pass
 
 
-def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[Loss]) -> Manifest:
+def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[LostEpisodes]) -> Manifest:
     moments = merge_all((f.moments for f in facts), plan.spec.action_dim)
     splits = {}
     for split in SPLITS:
@@ -298,7 +213,7 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
     unfinished = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{12}}")
     others = [p for p in sorted(root.glob(f".{name}.*")) if unfinished.fullmatch(p.name) and p != work]
     for other in others:
-        if held := living_claim(_claims(other)):
+        if held := living_claim(claims_of(other)):
             raise Held(
                 f"{final}: {held.who} is making this dataset in another way; wait for it or stop it", held.holder
             )
@@ -314,5 +229,5 @@ def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
 
 
 def _remove_work(work: Path) -> None:
-    for directory in (_claims(work), work):
+    for directory in (claims_of(work), work):
         shutil.rmtree(directory, ignore_errors=True)

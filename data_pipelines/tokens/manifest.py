@@ -76,7 +76,7 @@ class SplitFacts:
 
 
 @dataclass(frozen=True)
-class Loss:
+class LostEpisodes:
     """Episodes that could not be used."""
 
     reason: str
@@ -100,7 +100,7 @@ class Manifest:
     val: SplitFacts
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
-    skipped: tuple[Loss, ...] = ()  # what was left out
+    skipped: tuple[LostEpisodes, ...] = ()  # what was left out
     format: int = FORMAT
 
     @property

@@ -23,7 +23,7 @@ from array_record.python import array_record_module
 
 from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
-from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
+from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, part_name
 from data_pipelines.tokens.moments import Moments, merge_all
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
@@ -31,8 +31,8 @@ from hma_jax.config.json import from_dict, to_dict
 FACTS = "parts"
 """Directory of the facts of all parts."""
 
-Made = tuple[str, StoredEpisode] | Loss
-"""What a part is made of: episodes with their split, and what could not be used."""
+PartItem = tuple[str, StoredEpisode] | LostEpisodes
+"""One of what a part is made of: an episode with its split, or what could not be used."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,13 @@ class PartFacts:
     train: PartSplit
     val: PartSplit
     moments: Moments  # of the native actions of the train split
-    lost: tuple[Loss, ...]
+    lost: tuple[LostEpisodes, ...]
 
 
 def write_part(
-    directory: Path, part: Part, made: Iterable[Made], scratch: Path, action_dim: int, keep_frames: set[str]
+    directory: Path, part: Part, items: Iterable[PartItem], scratch: Path, action_dim: int, keep_frames: set[str]
 ) -> PartFacts:
-    """Writes `made` as the part of the dataset in `directory`, by way of the directory `scratch`.
+    """Writes `items` as the part of the dataset in `directory`, by way of the directory `scratch`.
 
     A part is there as a whole or not at all; one that is there is replaced. `keep_frames`:
     splits whose records hold frames. Raises OSError.
@@ -80,10 +80,10 @@ def write_part(
         split: _SplitWriter(scratch / part_name(split, part.number, part.count), split in keep_frames)
         for split in SPLITS
     }
-    lost: list[Loss] = []
+    lost: list[LostEpisodes] = []
     moments = []
-    for item in made:
-        if isinstance(item, Loss):
+    for item in items:
+        if isinstance(item, LostEpisodes):
             lost.append(item)
             continue
         split, episode = item
@@ -101,8 +101,9 @@ def write_part(
             os.replace(scratch / place.name, place)
         else:
             place.unlink(missing_ok=True)
-    os.replace(new_facts, _facts_path(directory, part))
     sync(directory)
+    os.replace(new_facts, _facts_path(directory, part))
+    sync(directory / FACTS)
     return facts
 
 

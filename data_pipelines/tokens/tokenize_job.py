@@ -28,8 +28,8 @@ from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
 from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
-from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
-from data_pipelines.tokens.part import Made, Part
+from data_pipelines.tokens.manifest import JobSettings, LostEpisodes, Manifest, SplitFacts, TokenizerFacts
+from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
 from hma_jax.config import require
 
@@ -80,7 +80,7 @@ def tokenize_dataset(
     )
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
-        Loss(reason.replace(f"{source.directory}/", ""), episodes=count)
+        LostEpisodes(reason.replace(f"{source.directory}/", ""), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
     return write_dataset(
@@ -167,7 +167,7 @@ class _Work:
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
         self._is_val = held_out(plan.spec.name, len(source), s.val_fraction, s.min_val, s.max_val)
 
-    def make(self, part: Part) -> Iterator[Made]:
+    def make(self, part: Part) -> Iterator[PartItem]:
         """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""
         spec, size = self._plan.spec, self._plan.tokenizer.image_size
         items = frames_ahead(
@@ -202,7 +202,7 @@ class _Work:
     def _keeps(self, index: int) -> bool:
         return self._plan.settings.keep_frames in ("all", self._split(index))
 
-    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[Made]:
+    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[PartItem]:
         """Takes the episodes from `pending` that have all their tokens."""
         while pending and pending[0].end is not None and encoder.ready >= pending[0].came:
             episode = pending.popleft()
@@ -217,12 +217,12 @@ class _Work:
                 begin.index, begin.success, tokens.astype(self._dtype), begin.actions, frames
             )
 
-    def _lose(self, error: EpisodeError) -> Loss:
+    def _lose(self, error: EpisodeError) -> LostEpisodes:
         if self._source.corrupt == "raise":
             raise error
         reason = str(error).replace(f"{self._source.directory}/", "")
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
-        return Loss(reason, *place)
+        return LostEpisodes(reason, *place)
 
 
 class _Encoder:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.publishing.claims import claim
-from data_pipelines.tokens import dataset_writer
+from data_pipelines.tokens import part_maker
 from experiments.cli.main import main
 from experiments.preparing import sources
 from experiments.progress import Pace
@@ -65,7 +65,7 @@ def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does
 ):
     """The last part of one dataset is another process's, which dies; so does the one that held the directory."""
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
-    monkeypatch.setattr(dataset_writer, "write_part", lambda *_: stop())
+    monkeypatch.setattr(part_maker, "write_part", lambda *_: stop())
     with pytest.raises(Stopped):
         main(arguments)  # it had come to its first part
     monkeypatch.undo()

@@ -17,7 +17,7 @@ import numpy as np
 import tensorflow_datasets  # noqa: F401  once, in the server that processes are forked from
 
 from data_pipelines.registry import get_spec
-from data_pipelines.tokens import dataset_writer
+from data_pipelines.tokens import part_maker
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer
 
@@ -46,11 +46,11 @@ class SlowTokenizer(FakeTokenizer):
         return super().encode(images)
 
 
-def tokenize(work: Work, dies_in: int = 0, early: bool = True) -> None:
-    """All datasets, as `hma tokenize` does. `dies_in`: kills itself at this step of a save, before or after it."""
+def tokenize(work: Work, dies_in: int = 0) -> None:
+    """All datasets, as `hma tokenize` does. `dies_in`: kills itself before this step of its saves, from 1 on."""
     log_parts(work.log)
     if dies_in:
-        die_in_save(work.log, dies_in, early)
+        die_in_save(work.log, dies_in)
     tokenizer = SlowTokenizer(work.pause)
 
     def make(name: str, wait: bool) -> bool:
@@ -68,7 +68,7 @@ def tokenize(work: Work, dies_in: int = 0, early: bool = True) -> None:
 
 
 def log_parts(log: Path) -> None:
-    make = dataset_writer.write_part
+    make = part_maker.write_part
 
     def logged(directory: Path, part, *rest):
         place = f"{directory.name.split('.')[1]}/{part.number}"
@@ -77,21 +77,18 @@ def log_parts(log: Path) -> None:
         write(log, "end", place)
         return facts
 
-    dataset_writer.write_part = logged
+    part_maker.write_part = logged
 
 
-def die_in_save(log: Path, countdown: int, early: bool) -> None:
+def die_in_save(log: Path, countdown: int) -> None:
     def patched(call: Callable) -> Callable:
         def step(*arguments: object, **options: object) -> object:
             nonlocal countdown
             countdown -= 1
-            try:
-                if countdown or not early:
-                    return call(*arguments, **options)
-            finally:
-                if countdown == 0:
-                    write(log, "dies", call.__name__)
-                    os.kill(os.getpid(), signal.SIGKILL)
+            if countdown == 0:
+                write(log, "dies", call.__name__)
+                os.kill(os.getpid(), signal.SIGKILL)
+            return call(*arguments, **options)
 
         return step
 
