@@ -109,7 +109,7 @@ class _Run:
         """The jobs that a dataset lacks; it is put together if nothing but that is left to do."""
         name = spec.name
         if not is_complete(self.root / name / VERSION, self.marks[name]):
-            self.claims[name] = self.claim(name)
+            self.claims[name] = self.claim(name)  # looked at again: another process may have made it by then
         if is_complete(self.root / name / VERSION, self.marks[name]):
             self.count(name, self.episodes)
             return []

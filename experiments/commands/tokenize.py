@@ -65,7 +65,7 @@ def _freeze(setting: Setting) -> None:
     from experiments.preparing.tokenizer import adopt_tokenizer
     from experiments.preparing.windows import freeze_windows, windows_are_frozen
 
-    study, workspace = setting.study, setting.workspace
+    study, workspace, said = setting.study, setting.workspace, False
     for pause in pauses_between_looks():
         try:
             with workspace.claimed():
@@ -73,9 +73,13 @@ def _freeze(setting: Setting) -> None:
                     adopt_tokenizer(setting.tokenizer, study, workspace)
                 freeze_windows(study, workspace)
             return
-        except Busy:
+        except Busy as busy:
             if windows_are_frozen(study, workspace):
                 return
+            if not said:
+                waiting = f"all tokens are there; waiting for the windows, or the end, of {busy.who}"
+                console.print(waiting, soft_wrap=True)
+                said = True
         time.sleep(pause)
 
 

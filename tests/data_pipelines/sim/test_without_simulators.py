@@ -188,9 +188,9 @@ def test_the_fingerprint_follows_the_library_that_draws(monkeypatch, fake):
 def test_a_dataset_that_another_process_makes_is_named_and_left_alone(tmp_path, fake):
     theirs = tmp_path / "pusht" / ".1.0.0.episodes.theirs"
     theirs.mkdir(parents=True)
-    with claim(tmp_path / "pusht" / ".1.0.0"):
-        with pytest.raises(ConfigError, match="pusht: process .* is making this dataset"):
-            run(tmp_path)
+    refused = pytest.raises(ConfigError, match="pusht: process .* is making this dataset")
+    with claim(tmp_path / "pusht" / ".1.0.0"), refused:
+        run(tmp_path)
     assert theirs.is_dir() and fake.made == []
     run(tmp_path)  # nobody's now
     assert sorted(p.name for p in (tmp_path / "pusht").iterdir()) == ["1.0.0", "stats.json"]
