@@ -38,6 +38,7 @@ def start():
     return start
 
 
+@pytest.mark.slow
 def test_a_death_at_any_step_of_a_save_leaves_no_trace(tmp_path, start):
     write_rlds(tmp_path / "suite", get_spec(NAME), [8, 9, 10, 11], shards=2)
     work = Work(tmp_path / "suite", (NAME,), tmp_path / "undisturbed", tmp_path / "log", part_size=1500, pause=0)
