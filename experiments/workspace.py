@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,9 +15,10 @@ from experiments.provenance import Provenance
 from experiments.study import Study
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.runtime.locks import Held, exclusive
 
 
-class Busy(ConfigError):
+class Busy(Held):
     """Another command is at work in the directory."""
 
 
@@ -88,23 +88,22 @@ class Workspace:
 
         Raises ConfigError if the directory cannot be written, Busy if another process holds it.
         """
-        try:
-            self.root.mkdir(parents=True, exist_ok=True)
-            lock = open(self.root / ".lock", "a+")
-        except OSError as error:
-            there = next(p for p in (self.root, *self.root.parents) if p.exists())
-            what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
-            raise ConfigError(
-                f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, in a directory where "
-                "you may write"
-            ) from error
-        with lock:
+        with ExitStack() as stack:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+                self.root.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(exclusive(self.root / ".lock"))
+            except Held as held:
                 raise Busy(
-                    f"another command is at work in {self.root}; wait for it or choose another --out"
+                    f"another command is at work in {self.root} ({held.who}); wait for it or choose another --out",
+                    held.holder,
                 ) from None
+            except OSError as error:
+                there = next(p for p in (self.root, *self.root.parents) if p.exists())
+                what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
+                raise ConfigError(
+                    f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, in a directory "
+                    "where you may write"
+                ) from error
             yield
 
 

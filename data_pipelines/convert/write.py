@@ -2,30 +2,34 @@
 
 `<out>/<name>/1.0.0` appears when it is complete. Until then shards lie in a hidden directory
 beside it with a journal of the finished ones; an interrupted conversion goes on behind the last
-of them, and the result has the same bytes as an undisturbed one.
+of them, and the result has the same bytes as an undisturbed one. One process at a time converts
+to a place (see `publishing`).
 """
 
 from __future__ import annotations
 
-import fcntl
-import json
 import os
 import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from data_pipelines.convert.episode import Conversion, encode
 from data_pipelines.errors import DataError
+from data_pipelines.publishing.claims import claim
+from data_pipelines.publishing.files import publish, sync
+from data_pipelines.publishing.journal import Journal
+from data_pipelines.publishing.marks import FINGERPRINT, read_metadata, shard_lengths
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, build_features, shard_name, write_info
 from data_pipelines.sources.units import LeftOut, Source, UnitError
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
+from hma_jax.runtime.locks import Held
 
 CONVERTER = 1
 """Raise it when a converter writes other bytes for the same source."""
@@ -33,7 +37,7 @@ CONVERTER = 1
 SHARD_BYTES = 256 * 2**20
 """A shard ends with the unit that reaches this size."""
 
-JOURNAL, LOCK = "journal.jsonl", ".lock"
+JOURNAL = "journal.jsonl"
 
 Progress = Callable[[int, int, str], None]
 """Called with (units done, of how many, the unit just read)."""
@@ -94,18 +98,29 @@ def convert(
     )
     if final.exists():
         return _finished(final, mark, source, name)
-    aside = final.with_name(f".{VERSION}.{mark[:16]}.partial")
-    aside.mkdir(parents=True, exist_ok=True)
-    with _alone(aside):
-        shards = _write_shards(source, aside, skip_damaged, shard_bytes, progress)
-        conversion = _finish(source, aside, final, name, shards, mark)
-    return conversion
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(claim(final.with_name(f".{VERSION}")))
+        except Held as held:
+            raise Held(
+                f"another conversion is writing {final.parent} ({held.who}); wait for it or stop it", held.holder
+            ) from None
+        if final.exists():  # made by another process meanwhile
+            return _finished(final, mark, source, name)
+        partial = final.with_name(f".{VERSION}.{mark[:16]}.partial")
+        partial.mkdir(exist_ok=True)
+        shards = _write_shards(source, partial, skip_damaged, shard_bytes, progress)
+        return _finish(source, partial, final, name, shards, mark)
 
 
 def _write_shards(
-    source: Source, aside: Path, skip_damaged: bool, shard_bytes: int, progress: Progress | None
+    source: Source, partial: Path, skip_damaged: bool, shard_bytes: int, progress: Progress | None
 ) -> list[_Shard]:
-    shards = _read_journal(aside)
+    journal = Journal(partial / JOURNAL)
+    shards = [_Shard(**line) for line in journal.read()]
+    if not shards:
+        for stray in partial.iterdir():
+            stray.unlink()
     total = len(source.units)
     while (shards[-1].units if shards else 0) < total:
         unit = shards[-1].units if shards else 0
@@ -131,56 +146,52 @@ def _write_shards(
                 if progress is not None:
                     progress(unit, total, source.units[unit - 1])
 
-        count = write_shard(aside / _part(len(shards)), records())
+        count = write_shard(partial / _part(len(shards)), records())
         shards.append(_Shard(unit, count, size, dict(sorted(left_out.items()))))
-        _append(aside / JOURNAL, json.dumps(vars(shards[-1])))
+        sync(partial / _part(len(shards) - 1))  # the line below says that it is there
+        journal.append(vars(shards[-1]))
     return shards
 
 
 def _finish(
-    source: Source, aside: Path, final: Path, name: str, shards: list[_Shard], mark: str
+    source: Source, partial: Path, final: Path, name: str, shards: list[_Shard], mark: str
 ) -> Conversion:
     episodes = sum(s.records for s in shards)
     left_out = dict(sorted(sum((Counter(s.left_out) for s in shards), Counter()).items()))
     if not episodes:
         reasons = "; ".join(f"{n} x {reason}" for reason, n in left_out.items()) or "it has no unit"
-        shutil.rmtree(aside)
+        shutil.rmtree(partial)
         raise DataError(f"{source.description}: no episode can be made of it: {reasons}.")
     kept = [(k, s) for k, s in enumerate(shards) if s.records]
     for to, (k, _) in enumerate(kept):
-        target = aside / shard_name(name, to, len(kept))
+        target = partial / shard_name(name, to, len(kept))
         if not target.exists():  # by a run that was stopped here
-            os.replace(aside / _part(k), target)
+            os.replace(partial / _part(k), target)
     write_info(
-        aside,
+        partial,
         name=name,
         features=build_features(source.layout.step_fields(), source.layout.episode_fields()),
         lengths=[s.records for _, s in kept],
         size=sum(s.size for _, s in kept),
         description=source.description,
-        metadata={"fingerprint": mark, "hz": source.hz, "left_out": left_out},
+        metadata={FINGERPRINT: mark, "hz": source.hz, "left_out": left_out},
         module="data_pipelines.convert",
     )
-    strays = [*aside.glob("part-*"), *aside.glob(".part-*")]
-    for stray in [*strays, aside / LOCK, aside / JOURNAL]:  # without the journal all of it is made again
+    # Without the journal all of it is made again, so it goes last. Hidden files are of writers that were killed.
+    for stray in [*partial.glob("part-*"), *partial.glob(".*"), partial / JOURNAL]:
         stray.unlink(missing_ok=True)
-    os.replace(aside, final)
+    publish(partial, final)
     return Conversion(final, suggest_spec(source, name), episodes, len(kept), left_out)
 
 
 def _finished(final: Path, mark: str, source: Source, name: str) -> Conversion:
     """What is there already, if it was made of the same source in the same way."""
-    try:
-        metadata = json.loads((final / "metadata.json").read_text())
-        splits = json.loads((final / "dataset_info.json").read_text())["splits"]
-    except (OSError, ValueError, KeyError):
-        metadata, splits = {}, []
+    metadata, lengths = read_metadata(final), shard_lengths(final)
     require(
-        metadata.get("fingerprint") == mark,
+        metadata.get(FINGERPRINT) == mark and bool(lengths),
         f"{final} exists already and was not made of this source with these settings; choose another --name "
         "or --out, or remove it",
     )
-    lengths = [int(n) for split in splits for n in split["shardLengths"]]
     return Conversion(final, suggest_spec(source, name), sum(lengths), len(lengths), metadata["left_out"])
 
 
@@ -189,38 +200,3 @@ def _finished(final: Path, mark: str, source: Source, name: str) -> Conversion:
 
 def _part(index: int) -> str:
     return f"part-{index:05d}"
-
-
-@contextmanager
-def _alone(aside: Path) -> Iterator[None]:
-    """Holds the directory; the lock falls with the process. ConfigError if another one has it."""
-    with open(aside / LOCK, "w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            held = True
-        except BlockingIOError:
-            held = False
-        require(held, f"another conversion is writing {aside.parent}; wait for it or stop it")
-        yield
-
-
-def _read_journal(aside: Path) -> list[_Shard]:
-    """Finished shards; a last line that was cut off by a crash does not count."""
-    path = aside / JOURNAL
-    if not path.exists():
-        for stray in aside.iterdir():
-            if stray.name != LOCK:
-                stray.unlink()
-        return []
-    lines = path.read_bytes().split(b"\n")
-    whole = lines[:-1]
-    if lines[-1]:
-        path.write_bytes(b"".join(line + b"\n" for line in whole))
-    return [_Shard(**json.loads(line)) for line in whole]
-
-
-def _append(path: Path, line: str) -> None:
-    with open(path, "a") as file:
-        file.write(line + "\n")
-        file.flush()
-        os.fsync(file.fileno())

@@ -2,31 +2,34 @@
 
 Bytes depend on the table, the packages' versions, frame size, episode count and seed; never on
 the number of workers or on how often a run was cut short. Episodes are kept as they are made, a
-dataset appears when all of its episodes are there. Imports no simulator.
+dataset appears when all of its episodes are there. One process at a time makes a dataset (see
+`publishing`). Imports no simulator.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import os
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
 from pathlib import Path
 from typing import BinaryIO
 
 from data_pipelines.errors import DataError
+from data_pipelines.publishing.claims import Claim, claim
+from data_pipelines.publishing.marks import FINGERPRINT, is_complete
 from data_pipelines.sim.embodiments import select
-from data_pipelines.sim.packages import require_packages
+from data_pipelines.sim.packages import gl_backend, package_versions, require_packages
 from data_pipelines.sim.spec import SimSpec
 from data_pipelines.sim.worker import Job, record_path
 from data_pipelines.sim.write import write_dataset
 from data_pipelines.sources.rlds.writer import VERSION
-from data_pipelines.suite.generate import is_complete
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.locks import Held
 
 GENERATOR = 1
 """Raise it when simulation, behaviour, drawing or encoding change: older datasets are then remade."""
@@ -40,8 +43,7 @@ Progress = Callable[[str, int, int], None]
 
 def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
     """Hash of everything the bytes of this dataset depend on."""
-    versions = tuple(importlib.metadata.version(p) for p in sorted({spec.package, "mujoco"}))
-    text = repr((GENERATOR, spec, episodes, size, seed, versions))
+    text = repr((GENERATOR, spec, episodes, size, seed, package_versions(spec), gl_backend()))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -58,8 +60,8 @@ def generate_sim(
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
     `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
-    is left as it is. Raises ConfigError for bad arguments and missing packages, DataError when a
-    simulator fails; the other datasets are then made all the same.
+    is left as it is. Raises ConfigError for bad arguments, missing packages and a dataset that another
+    process is making, DataError when a simulator fails; the other datasets are then made all the same.
     """
     require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
     require(16 <= size <= 1024, f"the frame size must lie in 16..1024, got {size}")
@@ -73,9 +75,10 @@ def generate_sim(
     require(os.access(root, os.W_OK), f"cannot write to {root}: no permission; choose another directory")
 
     marks = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
-    run = _Run(root, marks, episodes, size, seed, len(specs) * episodes, progress)
-    jobs = [job for spec in specs for job in run.plan(spec)]
-    failures = run.work(jobs, workers)
+    with ExitStack() as claims:
+        run = _Run(root, marks, episodes, size, seed, len(specs) * episodes, progress, claims)
+        jobs = [job for spec in specs for job in run.plan(spec)]
+        failures = run.work(jobs, workers)
     if failures:
         raise DataError(
             f"{len(failures)} of {len(specs)} datasets were not made; the others are complete. "
@@ -88,12 +91,15 @@ def generate_sim(
 class _Run:
     """One call of `generate_sim`: what is there, and the processes under way."""
 
-    def __init__(self, root: Path, marks: dict[str, str], episodes, size, seed, total, progress):
+    def __init__(
+        self, root: Path, marks: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack
+    ):
         self.root, self.marks, self.episodes, self.size, self.seed = root, marks, episodes, size, seed
         self.done, self.total, self.progress = 0, total, progress
         self.lock, self.finishing = threading.Lock(), threading.Lock()
         self.children: set[subprocess.Popen] = set()
         self.stopped = False
+        self.stack, self.claims = stack, dict[str, Claim]()
 
     def staging(self, name: str) -> Path:
         """Where the episodes of a dataset wait for each other."""
@@ -102,6 +108,8 @@ class _Run:
     def plan(self, spec: SimSpec) -> list[Job]:
         """The jobs that a dataset lacks; it is put together if nothing but that is left to do."""
         name = spec.name
+        if not is_complete(self.root / name / VERSION, self.marks[name]):
+            self.claims[name] = self.claim(name)  # looked at again: another process may have made it by then
         if is_complete(self.root / name / VERSION, self.marks[name]):
             self.count(name, self.episodes)
             return []
@@ -113,6 +121,17 @@ class _Run:
             self.finish(spec)
         chunks = [missing[i : i + JOB_EPISODES] for i in range(0, len(missing), JOB_EPISODES)]
         return [Job(name, tuple(chunk), self.seed, self.size, str(staging)) for chunk in chunks]
+
+    def claim(self, name: str) -> Claim:
+        """Held until the whole run ends. Raises Held."""
+        home = self.root / name
+        try:
+            return self.stack.enter_context(claim(home / f".{VERSION}"))
+        except Held as held:
+            raise Held(
+                f"{home}: {held.who} is making this dataset; wait for it, stop it, or name other datasets",
+                held.holder,
+            ) from None
 
     def missing(self, name: str) -> list[int]:
         return [i for i in range(self.episodes) if not record_path(self.staging(name), i).is_file()]
@@ -174,11 +193,12 @@ class _Run:
         """Puts a dataset together from its episodes."""
         write_dataset(
             spec,
-            self.root,
+            self.root / spec.name,
+            self.claims[spec.name],
             self.staging(spec.name),
             episodes=self.episodes,
             size=self.size,
-            metadata={"fingerprint": self.marks[spec.name], "generator": GENERATOR, "seed": self.seed},
+            metadata={FINGERPRINT: self.marks[spec.name], "generator": GENERATOR, "seed": self.seed},
         )
 
     def count(self, name: str, episodes: int) -> None:

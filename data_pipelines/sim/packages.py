@@ -6,6 +6,7 @@ Owns the messages for what is missing. Looks for packages without importing them
 from __future__ import annotations
 
 import ctypes.util
+import importlib.metadata
 import importlib.util
 import os
 import sys
@@ -34,6 +35,19 @@ TOGETHER = {
 }
 """Backend -> packages that its module imports, whichever of them a robot is from."""
 
+EVERYWHERE = ("mujoco", "numpy", "simplejpeg")
+"""Packages that decide what is in every dataset: physics and drawing, random draws, the encoding of frames."""
+
+BENEATH = {
+    "metaworld": ("gymnasium", "scipy"),
+    "robosuite": ("mink", "numba", "scipy"),
+    "gymnasium": ("dm-control",),
+    "aloha": ("dm-control", "gymnasium"),
+    "pusht": ("gymnasium", "opencv-python", "opencv-python-headless", "pygame", "pymunk", "shapely"),
+    "so101": ("gymnasium", "scipy"),
+}
+"""Backend -> what its packages simulate, steer and draw with, where it is installed."""
+
 EXTRA = "pip install -e '.[sim]'"
 
 APT = (
@@ -51,6 +65,19 @@ def missing_packages(specs: Iterable[SimSpec]) -> tuple[str, ...]:
     for spec in specs:
         needed.update({spec.package, *TOGETHER.get(spec.backend, ())})
     return tuple(p for p in sorted(needed) if importlib.util.find_spec(MODULES.get(p, p)) is None)
+
+
+def package_versions(spec: SimSpec) -> dict[str, str]:
+    """Versions of the packages that decide what is in a dataset; "" for one that is not installed."""
+    used = {spec.package, *EVERYWHERE, *TOGETHER.get(spec.backend, ()), *BENEATH.get(spec.backend, ())}
+    return {package: _version(package) for package in sorted(used)}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
 
 
 def require_packages(specs: Iterable[SimSpec]) -> None:

@@ -8,12 +8,12 @@ how it went. A line on stdout says that both are there.
 from __future__ import annotations
 
 import json
-import os
 import time
 import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from data_pipelines.publishing.files import write_file
 from data_pipelines.sim.embodiments import get_embodiment
 from data_pipelines.sim.packages import prepare_process
 
@@ -66,14 +66,7 @@ def run_job(job: Job) -> None:
         seconds = time.perf_counter() - began
         facts = {"env": env, "frames": len(episode.frames), "success": episode.success, "seconds": seconds}
         facts["states"] = episode.states.shape[1]
-        _write(facts_path(job.directory, index), json.dumps(facts).encode())
-        _write(record_path(job.directory, index), encode_episode(spec, episode, index))
+        write_file(facts_path(job.directory, index), json.dumps(facts).encode())
+        write_file(record_path(job.directory, index), encode_episode(spec, episode, index))
         print(index, flush=True)
     simulator.close()
-
-
-def _write(path: Path, data: bytes) -> None:
-    aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    aside.write_bytes(data)
-    os.replace(aside, path)
-

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from data_pipelines.publishing.claims import Claim
+from data_pipelines.publishing.files import publish, write_file
 from data_pipelines.sim.record import build_features
 from data_pipelines.sim.spec import SimSpec
 from data_pipelines.sim.worker import facts_path, record_path
@@ -26,27 +28,26 @@ STATS = "stats.json"
 
 
 def write_dataset(
-    spec: SimSpec, root: Path, staging: Path, *, episodes: int, size: int, metadata: dict
+    spec: SimSpec, home: Path, claim: Claim, staging: Path, *, episodes: int, size: int, metadata: dict
 ) -> Path:
-    """`<root>/<name>/<version>/` from the episodes in `staging`, which are then removed."""
-    home = root / spec.name
-    for left in home.glob(f".{VERSION}.incomplete.*"):  # by a run that was killed
-        shutil.rmtree(left)
-    aside, final = home / f".{VERSION}.incomplete.{os.getpid()}", home / VERSION
-    aside.mkdir()
+    """`<home>/<version>/` from the episodes in `staging`, which are then removed.
+
+    `claim` is that of the dataset in `home`: staging directories of other settings are nobody's then.
+    """
+    scratch, final = claim.scratch, home / VERSION
     facts = [json.loads(facts_path(staging, i).read_text()) for i in range(episodes)]
     frames = sum(f["frames"] for f in facts)
     shards = max(1, min(episodes, round(frames / SHARD_FRAMES)))
     bounds = np.linspace(0, episodes, shards + 1).astype(int)
     lengths, payload = [], 0
     for k in range(shards):
-        path = aside / shard_name(spec.name, k, shards)
+        path = scratch / shard_name(spec.name, k, shards)
         records = (record_path(staging, i).read_bytes() for i in range(bounds[k], bounds[k + 1]))
         lengths.append(write_shard(path, records))
         payload += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
     layout = ", ".join(f"{what} {dim}" for what, dim in spec.layout)
     write_info(
-        aside,
+        scratch,
         spec.name,
         build_features(spec, size, facts[0]["states"]),
         lengths,
@@ -56,10 +57,8 @@ def write_dataset(
         module="data_pipelines.sim",
     )
     _write_stats(home / STATS, spec, size, facts)
-    if final.exists():
-        shutil.rmtree(final)
-    os.replace(aside, final)
-    for left in home.glob(f".{VERSION}.episodes.*"):  # of other settings too
+    publish(scratch, final)
+    for left in home.glob(f".{VERSION}.episodes.*"):
         shutil.rmtree(left)
     return final
 
@@ -74,9 +73,7 @@ def _write_stats(path: Path, spec: SimSpec, size: int, facts: list[dict]) -> Non
         "machine": _machine(),
         "date": time.strftime("%Y-%m-%d"),
     }
-    aside = path.with_name(f".{path.name}.tmp")
-    aside.write_text(json.dumps(stats))
-    os.replace(aside, path)
+    write_file(path, json.dumps(stats))
 
 
 def _machine() -> str:

@@ -6,15 +6,16 @@ Bytes depend on the table, scale and seed, never on the number of workers.
 from __future__ import annotations
 
 import hashlib
-import json
 import multiprocessing
 import os
-import shutil
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+from data_pipelines.publishing.claims import claim
+from data_pipelines.publishing.files import publish
+from data_pipelines.publishing.marks import FINGERPRINT, is_complete
 from data_pipelines.sources.rlds.writer import VERSION
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.spec import EmbodimentSpec
@@ -49,17 +50,6 @@ def fingerprint(spec: EmbodimentSpec, scale: float, seed: int) -> str:
     """Hash of everything the bytes of this dataset depend on."""
     text = repr((GENERATOR, spec, episode_count(spec, scale), seed))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def is_complete(directory: Path, mark: str) -> bool:
-    """Whether `directory` holds a dataset with this fingerprint and all of its shards."""
-    try:
-        metadata = json.loads((directory / "metadata.json").read_text())
-        info = json.loads((directory / "dataset_info.json").read_text())
-    except (OSError, ValueError):
-        return False
-    shards = len(info["splits"][0]["shardLengths"])
-    return metadata.get("fingerprint") == mark and len(list(directory.glob("*.tfrecord-*"))) == shards
 
 
 def generate_suite(
@@ -121,23 +111,17 @@ def generate_suite(
 
 
 def _make(name: str, root: Path, scale: float, seed: int) -> None:
-    """One dataset: written aside, then renamed into place."""
+    """One dataset, unless another process makes it meanwhile."""
     (spec,) = select([name])
-    final = root / name / VERSION
-    for left in (root / name).glob(f".{VERSION}.incomplete.*"):  # by a run that was killed
-        shutil.rmtree(left)
-    aside = root / name / f".{VERSION}.incomplete.{os.getpid()}"
-    aside.mkdir(parents=True)
-    try:
+    final, mark = root / name / VERSION, fingerprint(spec, scale, seed)
+    with claim(final.with_name(f".{VERSION}"), wait=True) as held:
+        if is_complete(final, mark):
+            return
         write_dataset(
             spec,
-            aside,
+            held.scratch,
             episodes=episode_count(spec, scale),
             seed=zlib.crc32(f"{seed}/{name}".encode()),
-            metadata={"fingerprint": fingerprint(spec, scale, seed), "generator": GENERATOR, "seed": seed},
+            metadata={FINGERPRINT: mark, "generator": GENERATOR, "seed": seed},
         )
-        if final.exists():
-            shutil.rmtree(final)
-        os.replace(aside, final)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+        publish(held.scratch, final)

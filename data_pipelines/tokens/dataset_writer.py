@@ -1,12 +1,13 @@
-"""A dataset of the token store, made part by part by one process or many, and published at once.
+"""A dataset of the token store, made part by part by any number of processes, and published at once.
 
-Owns the work directory, who makes which part, what is kept after a crash, and publishing. What
-goes into a part is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
+Owns the work directory, what is kept after a crash, and publishing. Who makes which part is in
+`part_maker`; what goes into it is the caller's: episodes of RLDS (`tokenize_job`) or of any other source.
 
 Parts gather in `<store>/.<name>.<hash of the plan>`, where no reader looks and no job with
-another plan. When the last is there, the manifest is added and the directory renamed to
-`<store>/<name>`. Every step is repeatable and writes the same bytes, so that it does not
-matter how often a process is killed, or whether two make the same part or publish at once.
+another plan. Every process takes the next part that is neither there nor claimed by another one
+(`<work directory>.claims`, see `publishing`), so that processes may come, go and be killed at any
+time: the part of a dead one is free again. When the last is there, whoever claims the publishing
+adds the manifest and renames the directory to `<store>/<name>`.
 """
 
 from __future__ import annotations
@@ -15,74 +16,72 @@ import hashlib
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from data_pipelines.errors import DataError
-from data_pipelines.tokens.manifest import FILE, SPLITS, Loss, Manifest, SplitFacts, load_manifest
+from data_pipelines.publishing.claims import claim, living_claim, pauses_between_looks
+from data_pipelines.publishing.files import remove, sync
+from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts, load_manifest
 from data_pipelines.tokens.moments import merge_all
-from data_pipelines.tokens.part import FACTS, Made, Part, PartFacts, read_part, sync, write_part
-from data_pipelines.tokens.scratch import scratch
-from data_pipelines.tokens.share import Share
+from data_pipelines.tokens.part_files import Part, PartFacts, read_part
+from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, claims_of
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, stable_hash
+from hma_jax.runtime.locks import Held
 
 PART_SIZE = 256 * 2**20
 """Bytes of records in one part: what a killed process has to do again, at most."""
-
-MOST_PARTS = 1024
-"""Parts of a dataset: of one larger than this many times PART_SIZE the parts are larger."""
-
-Progress = Callable[[int, int], None]
-"""Called with the episodes done and all, of this process's share."""
 
 
 def write_dataset(
     store_root: str | Path,
     plan: Manifest,
     parts: Sequence[Part],
-    make: Callable[[Part], Iterable[Made]],
+    make: Make,
     *,
-    share: Share = Share(),
-    lost: Sequence[Loss] = (),
+    lost: Sequence[LostEpisodes] = (),
     max_lost: int = 0,
     overwrite: bool = False,
+    wait: bool = True,
     progress: Progress | None = None,
 ) -> Manifest | None:
-    """Makes this process's missing parts of `<store_root>/<plan.spec.name>`; publishes what is complete.
+    """Makes the missing parts of `<store_root>/<plan.spec.name>` that no other process makes, and publishes it.
 
     `plan`: the manifest without statistics and splits. `parts` cover the source in order, as
-    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or a Loss
+    `cut_parts` cuts them. `make(part)` gives a part's episodes in order of their index, or LostEpisodes
     for one that cannot be used; equal parts must give equal items. `lost` are episodes that are
     in no part. A dataset that is there, made from the same source in the same way, is kept; one
     made otherwise is refused or, with `overwrite`, removed.
 
-    Returns the manifest, or None while parts of other processes are missing. Raises ConfigError
-    for another dataset in its place and a directory that cannot be written, DataError for more
-    than `max_lost` lost episodes or no training episode at all, and what `make` raises.
+    Parts that other processes are making are waited for, and made here if those die; without
+    `wait` None is returned instead of the manifest. Raises ConfigError for another dataset in its
+    place, or one that other processes are making there, and a directory that cannot be written;
+    DataError for more than `max_lost` lost episodes, those that other processes lost included, or no
+    training episode at all; and what `make` raises.
     """
-    root, name = Path(store_root), plan.spec.name
-    final = root / name
+    root = Path(store_root)
+    final = root / plan.spec.name
     try:
         if overwrite:
             _remove_others(root, plan, parts)
-        work = _work_directory(root, plan, parts)
-        manifest = _published(final, plan)
-        if manifest is not None:
-            _remove_work(work)  # of a process that was killed after it had published
-            return manifest
-        (work / FACTS).mkdir(parents=True, exist_ok=True)
-        try:
-            _make_parts(work, final, plan, share.of(parts, name), make, max_lost, progress)
-            manifest = _publish(work, final, plan, parts, lost, max_lost)
-        except FileNotFoundError:
-            manifest = _published(final, plan)  # published meanwhile by a process that did the same
-            if manifest is None:
-                raise
-        if manifest is not None:
-            _remove_work(work)
-        return manifest
+        maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
+        pauses = pauses_between_looks()
+        while True:
+            try:
+                manifest = _attempt(maker, make, progress)
+            except FileNotFoundError:  # all of it is removed by the process that publishes it
+                manifest = _published(final, plan)
+                if manifest is None:
+                    raise
+            if manifest is not None:
+                _remove_work(maker.work)
+                return manifest
+            if not wait:
+                return None
+            time.sleep(next(pauses))
     except OSError as error:
         raise ConfigError(
             f"{final}: the token store cannot be written there ({error.strerror or error}). "
@@ -99,19 +98,12 @@ def differences(store_root: str | Path, plan: Manifest) -> list[str]:
     return _changes(load_manifest(final / FILE), plan) if final.exists() else []
 
 
-def missing_parts(store_root: str | Path, plan: Manifest, parts: Sequence[Part]) -> int:
-    """How many parts of a dataset that is not published are still to be made."""
-    work = _work_directory(Path(store_root), plan, parts)
-    return sum(read_part(work, part) is None for part in parts)
-
-
-def cut_parts(sizes: Sequence[int], part_size: int, most: int) -> list[Part]:
-    """Ranges of consecutive items of about `part_size` together; larger if it were more than `most`."""
-    target = max(part_size, -(-int(sum(sizes)) // most))
+def cut_parts(sizes: Sequence[int], part_size: int) -> list[Part]:
+    """Ranges of consecutive items of about `part_size` together."""
     ends, held = [], 0
     for i, size in enumerate(sizes):
         held += int(size)
-        if held >= target:
+        if held >= part_size:
             ends.append(i + 1)
             held = 0
     if not ends or ends[-1] < len(sizes):
@@ -127,81 +119,46 @@ def _work_directory(root: Path, plan: Manifest, parts: Sequence[Part]) -> Path:
     return root / f".{plan.spec.name}.{stable_hash([plan, list(parts)])[:12]}"
 
 
-def _aside(work: Path) -> Path:
-    return work.with_name(f"{work.name}.aside")
+def _attempt(maker: PartMaker, make: Make, progress: Progress | None) -> Manifest | None:
+    """Makes every part that is free and publishes the dataset if it is complete; None if it is not."""
+    manifest = _published(maker.final, maker.plan)
+    if manifest is not None:
+        return manifest
+    maker.make_free_parts(make, progress)
+    if maker.complete():
+        _publish(maker)
+    return _published(maker.final, maker.plan)
 
 
-def _make_parts(
-    work: Path,
-    final: Path,
-    plan: Manifest,
-    parts: Sequence[Part],
-    make: Callable[[Part], Iterable[Made]],
-    max_lost: int,
-    progress: Progress | None,
-) -> None:
-    # A part with losses was made when they were allowed. Made again, it says what is wrong.
-    kept = {p for p in parts if (f := read_part(work, p)) and (max_lost or not f.lost)}
-    total, done = sum(len(p.episodes) for p in parts), sum(len(p.episodes) for p in kept)
-    keep = {"none": set(), "val": {"val"}, "all": set(SPLITS)}[plan.settings.keep_frames]
-
-    def report(more: int = 0) -> None:
-        if progress is not None:
-            progress(done + more, total)
-
-    report()
-    with scratch(_aside(work)) as aside:
-        for part in parts:
-            if part in kept:
-                continue
-            if final.exists():
-                return
-            counted = _counted(make(part), report)
-            write_part(work, part, counted, aside, plan.spec.action_dim, keep)
-            done += len(part.episodes)
-
-
-def _counted(made: Iterable[Made], report: Callable[[int], None]) -> Iterable[Made]:
-    for n, item in enumerate(made, start=1):
-        yield item
-        report(n)
-
-
-def _publish(
-    work: Path,
-    final: Path,
-    plan: Manifest,
-    parts: Sequence[Part],
-    lost: Sequence[Loss],
-    max_lost: int,
-) -> Manifest | None:
-    facts = []
-    for part in parts:
-        known = read_part(work, part)
-        if known is None:
-            return _published(final, plan)  # None, unless another process was faster
-        facts.append(known)
-    manifest = _merge(plan, facts, lost)
-    if manifest.lost > max_lost:
-        raise DataError(
-            f"{plan.spec.name}: {manifest.lost} episodes are unusable, more than max_skipped={max_lost}. "
-            f"The last: {manifest.skipped[-1].reason} Raise max_skipped if the rest is worth it."
-        )
-    if not manifest.train.episodes:
-        raise DataError(f"{plan.spec.name}: no usable episode is left to train on.")
-    with scratch(_aside(work)) as aside:
-        manifest.save(work, aside)
-    sync(work)
+def _publish(maker: PartMaker) -> None:
+    """Unless another process is doing it, or a part is damaged, which the next attempt makes again."""
+    work, final, plan = maker.work, maker.final, maker.plan
+    maker.check_losses()
     try:
-        os.rename(work, final)
-    except OSError:
-        if not final.exists():  # otherwise another process published the same
-            raise
-    sync(final.parent)
-    return _published(final, plan)
+        with claim(claims_of(work) / "publish") as held:
+            facts = []
+            for part in maker.parts:
+                known = read_part(work, part)
+                if known is None:
+                    maker.forget(part)
+                    return
+                facts.append(known)
+            manifest = _merge(plan, facts, maker.lost)
+            if not manifest.train.episodes:
+                raise DataError(f"{plan.spec.name}: no usable episode is left to train on.")
+            manifest.save(work, held.scratch)
+            sync(work)
+            try:
+                os.rename(work, final)
+            except OSError:
+                if not final.exists():  # otherwise another process published the same
+                    raise
+            sync(final.parent)
+    except Held:
+        pass
 
 
-def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[Loss]) -> Manifest:
+def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[LostEpisodes]) -> Manifest:
     moments = merge_all((f.moments for f in facts), plan.spec.action_dim)
     splits = {}
     for split in SPLITS:
@@ -244,24 +201,30 @@ def _changes(there: Manifest, plan: Manifest) -> list[str]:
 
 
 def _remove_others(root: Path, plan: Manifest, parts: Sequence[Part]) -> None:
-    """A dataset of this name that was made otherwise, and what unfinished jobs left of it."""
+    """A dataset of this name that was made otherwise, and what unfinished jobs left of it.
+
+    Raises Held if a living process is making one.
+    """
     name = plan.spec.name
     final, work = root / name, _work_directory(root, plan, parts)
+    unfinished = re.compile(rf"\.{re.escape(name)}\.[0-9a-f]{{12}}")
+    others = [p for p in sorted(root.glob(f".{name}.*")) if unfinished.fullmatch(p.name) and p != work]
+    for other in others:
+        if held := living_claim(claims_of(other)):
+            raise Held(
+                f"{final}: {held.who} is making this dataset in another way; wait for it or stop it", held.holder
+            )
     if final.exists():
         try:
             outdated = bool(_changes(load_manifest(final / FILE), plan))
         except DataError:  # damaged, or of an older format
             outdated = True
         if outdated:
-            gone = root / f".{name}.removed"
-            shutil.rmtree(gone, ignore_errors=True)
-            os.rename(final, gone)  # out of sight first
-    unfinished = re.compile(rf"\.{re.escape(name)}\.([0-9a-f]{{12}}|removed)")
-    for other in root.glob(f".{name}.*"):
-        if unfinished.fullmatch(other.name) and other != work:
-            _remove_work(other)
+            remove(final)
+    for other in others:
+        _remove_work(other)
 
 
 def _remove_work(work: Path) -> None:
-    for directory in (_aside(work), work):
+    for directory in (claims_of(work), work):
         shutil.rmtree(directory, ignore_errors=True)

@@ -21,10 +21,10 @@ import numpy as np
 from data_pipelines.errors import DataError
 from data_pipelines.names import NAME_RULE, is_name, shown
 from data_pipelines.registry import DatasetSpec, find_spec
-from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Manifest, SplitFacts, TokenizerFacts
-from data_pipelines.tokens.part import Made, Part
+from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.release_folder import FACTOR_VOCAB, ReleaseFolder, open_folder
 from hma_jax.config import SvdVaeConfig, require
 from hma_jax.config.json import diff
@@ -68,14 +68,14 @@ def import_tokens(
     decode = None if tokenizer is None else tokenizer.decode
     places = [(split, e) for split, folder in folders.items() for e in range(len(folder))]
 
-    def make(part: Part) -> Iterator[Made]:
+    def make(part: Part) -> Iterator[PartItem]:
         for number in part.episodes:
             split, episode = places[number]
             yield split, _episode(folders[split], episode, number, plan, patch, decode if split == "val" else None)
 
     frame_bytes = folders["train"].video[0].nbytes
     sizes = [int(n) * frame_bytes for folder in folders.values() for n in np.diff(folder.bounds)]
-    return write_dataset(store_root, plan, cut_parts(sizes, PART_SIZE, MOST_PARTS), make, progress=progress)
+    return write_dataset(store_root, plan, cut_parts(sizes, PART_SIZE), make, progress=progress)
 
 
 def _plan(

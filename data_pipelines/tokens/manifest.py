@@ -89,7 +89,7 @@ class SplitFacts:
 
 
 @dataclass(frozen=True)
-class Loss:
+class LostEpisodes:
     """Episodes that could not be used."""
 
     reason: str
@@ -113,7 +113,7 @@ class Manifest:
     val: SplitFacts
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
-    skipped: tuple[Loss, ...] = ()  # what was left out
+    skipped: tuple[LostEpisodes, ...] = ()  # what was left out
     runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
     format: int = FORMAT
 

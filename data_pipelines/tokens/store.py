@@ -1,6 +1,6 @@
 """The token store: tokenised episodes of many datasets, with random access.
 
-Owns the reading of what `part` writes. Knows nothing of windows or mixtures.
+Owns the reading of what `part_files` writes. Knows nothing of windows or mixtures.
 """
 
 from __future__ import annotations

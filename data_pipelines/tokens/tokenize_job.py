@@ -27,12 +27,11 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
-from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
-from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts
-from data_pipelines.tokens.part import Made, Part
+from data_pipelines.tokens.manifest import JobSettings, LostEpisodes, Manifest, SplitFacts, TokenizerFacts
+from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
-from data_pipelines.tokens.share import Share
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -55,19 +54,20 @@ def tokenize_dataset(
     part_size: int = PART_SIZE,
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: int = MAX_SKIPPED,
-    share: Share = Share(),
     overwrite: bool = False,
+    wait: bool = True,
     progress: Progress | None = None,
 ) -> Manifest | None:
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
     `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz
     frames), 1 stores all phases; it must divide the stride. `batch` images are encoded at a
-    time, `threads` (default: as many as cores, up to 8) decode. `progress(done, total)` counts
-    episodes of this process's `share`. If the store already has this dataset made from the
-    same shards in the same way, nothing is done; what a killed job had finished is kept. The
-    bytes of the dataset depend on `spec`, source, tokenizer, `part_size` and the settings of
-    JobSettings; on nothing else. None: parts of other processes are still missing.
+    time, `threads` (default: as many as cores, up to 8) decode. If the store already has this
+    dataset made from the same shards in the same way, nothing is done. Any number of processes
+    may do the same at a time, start and be killed: each makes parts that no other one makes.
+    `progress(done, total)` counts the episodes of all. `wait`: until parts of others are there;
+    without it, None is returned while they are not. The bytes of the dataset depend on `spec`,
+    source, tokenizer, `part_size` and the settings of JobSettings; on nothing else.
 
     Raises ConfigError for keys, settings or a store directory that cannot work, and for a
     dataset in its place that was made otherwise, unless `overwrite`; DataError for damaged data
@@ -81,18 +81,18 @@ def tokenize_dataset(
     )
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
-        Loss(reason.replace(f"{source.location}/", ""), episodes=count)
+        LostEpisodes(reason.replace(f"{source.location}/", ""), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
         store_root,
         plan,
-        cut_parts(source.sizes(), part_size, MOST_PARTS),
+        cut_parts(source.sizes(), part_size),
         work.make,
-        share=share,
         lost=lost,
         max_lost=max_skipped if corrupt == "skip" else 0,
         overwrite=overwrite,
+        wait=wait,
         progress=progress,
     )
     source.remember()
@@ -173,7 +173,7 @@ class _Work:
         is_val = held_out(plan.spec.name, source.ids, s.val_fraction, s.min_val, s.max_val)
         self._is_val = is_val[self._numbers]
 
-    def make(self, part: Part) -> Iterator[Made]:
+    def make(self, part: Part) -> Iterator[PartItem]:
         """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""
         spec, size = self._plan.spec, self._plan.tokenizer.image_size
         items = frames_ahead(
@@ -208,7 +208,7 @@ class _Work:
     def _keeps(self, index: int) -> bool:
         return self._plan.settings.keep_frames in ("all", self._split(index))
 
-    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[Made]:
+    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[PartItem]:
         """Takes the episodes from `pending` that have all their tokens."""
         while pending and pending[0].end is not None and encoder.ready >= pending[0].came:
             episode = pending.popleft()
@@ -223,11 +223,12 @@ class _Work:
                 int(self._numbers[begin.index]), begin.success, tokens.astype(self._dtype), begin.actions, frames
             )
 
-    def _lose(self, error: EpisodeError) -> Loss:
-        self._source.skip(error)
+    def _lose(self, error: EpisodeError) -> LostEpisodes:
+        if self._source.corrupt == "raise":
+            raise error
         reason = str(error).replace(f"{self._source.location}/", "")
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
-        return Loss(reason, *place)
+        return LostEpisodes(reason, *place)
 
 
 class _Encoder:

@@ -42,7 +42,7 @@ def make_store(root: Path, seed: int) -> TokenStore:
                 actions = rng.standard_normal((STEPS, dim)).astype(np.float32)
                 yield ("val" if i < 2 else "train"), StoredEpisode(i, None, tokens, actions, None)
 
-        write_dataset(root, plan, cut_parts([1] * EPISODES, EPISODES, 1), episodes)
+        write_dataset(root, plan, cut_parts([1] * EPISODES, EPISODES), episodes)
     return TokenStore(root)
 
 

@@ -66,8 +66,6 @@ def _run(command: str, where: Where, how: How, remake: Remake, axes: tuple[str, 
 def tokenize(
     where: OmitArgPrefixes[Where],
     remake: OmitArgPrefixes[Remake],
-    process: Annotated[int | None, arg(metavar="I"), UNSET] = None,
-    processes: Annotated[int | None, arg(metavar="N"), UNSET] = None,
     batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
     threads: Annotated[
         int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")
@@ -75,19 +73,18 @@ def tokenize(
 ) -> None:
     """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
 
-    Killed at any point, the same command goes on and ends with the same bytes. Several processes
-    or machines share the work if each gets its number; SLURM's arrays and tasks, and Open MPI's, are
-    understood by themselves. The tokenizer must be there then: --tokenizer, or `hma tokenizer train` before.
+    Killed at any point, the same command goes on and ends with the same bytes. Started several times, on one
+    machine or on many that share the directory, it shares the work: each process takes parts that no other one
+    has, any of them may be killed, more may join. Those that join need a tokenizer that is there: --tokenizer,
+    or `hma tokenizer train` before.
 
     Args:
-        where: Study, data, output directory and settings. Several processes must share the directory.
+        where: Study, data, output directory and settings. Several processes share the directory.
         remake: What was made with other settings or data is never replaced without being asked for.
-        process: Number of this process, from 0 on.
-        processes: How many processes share the work; 1 for all of it, whatever SLURM says.
         batch: Frames encoded at a time. Changes no token.
         threads: Threads that decode frames.
     """
-    tokenize_commands.tokenize(make_setting(where), process, processes, batch, threads, remake.replace)
+    tokenize_commands.tokenize(make_setting(where), batch, threads, remake.replace)
 
 
 def train(

@@ -2,86 +2,85 @@
 
 from __future__ import annotations
 
-import os
-from typing import TYPE_CHECKING
+import time
+from contextlib import ExitStack
 
 from rich.markup import escape
 
 from experiments.commands.study import wrote
 from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
-from experiments.setting import Setting
+from experiments.setting import Setting, short
 from experiments.workspace import Busy, Workspace
-from hma_jax.config import require
-
-if TYPE_CHECKING:
-    from data_pipelines.tokens.share import Share
 
 
 def tokenize(
-    setting: Setting,
-    process: int | None = None,
-    processes: int | None = None,
-    batch: int | None = None,
-    threads: int | None = None,
-    replace: Step | None = None,
+    setting: Setting, batch: int | None = None, threads: int | None = None, replace: Step | None = None
 ) -> None:
-    """Everything up to training, or this process's share of the tokens."""
-    from data_pipelines.tokens.share import find_share
+    """Everything up to training. If another command prepares the same directory, takes part in its tokenising."""
     from experiments.pipeline import prepare
 
-    share = find_share(process, processes, os.environ)
-    if share.processes > 1:
-        _tokenize_share(setting, share, batch, threads, replace)
-        return
-    with setting.workspace.claimed():
-        prepare(
-            setting.study, setting.workspace, setting.data, setting.tokenizer,
-            replace=replace, batch=batch, threads=threads,
-        )  # fmt: skip
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(setting.workspace.claimed())
+        except Busy as busy:
+            _take_part(setting, busy, batch, threads, replace)
+        else:
+            prepare(
+                setting.study, setting.workspace, setting.data, setting.tokenizer,
+                replace=replace, batch=batch, threads=threads,
+            )  # fmt: skip
     _finish(setting)
 
 
-def _tokenize_share(
-    setting: Setting, share: Share, batch: int | None, threads: int | None, replace: Step | None
+def _take_part(
+    setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None
 ) -> None:
-    """Makes no tokenizer and removes nothing: other processes rely on what is there."""
+    """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
     from experiments.preparing.sources import find_sources, find_suite
     from experiments.preparing.store import make_store
-    from experiments.preparing.tokenizer import adopt_tokenizer
-    from experiments.preparing.windows import freeze_windows, require_same_windows
+    from experiments.preparing.windows import require_same_windows
 
     study, workspace = setting.study, setting.workspace
-    if share.told_by:
-        console.print(f"process {share.process} of {share.processes}, says {share.told_by}")
+    if replace is not None:
+        raise Busy(f"{busy}; --replace needs the directory for itself", busy.holder)
     tokenizer = setting.tokenizer or workspace.tokenizer
-    advice = f"Make it before the work is shared: {setting.command('tokenizer train')}"
-    require(tokenizer.is_dir(), f"{tokenizer}: no tokenizer. {advice}")
+    if not tokenizer.is_dir():
+        advice = f"Start this again when it is there, or make it before: {setting.command('tokenizer train')}"
+        raise Busy(f"{tokenizer}: no tokenizer yet, and {busy}. {advice}", busy.holder)
     require_same_windows(study, workspace, None)
     if setting.data:
         sources = find_sources(study, setting.data)
     else:
-        advice = f"Make them before the work is shared: {setting.command('data suite')}; or give --data"
+        advice = f"Start this again when they are, or make them before: {setting.command('data suite')}"
         sources = find_suite(study, workspace, advice)
-    unfinished = make_store(
-        study, workspace, sources, tokenizer=tokenizer, share=share, batch=batch, threads=threads, replace=replace
-    )
-    if unfinished:
-        console.print(
-            f"this share is done; {', '.join(unfinished)} will be complete when the others are. The last "
-            "process to end completes the store; the same command makes up for one that was lost",
-            soft_wrap=True,
-        )
-        return
-    try:
-        with workspace.claimed():
-            if setting.tokenizer is not None:
-                adopt_tokenizer(setting.tokenizer, study, workspace)
-            freeze_windows(study, workspace)
-    except Busy:
-        console.print("this share is done, and so is the store; another process is freezing the windows")
-        return
-    _finish(setting)
+    console.print(f"taking part: {busy.who} prepares {short(workspace.root)}", soft_wrap=True)
+    make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)
+    _freeze(setting)
+
+
+def _freeze(setting: Setting) -> None:
+    """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
+    from data_pipelines.publishing.claims import pauses_between_looks
+    from experiments.preparing.tokenizer import adopt_tokenizer
+    from experiments.preparing.windows import freeze_windows, windows_are_frozen
+
+    study, workspace, said = setting.study, setting.workspace, False
+    for pause in pauses_between_looks():
+        try:
+            with workspace.claimed():
+                if setting.tokenizer is not None:
+                    adopt_tokenizer(setting.tokenizer, study, workspace)
+                freeze_windows(study, workspace)
+            return
+        except Busy as busy:
+            if windows_are_frozen(study, workspace):
+                return
+            if not said:
+                waiting = f"all tokens are there; waiting for the windows, or the end, of {busy.who}"
+                console.print(waiting, soft_wrap=True)
+                said = True
+        time.sleep(pause)
 
 
 def _finish(setting: Setting) -> None:

@@ -11,11 +11,9 @@ from experiments.preparing.sources import Source, open_source
 from experiments.progress import Pace, step
 from experiments.study import Study
 from experiments.workspace import Workspace
-from hma_jax.config import require
 from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:
-    from data_pipelines.tokens.share import Share
     from hma_jax.tokenizers.base import Tokenizer
 
 
@@ -25,46 +23,37 @@ def make_store(
     sources: Sequence[Source],
     *,
     tokenizer: Path | None = None,
-    share: Share | None = None,
     batch: int | None = None,
     threads: int | None = None,
     replace: Step | None = None,
-) -> list[str]:
-    """Tokens of every source, or of a `share` of their parts; those made in the same way are kept.
+) -> None:
+    """Tokens of every source; those made in the same way are kept. Any number of processes may do it at a time.
 
     Raises ConfigError, before anything is done, if other tokens are in the place of some, unless `replace` allows
-    it. Returns the datasets that still lack parts of other processes. `tokenizer`: a directory, if it is not the
-    workspace's. `batch` and `threads` as in `tokenize_dataset`.
+    it. When it returns, every dataset is complete: parts that others are making are waited for at the end.
+    `tokenizer`: a directory, if it is not the workspace's. `batch` and `threads` as in `tokenize_dataset`.
     """
-    from data_pipelines.tokens.share import Share
     from data_pipelines.tokens.tokenize_job import tokenize_dataset
     from hma_jax.tokenizers.io import load_tokenizer
 
-    made_with = load_tokenizer(tokenizer or workspace.tokenizer)
-    settings, share = to_dict(study.store), share or Share()
-    require(
-        replace is None or share.processes == 1,
-        "processes that share the work replace nothing, since none knows what the others rely on; run the command "
-        "with --replace in one process (--processes 1), or choose another --out",
-    )
+    made_with, settings = load_tokenizer(tokenizer or workspace.tokenizer), to_dict(study.store)
     require_same("tokens", workspace.store, _differences(study, workspace, sources, made_with), replace)
     how = {k: v for k, v in (("batch", batch), ("threads", threads)) if v is not None}
     workspace.store.mkdir(parents=True, exist_ok=True)
-    unfinished = []
-    mine = f", share {share.process + 1} of {share.processes}" if share.processes > 1 else ""
-    with step(f"tokenise {len(sources)} dataset(s){mine}") as update:
-        for i, (spec, path) in enumerate(sources):
-            pace, note = Pace(), f"{spec.name} ({i + 1} of {len(sources)})"
-            manifest = tokenize_dataset(
-                spec, path, made_with, workspace.store, **settings, **how,
-                share=share, overwrite=may_replace("tokens", replace),
-                progress=lambda done, total, note=note, pace=pace: update(
-                    done, total, f"{note}{pace(done, total)}"
-                ),
-            )  # fmt: skip
-            if manifest is None:
-                unfinished.append(spec.name)
-    return unfinished
+
+    def make(i: int, wait: bool) -> bool:
+        (spec, path), pace = sources[i], Pace()
+        note = f"{spec.name} ({i + 1} of {len(sources)}{', the rest of it by other processes' if wait else ''})"
+        manifest = tokenize_dataset(
+            spec, path, made_with, workspace.store, **settings, **how,
+            overwrite=may_replace("tokens", replace), wait=wait,
+            progress=lambda done, total: update(done, total, f"{note}{pace(done, total)}"),
+        )  # fmt: skip
+        return manifest is not None
+
+    with step(f"tokenise {len(sources)} dataset(s)") as update:
+        for i in [i for i in range(len(sources)) if not make(i, wait=False)]:
+            make(i, wait=True)
 
 
 def _differences(

@@ -62,6 +62,14 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
     return Provenance(store.hash(names), manifest.hash(), identity, source_hash())
 
 
+def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
+    """Whether the windows that are there are those of the tokens that are there."""
+    from data_pipelines.tokens.store import TokenStore
+
+    there = _frozen(workspace, None)
+    return there is not None and there.store == TokenStore(workspace.store).hash(study.dataset_names())
+
+
 def require_judged(study: Study, workspace: Workspace) -> None:
     """Raises ConfigError if no dataset by which the datasets axis is judged has an evaluation window."""
     from data_pipelines.loading.evalset import EvalManifest

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 
-from data_pipelines.sim import generate, select
+from data_pipelines.sim import generate, packages, select
 from data_pipelines.sim.episode import Episode, StartState
 from data_pipelines.sim.record import encode_episode
 from data_pipelines.sim.worker import Job, facts_path, record_path
@@ -63,5 +63,5 @@ def fake_workers(monkeypatch) -> type[FakeProcess]:
     FakeProcess.made, FakeProcess.dies_at = [], None
     monkeypatch.setattr(generate.subprocess, "Popen", FakeProcess)
     monkeypatch.setattr(generate, "require_packages", lambda specs: None)
-    monkeypatch.setattr(generate.importlib.metadata, "version", lambda name: "1.0")
+    monkeypatch.setattr(packages.importlib.metadata, "version", lambda name: "1.0")
     return FakeProcess

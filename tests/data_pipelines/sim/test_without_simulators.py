@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.publishing.claims import claim
 from data_pipelines.sim import generate, packages, read_start, select
 from data_pipelines.sim.episode import StartState
 from data_pipelines.sim.record import encode_episode
@@ -28,7 +29,10 @@ def home(tmp_path):
     staging.mkdir(parents=True)
     for i in range(EPISODES):
         write_episode(staging, i)
-    write_dataset(SPEC, tmp_path, staging, episodes=EPISODES, size=SIZE, metadata={"fingerprint": "mark"})
+    with claim(staging.with_name(".1.0.0")) as held:
+        write_dataset(
+            SPEC, staging.parent, held, staging, episodes=EPISODES, size=SIZE, metadata={"fingerprint": "mark"}
+        )
     return tmp_path
 
 
@@ -155,6 +159,41 @@ def test_other_settings_remake_a_dataset(tmp_path, fake, monkeypatch):
     monkeypatch.setattr(generate, "GENERATOR", generate.GENERATOR + 1)
     run(tmp_path, episodes=13)
     assert len(fake.made) == 13
+
+
+@pytest.mark.parametrize("package", ["numpy", "dm-control", "gymnasium", "mujoco", "simplejpeg"])
+def test_the_fingerprint_follows_packages_beneath_the_robots_own(monkeypatch, package):
+    (spec,) = select(["ogbench_ur5e"])
+    versions = dict.fromkeys(package_names(), "1.0")
+    monkeypatch.setattr(packages.importlib.metadata, "version", lambda name: versions[name])
+    before = generate.fingerprint(spec, 10, SIZE, 0)
+    assert before == generate.fingerprint(spec, 10, SIZE, 0)
+    versions[package] = "1.1"
+    assert generate.fingerprint(spec, 10, SIZE, 0) != before
+
+
+def package_names() -> set[str]:
+    names = {*packages.MODULES, *packages.EVERYWHERE}
+    return names.union(*packages.TOGETHER.values(), *packages.BENEATH.values())
+
+
+def test_the_fingerprint_follows_the_library_that_draws(monkeypatch, fake):
+    marks = set()
+    for library in packages.GL:
+        monkeypatch.setenv("MUJOCO_GL", library)
+        marks.add(generate.fingerprint(SPEC, 10, SIZE, 0))
+    assert len(marks) == 2
+
+
+def test_a_dataset_that_another_process_makes_is_named_and_left_alone(tmp_path, fake):
+    theirs = tmp_path / "pusht" / ".1.0.0.episodes.theirs"
+    theirs.mkdir(parents=True)
+    refused = pytest.raises(ConfigError, match="pusht: process .* is making this dataset")
+    with claim(tmp_path / "pusht" / ".1.0.0"), refused:
+        run(tmp_path)
+    assert theirs.is_dir() and fake.made == []
+    run(tmp_path)  # nobody's now
+    assert sorted(p.name for p in (tmp_path / "pusht").iterdir()) == ["1.0.0", "stats.json"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -135,11 +138,32 @@ def test_a_dataset_appears_only_when_it_is_complete(tmp_path, monkeypatch):
         generate_suite(tmp_path, scale=TINY, names=NAMES[:1])
     assert contents(tmp_path) == {}
 
-    stale = tmp_path / NAMES[0] / ".1.0.0.incomplete.1"  # as kill -9 leaves it
+    stale = tmp_path / NAMES[0] / ".1.0.0.scratch.12345678"  # as kill -9 leaves it
     stale.mkdir(parents=True)
+    (tmp_path / NAMES[0] / ".1.0.0.lock").touch()
     monkeypatch.setattr(generate, "write_dataset", write)
     generate_suite(tmp_path, scale=TINY, names=NAMES[:1])
     assert [p.name for p in (tmp_path / NAMES[0]).iterdir()] == ["1.0.0"]
+
+
+def test_what_another_process_is_making_is_waited_for_and_not_made_again(tmp_path, monkeypatch):
+    began, name = threading.Event(), NAMES[0]
+    write, made = generate.write_dataset, []
+
+    def slowly(spec, directory, **kwargs):
+        began.set()
+        time.sleep(0.3)
+        assert directory.is_dir(), "its directory was removed while it was at work"
+        made.append(directory)
+        return write(spec, directory, **kwargs)
+
+    monkeypatch.setattr(generate, "write_dataset", slowly)
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(generate_suite, tmp_path, scale=TINY, names=[name])
+        assert began.wait(30)
+        second = pool.submit(generate_suite, tmp_path, scale=TINY, names=[name])
+        assert first.result() == second.result()
+    assert len(made) == 1 and [p.name for p in (tmp_path / name).iterdir()] == ["1.0.0"]
 
 
 def test_the_fingerprint_follows_everything_the_bytes_depend_on():

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import json
 import os
 import random
+import shutil
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.publishing.claims import claim
 from data_pipelines.tokens.dataset_writer import cut_parts
 from data_pipelines.tokens.moments import Moments, merge_all
-from data_pipelines.tokens.scratch import scratch
-from data_pipelines.tokens.share import Share
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import write_rlds
@@ -38,7 +39,7 @@ def undisturbed(rlds, tmp_path_factory):
 
 
 def work_directory(store: Path) -> Path:
-    (work,) = [p for p in store.iterdir() if p.name.startswith(".toy.") and not p.name.endswith(".aside")]
+    (work,) = [p for p in store.iterdir() if p.name.startswith(".toy.") and not p.name.endswith(".claims")]
     return work
 
 
@@ -66,8 +67,7 @@ def test_killed_again_and_again_it_ends_with_the_same_bytes(rlds, undisturbed, t
 
 
 def test_finished_parts_are_not_made_again(rlds, tmp_path):
-    with pytest.raises(RuntimeError, match="enough"):
-        run(rlds, tmp_path, progress=stop_after(10))
+    begin(rlds, tmp_path)
     parts = {p: p.stat().st_mtime_ns for p in work_directory(tmp_path).glob("*.array_record")}
     assert len(parts) >= 3
     first = []
@@ -76,6 +76,17 @@ def test_finished_parts_are_not_made_again(rlds, tmp_path):
     assert {tmp_path / "toy" / p.name: t for p, t in parts.items()}.items() <= {
         p: p.stat().st_mtime_ns for p in (tmp_path / "toy").iterdir()
     }.items()
+
+
+def begin(rlds: Path, store: Path, **options) -> Path:
+    """The work directory of a job that ended early."""
+    with pytest.raises(RuntimeError, match="enough"):
+        run(rlds, store, progress=stop_after(10), **options)
+    return work_directory(store)
+
+
+def claims_of(work: Path) -> Path:
+    return work.with_name(f"{work.name}.claims")
 
 
 def stop_after(episodes: int):
@@ -88,9 +99,7 @@ def stop_after(episodes: int):
 
 @pytest.mark.parametrize("damage", ["truncated", "missing", "facts", "other facts"])
 def test_damaged_part_is_made_again(rlds, undisturbed, tmp_path, damage):
-    with pytest.raises(RuntimeError, match="enough"):
-        run(rlds, tmp_path, progress=stop_after(10))
-    work = work_directory(tmp_path)
+    work = begin(rlds, tmp_path)
     record, facts = sorted(work.glob("train-*"))[1], sorted(work.glob("parts/*.json"))
     if damage == "truncated":
         record.write_bytes(record.read_bytes()[:-1])
@@ -104,63 +113,91 @@ def test_damaged_part_is_made_again(rlds, undisturbed, tmp_path, damage):
     assert contents(tmp_path) == undisturbed
 
 
-def test_what_a_dead_process_left_aside_is_removed_and_a_living_one_keeps_it(tmp_path):
-    process = multiprocessing.get_context("forkserver").Process(target=hold, args=(tmp_path,))
-    process.start()
-    while not list(tmp_path.glob("*/held")):
-        time.sleep(0.01)
-    with scratch(tmp_path):
-        assert len(list(tmp_path.glob("*/held"))) == 1
-    os.kill(process.pid, signal.SIGKILL)
-    process.join()
-    with scratch(tmp_path) as mine:
-        assert [p for p in tmp_path.iterdir() if p.is_dir()] == [mine]
-    assert list(tmp_path.iterdir()) == []
-
-
-def hold(root: Path) -> None:
-    with scratch(root) as mine:
-        (mine / "held").touch()
-        time.sleep(60)
-
-
 def test_publishing_is_cleaned_up_after(rlds, undisturbed, tmp_path):
     """As if the process had been killed between its last two steps."""
+    work = begin(rlds, tmp_path)
     run(rlds, tmp_path)
-    assert run(rlds, tmp_path / "other", share=Share(0, 2)) is None
-    aside = tmp_path / f"{work_directory(tmp_path / 'other').name}.aside"
-    aside.mkdir()
-    (aside / "rest").touch()
+    (work / "parts").mkdir(parents=True)
+    rest = claims_of(work) / "00000.scratch.12345678"
+    rest.mkdir(parents=True)
+    (rest / "rest").touch()
     assert run(rlds, tmp_path) is not None
-    assert {k: v for k, v in contents(tmp_path).items() if not k.startswith("other")} == undisturbed
+    assert contents(tmp_path) == undisturbed and list(tmp_path.iterdir()) == [tmp_path / "toy"]
 
 
 # --- several processes -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("processes", [2, 3, 40])
-def test_any_number_of_processes_makes_the_same_store(rlds, undisturbed, tmp_path, processes):
-    results = [run(rlds, tmp_path, share=Share(i, processes)) for i in range(processes)]
-    manifests = [m for m in results if m is not None]
-    assert manifests and results[0] is None  # some process is the last to have had anything to do
+@pytest.mark.parametrize("processes", [2, 4])
+def test_processes_at_the_same_time_make_the_same_store(rlds, undisturbed, tmp_path, processes):
+    started = [start(rlds, tmp_path) for _ in range(processes)]
+    assert [(p.join(), p.exitcode)[1] for p in started] == [0] * processes
     assert contents(tmp_path) == undisturbed
 
 
-def test_processes_at_the_same_time_make_the_same_store(rlds, undisturbed, tmp_path):
-    started = [start(rlds, tmp_path, share=Share(i, 2)) for i in range(2)]
-    assert [(p.join(), p.exitcode)[1] for p in started] == [0, 0]
+def test_a_part_that_another_process_makes_is_left_to_it_and_waited_for(rlds, undisturbed, tmp_path):
+    work = begin(rlds, tmp_path)
+    (number, *_) = [i for i in range(len(undisturbed)) if not (work / f"parts/{i:05d}.json").exists()]
+    with ThreadPoolExecutor(1) as pool:
+        with claim(claims_of(work) / f"{number:05d}"):
+            assert run(rlds, tmp_path, wait=False) is None
+            parts = {p.name for p in (work / "parts").iterdir()}
+            assert f"{number:05d}.json" not in parts and len(parts) >= 8
+            waiting = pool.submit(run, rlds, tmp_path)
+            time.sleep(0.5)
+            assert not waiting.done()
+        assert waiting.result(30) is not None  # as if the other process had died: its part is made here
     assert contents(tmp_path) == undisturbed
 
 
-def test_two_that_do_the_same_by_accident_do_no_harm(rlds, undisturbed, tmp_path):
-    started = [start(rlds, tmp_path) for _ in range(3)]
-    assert [(p.join(), p.exitcode)[1] for p in started] == [0, 0, 0]
+def test_the_part_of_a_dead_process_is_made_again_and_what_it_left_removed(rlds, undisturbed, tmp_path):
+    process = start(rlds, tmp_path)
+    while not list(tmp_path.glob(".toy.*.claims/*.scratch.*")):
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    run(rlds, tmp_path)
+    assert contents(tmp_path) == undisturbed and list(tmp_path.iterdir()) == [tmp_path / "toy"]
+
+
+def test_the_part_of_another_host_is_left_to_it_until_its_lease_expires(rlds, undisturbed, tmp_path):
+    """Where the file system does not show the locks of other hosts."""
+    work = begin(rlds, tmp_path)
+    lock = claims_of(work) / "00007.lock"
+    lock.parent.mkdir(exist_ok=True)
+    other = {"process": 7, "host": "other", "since": "then", "machine": "other", "token": "x"}
+    lock.write_text(json.dumps(other))
+    assert run(rlds, tmp_path, wait=False) is None
+    assert json.loads(lock.read_text()) == other and not (work / "parts/00007.json").exists()
+    os.utime(lock, (0, 0))
+    assert run(rlds, tmp_path, wait=False) is not None
     assert contents(tmp_path) == undisturbed
+
+
+def test_a_process_whose_part_was_taken_over_goes_on(rlds, undisturbed, tmp_path):
+    """It was stopped for longer than its lease; another host has removed its directory and claimed the part."""
+    taken = []
+
+    def take_over(done: int, total: int) -> None:
+        if done >= 5 and not taken:
+            (scratch,) = tmp_path.glob(".toy.*.claims/*.scratch.*")
+            shutil.rmtree(scratch)
+            lock = scratch.with_name(f"{scratch.name.split('.')[0]}.lock")
+            taken.append(lock.read_text())
+            lock.unlink()
+
+    run(rlds, tmp_path, progress=take_over)
+    assert taken and contents(tmp_path) == undisturbed
+
+
+def test_there_is_no_bound_on_the_number_of_parts():
+    assert len(cut_parts([10] * 5000, part_size=10)) == 5000
 
 
 def test_jobs_of_different_settings_do_not_mix(rlds, tmp_path):
-    run(rlds, tmp_path, share=Share(0, 2))
-    run(rlds, tmp_path, share=Share(1, 2), keep_frames="all")
+    begin(rlds, tmp_path)
+    with pytest.raises(RuntimeError, match="enough"):
+        run(rlds, tmp_path, progress=stop_after(10), keep_frames="all")
     assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == []
     run(rlds, tmp_path)
     with pytest.raises(ConfigError, match="already tokenised in another way.*keep_frames"):
@@ -168,8 +205,12 @@ def test_jobs_of_different_settings_do_not_mix(rlds, tmp_path):
 
 
 def test_overwriting_removes_what_was_made_otherwise(rlds, undisturbed, tmp_path):
-    run(rlds, tmp_path, share=Share(0, 2), keep_frames="none")
+    work = begin(rlds, tmp_path, keep_frames="none")
     run(rlds, tmp_path, keep_frames="all")
+    with claim(claims_of(work) / "00007"):  # by a process that is alive
+        with pytest.raises(ConfigError, match="toy: process .* is making this dataset in another way"):
+            run(rlds, tmp_path, overwrite=True)
+        assert work.is_dir()
     run(rlds, tmp_path, overwrite=True)
     assert contents(tmp_path) == undisturbed
     (tmp_path / "toy/manifest.json").write_text('{"format": 1}')
@@ -199,18 +240,47 @@ def test_failing_episode_is_left_out_whole_and_its_part_is_complete(rlds, undist
         assert (item.tokens == episode * 256 + np.arange(0, LENGTHS[episode], 2)[:, None]).all()
 
 
-def test_losses_of_all_parts_count_against_the_bound(tmp_path):
+@pytest.fixture
+def lossy(tmp_path):
     def spoil(episode, features):
         if episode % 6 == 0:
             features["steps/action"][0] = np.nan
 
-    bad = write_rlds(tmp_path / "rlds", SPEC, LENGTHS, change=spoil)
-    shared = dict(corrupt="skip", max_skipped=3)
-    run(bad, tmp_path / "a", share=Share(0, 2), **shared)
-    with pytest.raises(DataError, match="4 episodes are unusable, more than max_skipped=3"):
-        run(bad, tmp_path / "a", share=Share(1, 2), **shared)
+    return write_rlds(tmp_path / "rlds", SPEC, LENGTHS, change=spoil)  # 4 of 24
+
+
+def test_losses_of_all_processes_count_against_the_bound(lossy, tmp_path):
+    shared = dict(corrupt="skip", max_skipped=2)
+    with pytest.raises(RuntimeError, match="enough"):  # two episodes are lost by then
+        run(lossy, tmp_path / "a", progress=stop_after(11), **shared)
+    with pytest.raises(DataError, match="3 episodes are unusable, more than max_skipped=2.*episode 12 "):
+        run(lossy, tmp_path / "a", **shared)
+    assert len(kept_parts(tmp_path / "a")) <= 7, "it went on to the end before it said so"
     with pytest.raises(EpisodeError, match="not finite"):  # parts with losses are no longer good enough
-        run(bad, tmp_path / "a")
+        run(lossy, tmp_path / "a")
+    assert run(lossy, tmp_path / "a", corrupt="skip", max_skipped=4).lost == 4
+
+
+def test_losses_of_a_process_at_the_same_time_are_seen_before_the_end(lossy, tmp_path):
+    """Another process loses two episodes in parts that this one has passed, then this one a third."""
+    shared, others = dict(corrupt="skip", max_skipped=2), []
+
+    def other(done: int, total: int) -> None:
+        if done >= 1 and not others:
+            others.append(True)
+            with pytest.raises(RuntimeError, match="enough"):
+                run(lossy, tmp_path / "a", progress=stop_after(11), **shared)
+
+    with pytest.raises(DataError, match="3 episodes are unusable"):
+        run(lossy, tmp_path / "a", progress=other, **shared)
+    assert len(kept_parts(tmp_path / "a")) <= 7
+
+
+def test_episodes_lost_by_several_processes_are_listed_once(lossy, tmp_path):
+    run(lossy, tmp_path / "alone", corrupt="skip", max_skipped=4)
+    started = [start(lossy, tmp_path / "many", corrupt="skip", max_skipped=4) for _ in range(3)]
+    assert [(p.join(), p.exitcode)[1] for p in started] == [0, 0, 0]
+    assert contents(tmp_path / "many") == contents(tmp_path / "alone")
 
 
 # --- pieces ------------------------------------------------------------------------------------
@@ -218,9 +288,9 @@ def test_losses_of_all_parts_count_against_the_bound(tmp_path):
 
 @pytest.mark.parametrize("sizes", [[5], [1] * 100, [50, 1, 1, 1, 50], [0, 0, 7]])
 def test_parts_cover_the_source_in_order(sizes):
-    parts = cut_parts(sizes, part_size=10, most=8)
+    parts = cut_parts(sizes, part_size=10)
     assert [i for p in parts for i in p.episodes] == list(range(len(sizes)))
-    assert len(parts) <= 9 and all(p.count == len(parts) and len(p.episodes) for p in parts)
+    assert all(p.count == len(parts) and len(p.episodes) for p in parts)
 
 
 def test_moments_of_pieces_are_those_of_the_whole():

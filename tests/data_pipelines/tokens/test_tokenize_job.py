@@ -154,7 +154,7 @@ def test_unwritable_directory_is_one_clear_message(tmp_path, rlds):
 
 
 def test_full_disk_is_one_clear_message_and_leaves_nothing(tmp_path, rlds, monkeypatch):
-    from data_pipelines.tokens import part
+    from data_pipelines.tokens import part_files
 
     class Full:
         def __init__(self, path, options):
@@ -166,7 +166,7 @@ def test_full_disk_is_one_clear_message_and_leaves_nothing(tmp_path, rlds, monke
         def close(self):  # what ArrayRecord does when the disk is full
             raise RuntimeError("write() failed: No space left on device")
 
-    monkeypatch.setattr(part.array_record_module, "ArrayRecordWriter", Full)
+    monkeypatch.setattr(part_files.array_record_module, "ArrayRecordWriter", Full)
     with pytest.raises(ConfigError, match="cannot be written there .*No space left"):
         tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     assert visible(tmp_path / "store") == []
@@ -193,6 +193,8 @@ def test_unusable_episode_stops_the_job_or_is_skipped_and_recorded(tmp_path):
     assert sorted((*manifest.train.episodes, *manifest.val.episodes)) == [1, 2, 3, 4]
     (loss,) = manifest.skipped
     assert (loss.file, loss.offset, loss.episodes) == ("toy-train.tfrecord-00000-of-00001", 0, 1)
+    stored = json.loads((tmp_path / "store/toy/manifest.json").read_text())["skipped"]
+    assert [sorted(entry) for entry in stored] == [["episodes", "file", "offset", "reason"]]  # as of earlier versions
     assert "episode 0" in loss.reason and str(tmp_path) not in loss.reason
     assert load_manifest(tmp_path / "store/toy/manifest.json") == manifest
 

@@ -21,8 +21,9 @@ from pathlib import Path
 
 from array_record.python import array_record_module
 
+from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
-from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
+from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, part_name
 from data_pipelines.tokens.moments import Moments, merge_all
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
@@ -30,8 +31,8 @@ from hma_jax.config.json import from_dict, to_dict
 FACTS = "parts"
 """Directory of the facts of all parts."""
 
-Made = tuple[str, StoredEpisode] | Loss
-"""What a part is made of: episodes with their split, and what could not be used."""
+PartItem = tuple[str, StoredEpisode] | LostEpisodes
+"""One of what a part is made of: an episode with its split, or what could not be used."""
 
 
 @dataclass(frozen=True)
@@ -64,25 +65,25 @@ class PartFacts:
     train: PartSplit
     val: PartSplit
     moments: Moments  # of the native actions of the train split
-    lost: tuple[Loss, ...]
+    lost: tuple[LostEpisodes, ...]
 
 
 def write_part(
-    directory: Path, part: Part, made: Iterable[Made], aside: Path, action_dim: int, keep_frames: set[str]
+    directory: Path, part: Part, items: Iterable[PartItem], scratch: Path, action_dim: int, keep_frames: set[str]
 ) -> PartFacts:
-    """Writes `made` as the part of the dataset in `directory`, by way of the directory `aside`.
+    """Writes `items` as the part of the dataset in `directory`, by way of the directory `scratch`.
 
     A part is there as a whole or not at all; one that is there is replaced. `keep_frames`:
     splits whose records hold frames. Raises OSError.
     """
     writers = {
-        split: _SplitWriter(aside / part_name(split, part.number, part.count), split in keep_frames)
+        split: _SplitWriter(scratch / part_name(split, part.number, part.count), split in keep_frames)
         for split in SPLITS
     }
-    lost: list[Loss] = []
+    lost: list[LostEpisodes] = []
     moments = []
-    for item in made:
-        if isinstance(item, Loss):
+    for item in items:
+        if isinstance(item, LostEpisodes):
             lost.append(item)
             continue
         split, episode = item
@@ -91,17 +92,18 @@ def write_part(
         writers[split].add(episode)
     splits = [writers[split].close() for split in SPLITS]
     facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost))
-    facts_aside = aside / "facts.json"
-    facts_aside.write_text(json.dumps(to_dict(facts)))
-    sync(facts_aside)
+    new_facts = scratch / "facts.json"
+    new_facts.write_text(json.dumps(to_dict(facts)))
+    sync(new_facts)
     for split, values in zip(SPLITS, splits, strict=True):
         place = directory / part_name(split, part.number, part.count)
         if values.size:
-            os.replace(aside / place.name, place)
+            os.replace(scratch / place.name, place)
         else:
             place.unlink(missing_ok=True)
-    os.replace(facts_aside, _facts_path(directory, part))
     sync(directory)
+    os.replace(new_facts, _facts_path(directory, part))
+    sync(directory / FACTS)
     return facts
 
 
@@ -120,15 +122,6 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
         if size != getattr(facts, split).size:
             return None
     return facts if facts.part == part else None
-
-
-def sync(path: Path) -> None:
-    """What was written to `path` survives a loss of power."""
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def _facts_path(directory: Path, part: Part) -> Path:

@@ -1,0 +1,205 @@
+"""Exclusive locks on files, which end with their process however it ends.
+
+One primitive for everything that only one process may do: training in a run directory, working in a study's
+directory, making one dataset or one part of it (`data_pipelines.publishing`).
+
+What is promised depends on the file system, which carries flock or does not:
+
+* A local disk, or a shared one that carries flock between hosts (NFS 4, NFS 3 with its lock service, Lustre
+  mounted with the option flock): one holder at a time; a process that dies by SIGKILL or power loss holds nothing.
+* A shared disk that carries it within a host only (NFS with the options nolock or local_lock, Lustre with the
+  option localflock): one holder on each host. With a *lease*, one holder on all hosts, except that two which ask
+  within the same moment may both get it, and that a lock of a host that died is free after EXPIRES seconds.
+* One that does not take flock at all: a warning; with a lease, as between hosts.
+
+A lease is the lock file's time of change, which its holder renews. It is compared with the file system's own
+clock, so the hosts' clocks need not agree. A holder that was stopped for longer than EXPIRES may lose its lease
+to another host and finds out by `Lock.lost`: what a lease protects must be harmless when done twice.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+
+from hma_jax.config import ConfigError
+
+RENEWED_EVERY = 30.0
+"""Seconds between two renewals of a lease."""
+
+EXPIRES = 300.0
+"""Seconds without renewal after which a lease of another machine is over."""
+
+TAKEN = (errno.EAGAIN, errno.EACCES)
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who holds a lock, as its file says."""
+
+    process: int
+    host: str
+    since: str
+    machine: str = ""  # whose locks this process's are: equal for all containers of a host
+    token: str = ""  # of this one holding
+    locked: bool = True  # whether the file system took the lock
+
+    def __str__(self) -> str:
+        return f"process {self.process} on {self.host}, since {self.since}"
+
+
+class Held(ConfigError):
+    """Another process holds the lock. `holder` is None if it has not written its name yet."""
+
+    def __init__(self, message: str, holder: Holder | None = None):
+        super().__init__(message)
+        self.holder = holder
+
+    @property
+    def who(self) -> str:
+        return str(self.holder or "another process")
+
+
+@dataclass(frozen=True)
+class Lock:
+    """A lock that is held."""
+
+    path: Path
+    holder: Holder
+
+    def lost(self) -> bool:
+        """Whether it is another's by now, or gone: possible with a lease only, or if files are removed."""
+        return _read_holder(self.path) != self.holder
+
+
+@contextmanager
+def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Iterator[Lock]:
+    """Holds the lock file `path`, which is made if it is missing.
+
+    `lease`: holds it against other machines too where the file system does not (see above). `remove`: the file
+    goes when the lock is given back. Raises Held at once if another process, or another thread, has it, and
+    OSError if the file cannot be written.
+    """
+    fd, locked = _open(path, lease)
+    try:
+        if not locked and not lease:
+            log.warning("%s cannot be locked there; see that no other process works beside it", path)
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        lock = Lock(
+            path, Holder(os.getpid(), socket.gethostname(), since, machine(), secrets.token_hex(8), locked)
+        )
+        os.ftruncate(fd, 0)
+        os.pwrite(fd, json.dumps(asdict(lock.holder)).encode(), 0)
+        if lease:
+            os.fsync(fd)  # other hosts see it
+        try:
+            with _renewed(fd) if lease else nullcontext():
+                yield lock
+        finally:
+            if not lock.lost():
+                if remove:
+                    path.unlink(missing_ok=True)
+                else:
+                    os.ftruncate(fd, 0)
+    finally:
+        os.close(fd)
+
+
+@cache
+def machine() -> str:
+    """Names the kernel that keeps this process's locks, since it was booted."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:  # not Linux
+        return socket.gethostname()
+
+
+def _open(path: Path, lease: bool) -> tuple[int, bool]:
+    """The open and locked file, and whether the file system took the lock. Raises Held, OSError."""
+    while True:
+        fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            locked = _flock(fd)
+            holder = _read_holder(path)
+            if locked is None or lease and _leased(path, holder, locked):
+                held = Held(f"{path} is held by {holder or 'another process'}; wait for it or stop it", holder)
+                raise held
+            # Whoever held it may have removed the file after it was opened here.
+            if _same_file(fd, path):
+                kept, fd = fd, -1
+                return kept, locked
+        finally:
+            if fd >= 0:
+                os.close(fd)
+
+
+def _flock(fd: int) -> bool | None:
+    """True: locked; None: another holds it; False: the file system takes no locks."""
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return True
+    except OSError as error:
+        return None if error.errno in TAKEN else False
+
+
+def _leased(path: Path, holder: Holder | None, locked: bool) -> bool:
+    """Whether a lock that this kernel gave belongs to a machine whose locks it may not know of."""
+    if holder is None or (locked and holder.locked and holder.machine == machine()):
+        return False
+    now = path.with_name(f"{path.name}.{secrets.token_hex(4)}.now")
+    try:
+        now.touch(exist_ok=False)
+        return now.stat().st_mtime - path.stat().st_mtime < EXPIRES
+    except FileNotFoundError:  # given back meanwhile, or all of it is removed
+        return False
+    finally:
+        now.unlink(missing_ok=True)
+
+
+def _same_file(fd: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(fd), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def _read_holder(path: Path) -> Holder | None:
+    try:
+        return Holder(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):  # gone, given back, or its holder has not written its name yet
+        return None
+
+
+@contextmanager
+def _renewed(fd: int) -> Iterator[None]:
+    """Renews the lease while the block runs."""
+    ended = threading.Event()
+
+    def renew() -> None:
+        while not ended.wait(RENEWED_EVERY):
+            try:
+                os.utime(fd)
+            except OSError as error:  # a shared disk that does not answer for a while
+                log.warning("a lock cannot be renewed (%s); trying again", error.strerror)
+
+    thread = threading.Thread(target=renew, name="renew lock", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

@@ -1,0 +1,94 @@
+"""The scheme that tokens, conversions, the suite and the simulators share."""
+
+from __future__ import annotations
+
+import multiprocessing
+import time
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.publishing import files
+from data_pipelines.publishing.claims import claim, living_claim
+from data_pipelines.publishing.files import publish, write_file
+from data_pipelines.publishing.journal import Journal
+from data_pipelines.publishing.marks import is_complete
+from hma_jax.runtime.locks import Held
+
+
+def hold(place: Path, ready) -> None:
+    with claim(place) as held:
+        (held.scratch / "half").touch()
+        ready.set()
+        time.sleep(60)
+
+
+def test_scratch_of_the_living_is_kept_and_that_of_the_dead_removed(tmp_path):
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    process = context.Process(target=hold, args=(tmp_path / "thing", ready))
+    process.start()
+    assert ready.wait(60)
+    with pytest.raises(Held, match=f"process {process.pid}"), claim(tmp_path / "thing"):
+        pass
+    with claim(tmp_path / "other"):  # of something else: nobody's business
+        assert len(list(tmp_path.glob("thing.scratch.*/half"))) == 1
+    assert living_claim(tmp_path).holder.process == process.pid
+    process.kill()
+    process.join()
+    assert living_claim(tmp_path) is None
+    with claim(tmp_path / "thing") as held:
+        mine = held.scratch
+        assert [p for p in tmp_path.iterdir() if p.is_dir()] == [mine]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_directory_takes_the_place_of_another_and_leaves_nothing(tmp_path):
+    (tmp_path / "1.0.0" / "old").mkdir(parents=True)
+    (tmp_path / ".1.0.0.removed" / "older").mkdir(parents=True)  # of a process that died while it removed
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "new").touch()
+    publish(tmp_path / "made", tmp_path / "1.0.0")
+    assert [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*")] == ["1.0.0", "1.0.0/new"]
+
+
+def test_everything_is_forced_to_the_disk_before_it_is_seen(tmp_path, monkeypatch):
+    done, sync, rename = [], files.sync, files.os.rename
+    monkeypatch.setattr(files, "sync", lambda path: (done.append(Path(path).name), sync(path)))
+    monkeypatch.setattr(files.os, "rename", lambda a, b: (done.append("rename"), rename(a, b)))
+    (tmp_path / "made" / "inner").mkdir(parents=True)
+    (tmp_path / "made" / "inner" / "file").touch()
+    publish(tmp_path / "made", tmp_path / "final")
+    assert done == ["made", "file", "inner", "rename", tmp_path.name]
+
+
+def test_a_file_is_whole_or_as_it_was(tmp_path, monkeypatch):
+    write_file(tmp_path / "file", "old")
+
+    def fail(fd):
+        raise OSError("no space")
+
+    with monkeypatch.context() as full:
+        full.setattr(files.os, "fsync", fail)
+        with pytest.raises(OSError, match="no space"):
+            write_file(tmp_path / "file", "new")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["old"]
+    write_file(tmp_path / "file", b"new")
+    assert (tmp_path / "file").read_bytes() == b"new"
+
+
+def test_a_line_of_a_journal_that_a_crash_cut_off_does_not_count(tmp_path):
+    journal = Journal(tmp_path / "journal.jsonl")
+    assert journal.read() == []
+    for i in range(3):
+        journal.append({"step": i})
+    journal.path.write_bytes(journal.path.read_bytes()[:-4])
+    assert journal.read() == [{"step": 0}, {"step": 1}]
+    journal.append({"step": 5})
+    assert journal.read() == [{"step": 0}, {"step": 1}, {"step": 5}]
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"fingerprint": "other"}'])
+def test_what_says_nothing_of_itself_is_not_complete(tmp_path, text):
+    (tmp_path / "metadata.json").write_text(text)
+    assert not is_complete(tmp_path, "mark")

@@ -1,0 +1,164 @@
+"""`hma tokenize` in several processes, and on data in a remote store."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.publishing.claims import claim
+from data_pipelines.tokens import part_maker
+from experiments.cli.main import main
+from experiments.preparing import sources
+from experiments.progress import Pace
+from experiments.setting import Where, make_setting
+from experiments.workspace import Workspace
+from tests.data_pipelines.fakes import write_rlds
+from tests.data_pipelines.tokens.job_process import contents
+from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    root = tmp_path_factory.mktemp("rlds")
+    return ["--data", *(str(write_rlds(root, spec, LENGTHS)) for spec in (ARM, BASE))]
+
+
+@pytest.fixture(scope="module")
+def tokenizer(data, tmp_path_factory):
+    out = tmp_path_factory.mktemp("tokenizer")
+    assert main(["tokenizer", "train", *SMOKE, "--out", str(out), *data]) == 0
+    return ["--tokenizer", str(out / "tokenizer")]
+
+
+@pytest.fixture(scope="module")
+def whole(data, tokenizer, tmp_path_factory):
+    """What one process makes."""
+    out = tmp_path_factory.mktemp("whole")
+    assert main(["tokenize", *SMOKE, "--out", str(out), *data, *tokenizer, "--batch", "3", "--threads", "1"]) == 0
+    return made(out)
+
+
+def made(out: Path) -> dict[str, bytes]:
+    files = ("eval_manifest.json", "data.json")
+    return contents(out / "tokens") | {name: (out / name).read_bytes() for name in files}
+
+
+@pytest.mark.slow
+def test_two_processes_at_the_same_time_make_one_store_and_its_windows(data, tokenizer, whole, tmp_path):
+    command = [sys.executable, "-m", "experiments.cli", "tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
+    started = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    said = [process.communicate(timeout=300)[0] for process in started]
+    assert [process.returncode for process in started] == [0, 0], said
+    assert made(tmp_path) == whole
+    assert all("eval_manifest.json" in text and "held out" in text for text in said)
+
+
+def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does(
+    data, tokenizer, whole, tmp_path, monkeypatch, capsys
+):
+    """The last part of one dataset is another process's, which dies; so does the one that held the directory."""
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
+    monkeypatch.setattr(part_maker, "write_part", lambda *_: stop())
+    with pytest.raises(Stopped):
+        main(arguments)  # it had come to its first part
+    monkeypatch.undo()
+    (work,) = (tmp_path / "tokens").glob(f".{ARM.name}.????????????")
+    part, holder = ExitStack(), ExitStack()
+    part.enter_context(claim(work.with_name(f"{work.name}.claims") / "00000"))
+    holder.enter_context(Workspace(tmp_path).claimed())
+    with ThreadPoolExecutor(1) as pool:
+        joined = pool.submit(main, arguments)
+        until = time.monotonic() + 60
+        while not (tmp_path / "tokens" / BASE.name).exists():  # it goes on with what is free
+            assert time.monotonic() < until and not joined.done()
+            time.sleep(0.01)
+        time.sleep(0.5)
+        assert not joined.done() and not (tmp_path / "tokens" / ARM.name).exists()
+        part.close()
+        while not (tmp_path / "tokens" / ARM.name).exists():  # now it makes that part
+            assert time.monotonic() < until and not joined.done()
+            time.sleep(0.01)
+        time.sleep(0.5)
+        assert not joined.done() and not (tmp_path / "eval_manifest.json").exists()  # the holder may do it
+        holder.close()
+        assert joined.result(60) == 0
+    assert made(tmp_path) == whole
+    assert "taking part: process" in capsys.readouterr().out
+
+
+def test_who_joins_leaves_the_windows_to_a_living_holder_that_has_frozen_them(data, tokenizer, tmp_path):
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
+    assert main(arguments) == 0
+    before = (tmp_path / "eval_manifest.json").stat().st_mtime_ns
+    with Workspace(tmp_path).claimed():
+        assert main(arguments) == 0
+    assert (tmp_path / "eval_manifest.json").stat().st_mtime_ns == before
+
+
+def test_who_joins_needs_a_tokenizer_and_replaces_nothing(data, tokenizer, tmp_path, capsys):
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data]
+    with Workspace(tmp_path).claimed():
+        assert main(arguments) == 2
+        message = capsys.readouterr().err
+        assert "no tokenizer yet, and another command is at work" in message
+        assert f"hma tokenizer train --preset smoke --out {tmp_path} --data {data[1]} {data[2]}" in message
+        assert main([*arguments, *tokenizer, "--replace", "tokens"]) == 2
+        assert "--replace needs the directory for itself" in capsys.readouterr().err
+    assert not (tmp_path / "tokens").exists()
+
+
+class Stopped(Exception):
+    pass
+
+
+def stop():
+    raise Stopped
+
+
+def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
+    UPath = pytest.importorskip("upath").UPath
+    root = UPath("memory://bucket") / ARM.name
+    try:
+        for path in Path(data[1]).iterdir():
+            copy = root / "1.0.0" / path.name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(path.read_bytes())
+        setting = make_setting(Where("smoke", tmp_path, (str(root),)))
+        assert setting.data == (f"memory://bucket/{ARM.name}",)
+        ((spec, directory),) = sources.find_sources(setting.study, setting.data)
+        assert spec == ARM and directory == root
+        assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), "--data", str(root)]) == 0
+        assert f"--data memory://bucket/{ARM.name}" in capsys.readouterr().out.replace("\n", " ")
+        assert json.loads((tmp_path / "out/data.json").read_text())[ARM.name]["episodes"] == 4
+    finally:
+        root.fs.rm("/bucket", recursive=True)
+
+
+def test_store_of_an_older_format_is_made_again_when_asked_for(data, tmp_path, capsys):
+    arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data[:2]]
+    assert main(arguments) == 0
+    before = contents(tmp_path / "tokens")
+    manifest = tmp_path / "tokens" / ARM.name / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"format": 1}))
+    capsys.readouterr()
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert "manifest format 1; this reads 2" in said and "--replace tokens" in said
+    assert main([*arguments, "--replace", "tokens"]) == 0
+    assert contents(tmp_path / "tokens") == before
+
+
+def test_time_left_does_not_count_what_was_there_before():
+    now = [0.0]
+    pace = Pace(lambda: now[0])
+    assert pace(90, 100) == ""
+    now[0] = 10.0
+    assert pace(91, 100) == ", 1 min 30 s left"
+    assert pace(100, 100) == ""

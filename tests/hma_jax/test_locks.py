@@ -1,0 +1,120 @@
+"""Locks on files: one holder, free when it dies, and leases between machines that see no lock of each other."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from hma_jax.config import ConfigError
+from hma_jax.runtime import locks
+from hma_jax.runtime.locks import Held, Holder, exclusive
+
+
+def hold(path: Path, ready) -> None:
+    with exclusive(path, lease=True, remove=True):
+        ready.set()
+        time.sleep(60)
+
+
+def test_the_holder_is_named_and_its_death_frees_the_lock(tmp_path: Path):
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    holder = context.Process(target=hold, args=(tmp_path / "lock", ready))
+    holder.start()
+    assert ready.wait(60)
+    with pytest.raises(Held, match=f"held by process {holder.pid} on ") as held, exclusive(tmp_path / "lock"):
+        pass
+    assert held.value.holder.process == holder.pid and isinstance(held.value, ConfigError)
+    holder.kill()
+    holder.join()
+    with exclusive(tmp_path / "lock", lease=True, remove=True) as lock:  # at once: this machine knows that it died
+        assert lock.holder.process == os.getpid() and not lock.lost()
+    assert not list(tmp_path.iterdir())
+
+
+def test_threads_exclude_each_other_too(tmp_path: Path):
+    inside, most = [], []
+
+    def work(_: int) -> None:
+        while True:
+            try:
+                with exclusive(tmp_path / "lock", lease=True, remove=True):
+                    inside.append(1)
+                    most.append(len(inside))
+                    time.sleep(0.001)
+                    inside.pop()
+                return
+            except Held:
+                time.sleep(0.0005)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, range(64)))
+    assert most == [1] * 64 and not list(tmp_path.iterdir())
+
+
+def leave(path: Path, age: float, **facts) -> None:
+    """The file of a holder whose lock the file system does not show here."""
+    holder = {"process": 7, "host": "other", "since": "then", "machine": "other", "token": "x", "locked": True}
+    path.write_text(json.dumps(holder | facts))
+    now = path.stat().st_mtime
+    os.utime(path, (now - age, now - age))
+
+
+def test_a_lease_of_another_machine_holds_until_it_expires(tmp_path: Path):
+    path = tmp_path / "lock"
+    leave(path, age=locks.EXPIRES - 5)
+    with pytest.raises(Held, match="process 7 on other"), exclusive(path, lease=True):
+        pass
+    with exclusive(path):  # no lease asked for: only the lock counts
+        pass
+    leave(path, age=locks.EXPIRES + 5)
+    with exclusive(path, lease=True) as lock:
+        assert not lock.lost()
+    assert [p.name for p in tmp_path.iterdir()] == ["lock"]
+
+
+def test_a_lock_of_this_machine_needs_no_expiry(tmp_path: Path):
+    leave(tmp_path / "lock", age=0, machine=locks.machine())
+    with exclusive(tmp_path / "lock", lease=True):
+        pass
+
+
+def test_where_no_lock_is_taken_a_lease_still_excludes(tmp_path: Path, monkeypatch, caplog):
+    def refuse(fd, operation):
+        raise OSError(95, "not supported")
+
+    monkeypatch.setattr(locks.fcntl, "flock", refuse)
+    path = tmp_path / "lock"
+    with exclusive(path, lease=True), pytest.raises(Held), exclusive(path, lease=True):
+        pass
+    assert not caplog.records
+    with exclusive(path):
+        assert "cannot be locked" in caplog.text
+
+
+def test_a_lease_is_renewed_while_it_is_held_and_given_back_at_the_end(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(locks, "RENEWED_EVERY", 0.01)
+    path = tmp_path / "lock"
+    with exclusive(path, lease=True):
+        os.utime(path, (0, 0))
+        until = time.monotonic() + 10
+        while path.stat().st_mtime == 0:
+            assert time.monotonic() < until
+            time.sleep(0.005)
+    assert path.read_text() == ""
+
+
+def test_who_loses_a_lease_finds_out_and_takes_nothing_from_the_next(tmp_path: Path):
+    path = tmp_path / "lock"
+    with exclusive(path, lease=True, remove=True) as lock:
+        assert not lock.lost()
+        path.unlink()
+        leave(path, age=0)
+        assert lock.lost()
+    assert Holder(**json.loads(path.read_text())).host == "other"
