@@ -28,6 +28,8 @@ OWN = (
         camera="exterior, fixed",
         note="Franka, DROID at 5 Hz: absolute end-effector pose and gripper",
         version="1.0.0",
+        angles=(3, 5),  # roll and yaw
+        angle_form="sine_cosine",
     ),
     DatasetSpec(
         "unitree_g1_sample",

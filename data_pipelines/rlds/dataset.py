@@ -31,11 +31,20 @@ if TYPE_CHECKING:
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
 
-MAX_SKIPPED = 16
-"""Default bound of the policy corrupt='skip'."""
+MAX_SKIPPED = 16.0
+"""Default bound of the policy corrupt='skip': so many episodes or, below 1, this share of them."""
 
 REMEMBERED = 2**14
 """Episodes of which it is remembered where their frames lie: 16 bytes a frame."""
+
+
+def count_skippable(limit: float, episodes: int) -> int:
+    """How many of `episodes` may be left out: `limit`, or this share of them, rounded down, if it is below 1."""
+    require(
+        limit >= 0 and (limit < 1 or limit == int(limit)),
+        f"max_skipped must be a whole number of episodes or, below 1, a share of them, got {limit:g}",
+    )
+    return int(limit if limit >= 1 else limit * episodes)
 
 
 @dataclass(frozen=True)
@@ -82,7 +91,8 @@ class RldsDataset:
 
     Damage: with corrupt="raise" every damaged shard or record is an error. With "skip",
     what a damaged shard still holds is indexed, `skip` accepts unusable episodes, and all
-    losses are listed in `skipped`; more than `max_skipped` of them raise DataError.
+    losses are listed in `skipped`; more than `max_skipped` of them (below 1: more than this share of
+    the episodes that dataset_info.json lists) raise DataError.
 
     Many datasets may share `files`, so that their number does not multiply the files kept open.
 
@@ -96,20 +106,20 @@ class RldsDataset:
         split: str = "train",
         *,
         corrupt: Literal["raise", "skip"] = "raise",
-        max_skipped: int = MAX_SKIPPED,
+        max_skipped: float = MAX_SKIPPED,
         files: OpenFiles | None = None,
     ):
         require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
         self.directory = resolve_version(directory)
         self.split = split
         self.corrupt = corrupt
-        self.max_skipped = max_skipped
         self.skipped: dict[str, int] = {}  # reason -> episodes lost
         self._files = OpenFiles() if files is None else files
         self._known: dict[tuple[int, str], np.ndarray] = {}  # (episode, image) -> where its frames lie, [N, 2]
         meta = read_metadata(self.directory, split)
         self.name, self.version = meta.name, meta.version
         self.features = meta.features
+        self.max_skipped = count_skippable(max_skipped, sum(meta.shard_lengths))
         self._index(meta.shards, meta.shard_lengths)
 
     def __len__(self) -> int:

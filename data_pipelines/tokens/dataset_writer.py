@@ -23,6 +23,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.tokens.manifest import FILE, SPLITS, Loss, Manifest, SplitFacts, load_manifest
 from data_pipelines.tokens.moments import merge_all
 from data_pipelines.tokens.part import FACTS, Made, Part, PartFacts, read_part, sync, write_part
+from data_pipelines.tokens.row_sample import merge_samples
 from data_pipelines.tokens.scratch import scratch
 from data_pipelines.tokens.share import Share
 from hma_jax.config import ConfigError, require
@@ -222,6 +223,7 @@ def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[Loss]) -> 
         action_std=moments.std,
         action_min=moments.low,
         action_max=moments.high,
+        action_quantiles=merge_samples(f.sample for f in facts).quantiles(),
         skipped=(*lost, *(loss for f in facts for loss in f.lost)),
         **splits,
     )

@@ -17,6 +17,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.registry import DatasetSpec
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import Embodiment
 
 FILE = "manifest.json"
@@ -100,6 +101,7 @@ class Manifest:
     val: SplitFacts
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
+    action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
     skipped: tuple[Loss, ...] = ()  # what was left out
     format: int = FORMAT
 
@@ -127,8 +129,13 @@ class Manifest:
         empty = dict.fromkeys(LISTS, ())
         return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
-    def embodiment(self) -> Embodiment:
-        """The model's view of this dataset's actions."""
+    def embodiment(self, scale: ActionScale = "deviation") -> Embodiment:
+        """The model's view of this dataset's actions.
+
+        By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
+        extremes. Raises DataError for a manifest of a version that kept no quantiles.
+        """
+        low, high = self._quantile_scale() if scale == "quantiles" else ((), ())
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
@@ -136,7 +143,22 @@ class Manifest:
             self.action_mean,
             self.action_std,
             self.spec.video_targets,
+            low,
+            high,
         )
+
+    def _quantile_scale(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        if not self.action_mean:
+            return (), ()
+        if not self.action_quantiles:
+            raise DataError(
+                f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
+                "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
+            )
+        first, last = self.action_quantiles[0], self.action_quantiles[-1]
+        pairs = zip(first, last, self.action_min, self.action_max, strict=True)
+        chosen = [(a, b) if b > a else (least, most) for a, b, least, most in pairs]
+        return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 
     def hash(self) -> str:
         lists = (getattr(self.split(s), name) for s in SPLITS for name in LISTS)

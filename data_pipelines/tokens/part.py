@@ -24,6 +24,7 @@ from array_record.python import array_record_module
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
 from data_pipelines.tokens.moments import Moments, merge_all
+from data_pipelines.tokens.row_sample import RowSample, RowSampler, rows_of_part
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 
@@ -65,6 +66,7 @@ class PartFacts:
     val: PartSplit
     moments: Moments  # of the native actions of the train split
     lost: tuple[Loss, ...]
+    sample: RowSample = RowSample()  # of the same actions
 
 
 def write_part(
@@ -80,7 +82,7 @@ def write_part(
         for split in SPLITS
     }
     lost: list[Loss] = []
-    moments = []
+    moments, sampler = [], RowSampler(rows_of_part(part.count))
     for item in made:
         if isinstance(item, Loss):
             lost.append(item)
@@ -88,9 +90,10 @@ def write_part(
         split, episode = item
         if split == "train" and len(episode.actions):
             moments.append(Moments.of(episode.actions))
+            sampler.add(episode.actions, episode.episode)
         writers[split].add(episode)
     splits = [writers[split].close() for split in SPLITS]
-    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost))
+    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost), sampler.sample())
     facts_aside = aside / "facts.json"
     facts_aside.write_text(json.dumps(to_dict(facts)))
     sync(facts_aside)

@@ -18,6 +18,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, load_manifest, part_name
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
+from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import EmbodimentTable
 
 _File = tuple[str, str, int]  # dataset, split, part
@@ -64,9 +65,9 @@ class TokenStore:
         chosen = sorted(self.names if names is None else names)
         return stable_hash({name: self.manifest(name).hash() for name in chosen})
 
-    def embodiment_table(self, names: Sequence[str]) -> EmbodimentTable:
-        """The table of `names`, in that order."""
-        return EmbodimentTable(tuple(self.manifest(name).embodiment() for name in names))
+    def embodiment_table(self, names: Sequence[str], scale: ActionScale = "deviation") -> EmbodimentTable:
+        """The table of `names`, in that order. Raises what `Manifest.embodiment` raises."""
+        return EmbodimentTable(tuple(self.manifest(name).embodiment(scale) for name in names))
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
         """Episode `i` of a split, in store order. Raises DataError for a damaged record."""

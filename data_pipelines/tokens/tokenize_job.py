@@ -53,7 +53,7 @@ def tokenize_dataset(
     threads: int | None = None,
     part_size: int = PART_SIZE,
     corrupt: Literal["raise", "skip"] = "raise",
-    max_skipped: int = MAX_SKIPPED,
+    max_skipped: float = MAX_SKIPPED,
     share: Share = Share(),
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -90,7 +90,7 @@ def tokenize_dataset(
         work.make,
         share=share,
         lost=lost,
-        max_lost=max_skipped if corrupt == "skip" else 0,
+        max_lost=source.max_skipped if corrupt == "skip" else 0,
         overwrite=overwrite,
         progress=progress,
     )
@@ -214,7 +214,7 @@ class _Work:
             frames = np.stack(episode.frames) if episode.keep else None
             episode.frames.clear()
             yield self._split(begin.index), StoredEpisode(
-                begin.index, begin.success, tokens.astype(self._dtype), begin.actions, frames
+                begin.index, begin.success, tokens.astype(self._dtype), self._plan.spec.convert(begin.actions), frames
             )
 
     def _lose(self, error: EpisodeError) -> Loss:

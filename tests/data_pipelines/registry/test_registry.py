@@ -79,7 +79,7 @@ def test_rates_that_the_release_gets_wrong_are_right():
 
 
 def test_termination_flags_and_future_actions_are_no_part_of_the_action():
-    dims = {"fractal20220817_data": 10, "kuka": 7, "bc_z": 7, "cmu_stretch": 7, "toto": 7, "droid": 7}
+    dims = {"fractal20220817_data": 10, "kuka": 7, "bc_z": 7, "cmu_stretch": 7, "toto": 7, "droid": 9}
     assert {name: get_spec(name).action_dim for name in dims} == dims
     assert not [s.name for s in all_specs() if any("terminate" in key for key in s.action_keys)]
 
