@@ -21,6 +21,12 @@ WRAPPING: dict[AngleUnit, str] = {"radian": "wrapping angle", "degree": "wrappin
 """Hints for angles, by their unit. (An angle in turns cannot be told from a switch.)"""
 
 
+QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
+
+BINS = 24
+"""Of the histogram, from the smallest value to the largest."""
+
+
 @dataclass(frozen=True)
 class DimensionFacts:
     """One value of an action field over all sampled steps."""
@@ -32,6 +38,8 @@ class DimensionFacts:
     distinct: int  # different numbers, counted up to 100
     smoothness: float  # step-to-step change over that of independent values; nan for a constant
     not_finite: int
+    quantiles: tuple[float, ...]  # at QUANTILES
+    histogram: tuple[int, ...]  # values in BINS equal bins
     hint: str  # constant, end flag, switch, one of WRAPPING, absolute, delta, or nothing
 
 
@@ -47,7 +55,7 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     good = values[finite]
     if not len(good):
         nan = float("nan")
-        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), "")
+        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), (nan,) * len(QUANTILES), (0,) * BINS, "")
     mean, std = float(good.mean()), float(good.std())
     columns = [kept for column in columns if len(kept := column[np.isfinite(column)])]
     changes = np.concatenate([np.diff(column) for column in columns])
@@ -58,7 +66,10 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     distinct = min(len(counts), 100)
     hint = _hint(columns, mean, std, counts[-2:].sum() / len(good), smoothness)
     extremes = float(good.min()), float(good.max())
-    return DimensionFacts(*extremes, mean, std, distinct, smoothness, int((~finite).sum()), hint)
+    quantiles = tuple(np.quantile(good, QUANTILES, method="inverted_cdf").tolist())
+    histogram = tuple(np.histogram(good, BINS, extremes if alive else (mean - 1, mean + 1))[0].tolist())
+    bad = int((~finite).sum())
+    return DimensionFacts(*extremes, mean, std, distinct, smoothness, bad, quantiles, histogram, hint)
 
 
 def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, smoothness: float) -> str:

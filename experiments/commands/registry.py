@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.text import Text
 
 from experiments.atomic import write_atomically
+from experiments.commands.after_data import no_window, tokenize_command
 from experiments.commands.study import wrote
-from experiments.presets import get_preset
 from experiments.progress import console, step, tidy_table
-from experiments.setting import Where, command, use_entries
+from experiments.setting import use_entries
 from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
@@ -93,7 +93,8 @@ def inspect(
         raise ConfigError(f"--hz must be positive, got {hz:g}")
     use_entries(registry)
     with step(f"read {directory}"):
-        facts, examples = inspect_dataset(directory, split, episodes=episodes)
+        sample = inspect_dataset(directory, split, episodes=episodes)
+    facts = sample.facts
     known = find_spec(facts.name)
     suggestion = suggest_entry(facts, hz or (known.hz if known else None))
     if entry is not None and (suggestion is None or not suggestion.hz):
@@ -115,7 +116,7 @@ def inspect(
     blank = [c.key for c in facts.cameras if c.is_blank]
     title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
     sheet, aside = folder / SHEET, folder / f".{SHEET}"
-    draw_sheet(title, examples, blank).save(aside, format="png")
+    draw_sheet(title, sample.shown, blank).save(aside, format="png")
     aside.replace(sheet)
     wrote(sheet)
     if as_json is not None:
@@ -209,24 +210,11 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -> None:
-    """The command that reads the dataset as it was counted here, or why there is none."""
+    """The command that reads the dataset as it was counted here, or what to try where nothing can be read."""
     if windows is None:
         return
-    if not windows.total:
-        fits = facts.lengths.longest // windows.stride
-        advice = f"frames={fits} would fit" if fits > 1 else "they are too short for any window"
-        console.print(
-            f"next: nothing yet. No episode that was read is as long as a window of {windows.frames} frames; {advice}. "
-            "Is the rate another one (--hz)?",
-            soft_wrap=True,
-        )
-        return
-    preset = get_preset(Where.preset)
-    changes = {}
-    if windows.frames != preset.model.frames:
-        changes["model.frames"] = windows.frames
-    if windows.frames <= preset.eval.prompt_frames:
-        changes["eval.prompt_frames"] = max(windows.frames // 2, 1)
-    settings = tuple(f"{name}={value}" for name, value in changes.items())
-    asked = Where(data=(facts.directory,), registry=entries, set=settings).anywhere()
-    console.print(Text(f"next: {command('tokenize', *asked.words())}"), soft_wrap=True)
+    if windows.total:
+        words = tokenize_command((facts.directory,), windows.frames, entries)
+    else:
+        words = no_window(facts, windows.stride, entries)
+    console.print(Text(f"next: {words}"), soft_wrap=True)

@@ -88,7 +88,7 @@ def test_inspection_suggests_an_entry_that_mends_it(tmp_path, degrees):
         actions[-1, 2] = 1
 
     directory = write_rlds(tmp_path, SPEC, [20] * 6, change=change)
-    suggestion = suggest_entry(inspect_dataset(directory)[0], 4)
+    suggestion = suggest_entry(inspect_dataset(directory).facts, 4)
     spec = suggestion.spec()
     assert (spec.action_keys, spec.angles, spec.angle_form) == (("action[:2]",), (1,), "sine_cosine")
     assert spec.angle_unit == ("degree" if degrees else "radian") and spec.action_dim == 3
