@@ -14,9 +14,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from data_pipelines.registry.openx_counts import EPISODES, LONG, mean_steps
 from data_pipelines.registry.spec import DatasetSpec
-
-LONG = "_converted_externally_to_rlds"
 
 BASE = {"action/base_displacement_vector": 2, "action/base_displacement_vertical_rotation": 1}
 DELTA_POSE = {"action/world_vector": 3, "action/rotation_delta": 3}
@@ -51,6 +50,8 @@ def openx(
         unverified=unverified,
         angles=angles,
         angle_form="sine_cosine" if angles else "as_recorded",
+        episodes=EPISODES.get(name, 0),
+        mean_steps=mean_steps(name),
     )
 
 

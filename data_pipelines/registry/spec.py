@@ -43,7 +43,7 @@ class DatasetSpec:
     action_keys: tuple[str, ...]
     action_dims: tuple[int, ...]
     hz: float  # native rate of frames and actions
-    camera: str = ""  # for people, as all that follows but `split` and `video_targets`
+    camera: str = ""  # for people, as what `facts` leaves out
     split: str = "train"
     note: str = ""
     video_targets: bool = True
@@ -52,6 +52,10 @@ class DatasetSpec:
     angles: tuple[int, ...] = ()  # values that wrap; data, as the next two
     angle_form: AngleForm = "as_recorded"
     angle_unit: AngleUnit = "radian"
+    # For people again; 0 where nobody says.
+    episodes: int = 0  # of `split`
+    median_steps: float = 0.0  # of an episode
+    mean_steps: float = 0.0
 
     def __post_init__(self):
         name = self.name
@@ -98,4 +102,6 @@ class DatasetSpec:
 
     def facts(self) -> DatasetSpec:
         """This entry without its words for people, which do not change the data."""
-        return dataclasses.replace(self, camera="", note="", version="", unverified="")
+        return dataclasses.replace(
+            self, camera="", note="", version="", unverified="", episodes=0, median_steps=0.0, mean_steps=0.0
+        )

@@ -41,7 +41,8 @@ def list_datasets(words: Sequence[str], mixture: str | None, registry: Path | No
     if not shown:
         raise ConfigError(f"no entry has {' and '.join(map(repr, words))} in it; `hma data list` shows all")
     console.print(
-        f"{shown} entries. * not confirmed by a public source: the entry says what. Mixtures: "
+        f"{shown} entries. steps: of the middle episode, ~ of the mean one, ? nobody says. "
+        "* not confirmed by a public source: the entry says what. Mixtures: "
         f"{', '.join(MIXTURES)} (--mixture). A dataset of your own is one more entry; "
         "`hma data inspect DIR` suggests it."
     )
@@ -53,7 +54,7 @@ def _fits(spec: DatasetSpec, title: str, words: Sequence[str]) -> bool:
 
 
 def _table_of(title: str, specs: Sequence[DatasetSpec]):
-    table = tidy_table(title, "name", "dims", "Hz", "stride")
+    table = tidy_table(title, "name", "dims", "Hz", "stride", "episodes", "steps")
     table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
     table.add_column("image", overflow="fold")
     table.add_column("what it is", min_width=30)
@@ -64,6 +65,8 @@ def _table_of(title: str, specs: Sequence[DatasetSpec]):
             f"{spec.action_dim}",
             f"{spec.hz:g}",
             f"{spec.stride}",
+            f"{spec.episodes:,}" if spec.episodes else "?",
+            f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
             spec.image_key.removeprefix("observation/"),
             escape(spec.note) + unsure,
         )
