@@ -26,6 +26,9 @@ from data_pipelines.rlds.writer import VERSION, build_features, shard_name, writ
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 
+ADVICE = re.compile(r" Fetch the file again, or leave [\w ]+ out with --skip-damaged\.$")
+"""What the message of a UnitError advises, of no use to whoever followed it."""
+
 CONVERTER = 1
 """Raise it when a converter writes other bytes for the same source."""
 
@@ -125,7 +128,7 @@ def _write_shards(
                 except UnitError as error:
                     if not skip_damaged:
                         raise
-                    left_out[str(error)] += 1
+                    left_out[ADVICE.sub("", str(error))] += 1
                 unit += 1
                 if progress is not None:
                     progress(unit, total, source.units[unit - 1])

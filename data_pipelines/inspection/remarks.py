@@ -13,6 +13,8 @@ from data_pipelines.inspection.suggest import WindowFacts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.schema import field_slice
 
+MISFIT = "entry does not fit"
+
 NAMED = 6
 """Examples that a remark lists."""
 
@@ -77,7 +79,7 @@ def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Remark]:
         return []
     there = [c.key for c in facts.cameras] + [f"{key} ({n})" for key, n in sizes.items()]
     text = f"the registry's entry wants {', '.join(missing)}; there are {', '.join(there) or 'neither'}"
-    return [Remark("bad", "entry does not fit", text)]
+    return [Remark("bad", MISFIT, text)]
 
 
 def _windows(facts: Facts, windows: WindowFacts | None) -> list[Remark]:

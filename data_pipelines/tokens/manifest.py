@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -24,6 +25,9 @@ FILE = "manifest.json"
 SPLITS = ("train", "val")
 LISTS = ("episodes", "steps")
 """Lists with an entry per episode: up to millions, so no code looks at them one by one."""
+
+LATER = ("angles", "angle_form", "angle_unit", "episodes", "median_steps", "mean_steps")
+"""Fields of a spec that manifests of earlier versions lack: where they say nothing, the hash stays what it was."""
 
 FORMAT = 2
 """Of the store's layout; 1 had one file per split."""
@@ -129,13 +133,16 @@ class Manifest:
         empty = dict.fromkeys(LISTS, ())
         return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
-    def embodiment(self, scale: ActionScale = "deviation") -> Embodiment:
-        """The model's view of this dataset's actions.
+    def embodiment(
+        self, scale: ActionScale = "deviation", quantiles: Sequence[Sequence[float]] | None = None
+    ) -> Embodiment:
+        """The model's view of this dataset's actions. `quantiles`, as `row_sample.QUANTILES` lists them, are of the
+        actions that count, if those are not all of the train split's.
 
         By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
         extremes. Raises DataError for a manifest of a version that kept no quantiles.
         """
-        low, high = self._quantile_scale() if scale == "quantiles" else ((), ())
+        low, high = self._quantile_scale(quantiles or self.action_quantiles) if scale == "quantiles" else ((), ())
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
@@ -147,23 +154,31 @@ class Manifest:
             high,
         )
 
-    def _quantile_scale(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _quantile_scale(
+        self, quantiles: Sequence[Sequence[float]]
+    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
         if not self.action_mean:
             return (), ()
-        if not self.action_quantiles:
+        if not quantiles:
             raise DataError(
                 f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
                 "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
-        first, last = self.action_quantiles[0], self.action_quantiles[-1]
-        pairs = zip(first, last, self.action_min, self.action_max, strict=True)
+        pairs = zip(quantiles[0], quantiles[-1], self.action_min, self.action_max, strict=True)
         chosen = [(a, b) if b > a else (least, most) for a, b, least, most in pairs]
         return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 
     def hash(self) -> str:
         lists = (getattr(self.split(s), name) for s in SPLITS for name in LISTS)
         digests = [hashlib.sha256(np.asarray(x, "<i8").tobytes()).hexdigest() for x in lists]
-        return stable_hash([self._without_lists(), digests])
+        facts = to_dict(self._without_lists())
+        said = to_dict(DatasetSpec("", "", (), (), 1.0))
+        for name in LATER:
+            if facts["spec"][name] == said[name]:
+                del facts["spec"][name]
+        if not facts["action_quantiles"]:
+            del facts["action_quantiles"]
+        return stable_hash([facts, digests])
 
     def to_text(self) -> str:
         """Deterministic JSON, long lists on one line."""

@@ -16,6 +16,7 @@ from array_record.python import array_record_module
 from data_pipelines.errors import DataError
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, load_manifest, part_name
+from data_pipelines.tokens.row_sample import RowSampler
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
 from hma_jax.config.training import ActionScale
@@ -81,6 +82,17 @@ class TokenStore:
                 f"{path}: episode {at} cannot be read: {error}. "
                 f"Remove {path.parent} and tokenise the dataset again."
             ) from error
+
+    def action_quantiles(self, name: str, episodes: Sequence[int]) -> tuple[tuple[float, ...], ...]:
+        """Those of `row_sample.QUANTILES`, of the actions of these training episodes alone (positions in the store).
+
+        Reads the episodes. Raises DataError for a damaged record.
+        """
+        sampler = RowSampler()
+        for i in episodes:
+            item = self.episode(name, "train", int(i))
+            sampler.add(item.actions, item.episode)
+        return sampler.sample().quantiles()
 
     def check_table(self, table: EmbodimentTable, names: Sequence[str]) -> None:
         """Raises ConfigError unless `table` has each of `names` with the action layout stored here."""

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from data_pipelines.inspection.duplicates import Fingerprint
     from experiments.report.data_page import Viewed
 
+ENTRIES = "my_robots.toml"
+
 OTHER_SPLITS = 2
 """Splits beside the one shown that are searched for the same episodes."""
 
@@ -59,7 +61,7 @@ def view(
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, draw_page(viewed, frames, again))
     wrote(out)
-    _say_next(viewed, frames, stride, registry)
+    _say_next(viewed, frames, registry)
 
 
 def _view_one(
@@ -113,25 +115,27 @@ def _say_remarks(viewed: Viewed) -> None:
         console.print(f"[bold]{name}[/]: {title}: {escape(remark.text)}", soft_wrap=True)
 
 
-def _say_next(viewed: Sequence[Viewed], frames: int, stride: int | None, registry: Path | None) -> None:
+def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> None:
     """The command that reads what can be read, or the one that leads there."""
+    from data_pipelines.inspection.remarks import MISFIT
     from data_pipelines.inspection.suggest import window_facts
+    from data_pipelines.registry.spec import stride_of
 
-    usable, told = [], False
+    usable = []
     for v in viewed:
         f = v.facts
         if not v.registered:
-            told = True
-            rate = f"{v.hz:g}" if v.hz else "HZ"
-            words = command("data inspect", f.directory, "--hz", rate, "--entry", "my_robots.toml")
-            why = "it is not in the registry; this writes its entry"
-            console.print(Text(f"next for {f.name}: {words}  ({why})"), soft_wrap=True)
+            words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", ENTRIES)
+            after = f"{words}  (it is not in the registry; this writes its entry)"
+        elif any(r.title == MISFIT for r in v.remarks):
+            after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
         elif not window_facts(f, v.stride, frames).total:
-            told = True
-            console.print(Text(f"next for {f.name}: {no_window(f, v.stride, registry)}"), soft_wrap=True)
-        elif not any(r.kind == "bad" and r.title == "entry does not fit" for r in v.remarks):
+            after = no_window(f, v.stride, registry)
+        elif not window_facts(f, stride_of(v.hz), frames).total:
+            after = f"nothing yet: a study takes it at stride {stride_of(v.hz)}, where no window of {frames} frames fits"
+        else:
             usable.append(f.directory)
+            continue
+        console.print(Text(f"next for {f.name}: {after}"), soft_wrap=True)
     if usable:
         console.print(Text(f"next: {tokenize_command(usable, frames, registry)}"), soft_wrap=True)
-    elif not told:
-        console.print("next: mend the registry's entry, `hma data inspect` suggests one")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.tokens.manifest import load_manifest
+from data_pipelines.tokens.manifest import LATER, load_manifest
 from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, merge_samples, rows_of_part
 from data_pipelines.tokens.share import Share
 from data_pipelines.tokens.store import TokenStore
@@ -120,6 +120,29 @@ def test_a_value_that_moves_in_less_than_a_hundredth_is_measured_by_its_extremes
     assert manifest.action_quantiles[0][2] == manifest.action_quantiles[-1][2] == 0
     scaled = manifest.embodiment("quantiles")
     assert (scaled.low[2], scaled.high[2]) == (0, 4)
+
+
+def test_quantiles_of_some_trajectories_are_of_those_alone(tmp_path):
+    manifest = tokenize_dataset(SPEC, write_rlds(tmp_path, SPEC, [30] * 8), FakeTokenizer(), tmp_path / "store")
+    store = TokenStore(tmp_path / "store")
+    everything = range(len(manifest.train.episodes))
+    assert store.action_quantiles("toy", everything) == manifest.action_quantiles
+    first = store.action_quantiles("toy", [0])
+    number = manifest.train.episodes[0]
+    assert (first[0][0], first[-1][0], first[2][1]) == (number, number, 14)
+    assert manifest.embodiment("quantiles", first).high[1] == first[-1][1]
+
+
+def test_a_manifest_of_an_earlier_version_keeps_its_hash(tmp_path):
+    """As commit 282e5c0 wrote it and named it, with the fields that it had."""
+    tokenize_dataset(SPEC, write_rlds(tmp_path, SPEC, [6] * 6), FakeTokenizer(), tmp_path / "store")
+    path = tmp_path / "store/toy/manifest.json"
+    values = json.loads(path.read_text())
+    del values["action_quantiles"]
+    for name in LATER:
+        del values["spec"][name]
+    path.write_text(json.dumps(values))
+    assert load_manifest(path).hash() == "65a9e7defe4b3fd2"
 
 
 def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
