@@ -184,6 +184,7 @@ def _print_entry(facts: Facts, known: DatasetSpec | None, suggestion: Suggestion
     else:
         same = (known.image_key, known.action_keys, known.action_dims)
         fits = same == (suggestion.image_key, suggestion.action_keys, suggestion.action_dims)
+        fits &= set(suggestion.angles) <= set(known.angles)
         agrees = ", as its contents suggest" if fits else ". Its contents alone would suggest:"
         console.print(f"[bold]in the registry[/]: {escape(_in_words(known))}{agrees}", soft_wrap=True)
         if fits:
