@@ -45,7 +45,14 @@ class StoreConfig:
     max_val: int = 200  # and at most
     frame_step: int | None = None  # None: only the 2 Hz frames
     corrupt: Literal["raise", "skip"] = "raise"  # damaged records: stop, or leave out and count
-    max_skipped: int = 16  # damaged episodes per dataset that may be left out
+    max_skipped: float = 16.0  # damaged episodes per dataset that may be left out; below 1: this share of them
+
+    def __post_init__(self):
+        m = self.max_skipped
+        require(
+            m >= 0 and (m < 1 or m == int(m)),
+            f"store.max_skipped must be a whole number of episodes or, below 1, a share of them, got {m:g}",
+        )
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ def train_trial(
     from hma_jax.training.validation import Validation
 
     store, loader = materials.store, loader_of(trial)
-    table = table or store.embodiment_table(trial.datasets)
+    table = table or store.embodiment_table(trial.datasets, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
 
     def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
@@ -242,7 +242,7 @@ def run_trial(
 
     started = time.perf_counter()
     materials = open_materials(workspace)
-    table = materials.store.embodiment_table(trial.datasets)
+    table = materials.store.embodiment_table(trial.datasets, trial.train.action_scale)
     declared = declare_model(trial.model, table)
     trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress)
 

@@ -31,6 +31,9 @@ from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 from hma_jax.runtime.locks import Held
 
+ADVICE = re.compile(r" Fetch the file again, or leave [\w ]+ out with --skip-damaged\.$")
+"""What the message of a UnitError advises, of no use to whoever followed it."""
+
 CONVERTER = 1
 """Raise it when a converter writes other bytes for the same source."""
 
@@ -141,7 +144,7 @@ def _write_shards(
                 except UnitError as error:
                     if not skip_damaged:
                         raise
-                    left_out[str(error)] += 1
+                    left_out[ADVICE.sub("", str(error))] += 1
                 unit += 1
                 if progress is not None:
                     progress(unit, total, source.units[unit - 1])

@@ -10,10 +10,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_pipelines.registry.angles import TURN, AngleUnit
 from hma_jax.model.embodiments import DEAD_STD
 
 SWITCH_SHARE = 0.8
 """A value that is one of two numbers at least so often is a switch."""
+
+
+WRAPPING: dict[AngleUnit, str] = {"radian": "wrapping angle", "degree": "wrapping angle in degrees"}
+"""Hints for angles, by their unit. (An angle in turns cannot be told from a switch.)"""
+
+
+QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
+
+BINS = 24
+"""Of the histogram, from the smallest value to the largest."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +38,9 @@ class DimensionFacts:
     distinct: int  # different numbers, counted up to 100
     smoothness: float  # step-to-step change over that of independent values; nan for a constant
     not_finite: int
-    hint: str  # constant, end flag, switch, wrapping angle, absolute, delta, or nothing
+    quantiles: tuple[float, ...]  # at QUANTILES
+    histogram: tuple[int, ...]  # values in BINS equal bins
+    hint: str  # constant, end flag, switch, one of WRAPPING, absolute, delta, or nothing
 
 
 def dimension_facts(episodes: Sequence[np.ndarray]) -> tuple[DimensionFacts, ...]:
@@ -42,9 +55,10 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     good = values[finite]
     if not len(good):
         nan = float("nan")
-        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), "")
+        return DimensionFacts(nan, nan, nan, nan, 0, nan, len(values), (nan,) * len(QUANTILES), (0,) * BINS, "")
     mean, std = float(good.mean()), float(good.std())
-    changes = np.concatenate([np.diff(column[np.isfinite(column)]) for column in columns])
+    columns = [kept for column in columns if len(kept := column[np.isfinite(column)])]
+    changes = np.concatenate([np.diff(column) for column in columns])
     alive = std > DEAD_STD and len(changes)
     # Independent draws change by sqrt(2) standard deviations from one step to the next.
     smoothness = float(np.sqrt((changes**2).mean()) / (np.sqrt(2) * std)) if alive else float("nan")
@@ -52,7 +66,10 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     distinct = min(len(counts), 100)
     hint = _hint(columns, mean, std, counts[-2:].sum() / len(good), smoothness)
     extremes = float(good.min()), float(good.max())
-    return DimensionFacts(*extremes, mean, std, distinct, smoothness, int((~finite).sum()), hint)
+    quantiles = tuple(np.quantile(good, QUANTILES, method="inverted_cdf").tolist())
+    histogram = tuple(np.histogram(good, BINS, extremes if alive else (mean - 1, mean + 1))[0].tolist())
+    bad = int((~finite).sum())
+    return DimensionFacts(*extremes, mean, std, distinct, smoothness, bad, quantiles, histogram, hint)
 
 
 def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, smoothness: float) -> str:
@@ -62,11 +79,18 @@ def _hint(columns: list[np.ndarray], mean: float, std: float, commonest: float, 
     if commonest >= SWITCH_SHARE:
         ends = all(not column[:-1].any() for column in columns) and any(column[-1] for column in columns)
         return "end flag" if ends else "switch"
-    if all(np.abs(column).max() < np.pi + 0.01 for column in columns) and any(
-        np.abs(np.diff(column)).max(initial=0) > 1.9 * np.pi for column in columns
-    ):
-        return "wrapping angle"
+    for unit, words in WRAPPING.items():
+        if _wraps(columns, TURN[unit]):
+            return words
     # Targets drift slowly about wherever the robot is; changes jump about zero.
     if smoothness < 0.2 or abs(mean) > 2 * std:
         return "absolute"
     return "delta" if abs(mean) < 0.5 * std else ""
+
+
+def _wraps(columns: list[np.ndarray], turn: float) -> bool:
+    """Whether values stay within one turn, about 0 or from 0 on, and jump from one end to the other."""
+    low, high = min(c.min() for c in columns), max(c.max() for c in columns)
+    near = 0.002 * turn
+    inside = (low > -turn / 2 - near and high < turn / 2 + near) or (low > -near and high < turn + near)
+    return inside and any(np.abs(np.diff(c)).max(initial=0) > 0.9 * turn for c in columns)

@@ -16,13 +16,20 @@ import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
+from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
+from data_pipelines.inspection.sample import Shown, shrink
 from data_pipelines.loading.splits import smallest_hashes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import read_features, read_info, step_key
-from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched
+from data_pipelines.sources.source import (
+    INSTRUCTION_KEY,
+    SUCCESS_KEY,
+    EpisodeSource,
+    Fetched,
+)
 from hma_jax.config import require
 
 if TYPE_CHECKING:
@@ -112,15 +119,12 @@ class Facts:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """An episode for people: a few frames of every camera, as they are."""
+class Sample:
+    """What was read of a dataset."""
 
-    index: int
-    steps: int
-    success: bool | None
-    instruction: str
-    times: tuple[int, ...]  # step of each frame
-    frames: dict[str, list[np.ndarray]]  # camera -> uint8 [H, W, 3] each
+    facts: Facts
+    shown: tuple[Shown, ...]
+    fingerprints: tuple[Fingerprint, ...]  # of every sampled episode
 
 
 def inspect_dataset(
@@ -131,8 +135,8 @@ def inspect_dataset(
     shown: int = 4,
     frames: int = 8,
     max_bytes: int = 2_000_000_000,
-) -> tuple[Facts, list[Shown]]:
-    """Facts of one split, and some of its episodes to look at.
+) -> Sample:
+    """Facts of one split, some of its episodes to look at, and what tells duplicates.
 
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
     each camera are decoded in the first `shown`, two in the others. Damaged records are counted
@@ -146,7 +150,7 @@ def inspect_dataset(
     numbers = [f.key for f in fields if f.per_step and f.kind == "number" and "action" in f.key]
     numbers = [key for key in numbers if source.features[step_key(key)].size in range(1, WIDEST + 1)]
     rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
-    steps, examples, bytes_read = [], [], 0
+    steps, examples, prints, bytes_read = [], [], [], 0
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
     first = np.unique(np.linspace(0, len(drawn) - 1, shown).round().astype(int))  # those to look at
     for i in [*drawn[first], *np.delete(drawn, first)]:
@@ -163,14 +167,16 @@ def inspect_dataset(
             continue
         bytes_read += sum(_size(values) for values in record.values())
         steps.append(count)
+        actions = {key: np.asarray(record[step_key(key)]).reshape(count, -1) for key in numbers}
         for key in numbers:
-            rows[key].append(np.asarray(record[step_key(key)]).reshape(count, -1))
+            rows[key].append(actions[key])
+        prints.append(take_fingerprint(split, int(i), count, looked, list(actions.values())))
         if len(examples) < shown:
-            examples.append(_shown(int(i), count, record, times, looked))
+            examples.append(_shown(int(i), count, record, times, looked, actions))
     if not steps:
         reasons = "; ".join(source.skipped) or "it is empty"
         raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}")
-    return Facts(
+    facts = Facts(
         name=source.name,
         version=source.version,
         directory=str(source.location),
@@ -186,7 +192,8 @@ def inspect_dataset(
         actions=tuple(ActionFacts(key, dimension_facts(rows[key])) for key in numbers),
         damaged=dict(source.skipped),
         hz=source.hz,
-    ), examples
+    )
+    return Sample(facts, tuple(examples), tuple(prints))
 
 
 # --- schema -----------------------------------------------------------------------------------
@@ -274,11 +281,12 @@ class _CameraLog:
         return CameraFacts(key, tuple(sorted(self.sizes)), self.frames, self.blank, self.still)
 
 
-def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict) -> Shown:
+def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> Shown:
     text = next((record[key][0] for key in INSTRUCTION_KEYS if record.get(key)), b"")
     success = record.get(SUCCESS_KEY)
     known = success is not None and len(success) == 1
-    return Shown(i, steps, bool(success[0]) if known else None, text.decode(errors="replace"), times, looked)
+    flag = bool(success[0]) if known else None
+    return Shown(i, steps, flag, text.decode(errors="replace"), times, shrink(looked), actions)
 
 
 def _size(values: np.ndarray | list[bytes]) -> int:

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.inspect import CameraFacts, Facts
 from data_pipelines.loading.windows import count_windows
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry.angles import AngleForm, AngleUnit
+from data_pipelines.sources.rlds.schema import field_slice
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)
@@ -33,12 +36,19 @@ class Suggestion:
     version: str
     video_targets: bool
     reasons: tuple[str, ...]
+    angles: tuple[int, ...] = ()
+    angle_unit: AngleUnit = "radian"
+
+    @property
+    def angle_form(self) -> AngleForm:
+        return "sine_cosine" if self.angles else "as_recorded"
 
     def spec(self) -> DatasetSpec:
         """As an entry. Raises ConfigError while the rate is missing."""
         return DatasetSpec(
             self.name, self.image_key, self.action_keys, self.action_dims, self.hz,
             split=self.split, video_targets=self.video_targets, version=self.version,
+            angles=self.angles, angle_form=self.angle_form, angle_unit=self.angle_unit,
         )  # fmt: skip
 
     def python(self) -> str:
@@ -58,6 +68,11 @@ class Suggestion:
             lines.append("        video_targets=False,  # its camera shows nothing")
         if self.version:
             lines.append(f"        version={_text(self.version)},")
+        if self.angles:
+            lines.append(f"        angles={_tuple(map(str, self.angles))},  # they wrap")
+            lines.append(f"        angle_form={_text(self.angle_form)},  # or \"unwrapped\"")
+            if self.angle_unit != "radian":
+                lines.append(f"        angle_unit={_text(self.angle_unit)},")
         return "\n".join([*lines, "    ),"])
 
 
@@ -80,11 +95,17 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
         return None
     keys, dims, about = _choose_actions(facts)
     reasons = [f"camera: {why}", f"action: {about}"]
+    angles, unit = _choose_angles(facts, keys, dims)
+    if angles:
+        reasons.append(
+            f"angles: {', '.join(map(str, angles))} of the action jump by a whole turn ({unit}s); as sine and cosine "
+            "they do not"
+        )
     if not hz:
         reasons.append("hz: not in the files; say it with --hz, or fill it in")
     return Suggestion(
         facts.name, camera.key, keys, dims, hz or NO_RATE, facts.split, facts.version,
-        not camera.is_blank, tuple(reasons),
+        not camera.is_blank, tuple(reasons), angles, unit,
     )  # fmt: skip
 
 
@@ -130,6 +151,21 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
     if others:
         about += f"; there are also {', '.join(others)}"
     return tuple(names), tuple(dims), about
+
+
+def _choose_angles(
+    facts: Facts, keys: Sequence[str], dims: Sequence[int]
+) -> tuple[tuple[int, ...], AngleUnit]:
+    """Which of the chosen values wrap, counted over all keys, and in what unit: that of most of them."""
+    by_key = {a.key: a for a in facts.actions}
+    hints = [
+        d.hint
+        for key, dim in zip(keys, dims, strict=True)
+        for d in by_key[field_slice(key)[0]].dimensions[field_slice(key)[1]][:dim]
+    ]
+    found = {unit: tuple(i for i, h in enumerate(hints) if h == words) for unit, words in WRAPPING.items()}
+    unit = max(found, key=lambda u: len(found[u]))
+    return found[unit], unit
 
 
 def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:

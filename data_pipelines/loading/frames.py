@@ -45,7 +45,7 @@ def make_frame_loader(
     max_val: int = 200,
     split: Literal["train", "val"] = "train",
     corrupt: Literal["raise", "skip"] = "raise",
-    max_skipped: int = MAX_SKIPPED,
+    max_skipped: float = MAX_SKIPPED,
     threads: int = 2,
 ) -> Iterator[np.ndarray]:
     """Endless batches of frames, uint8 [B, image_size, image_size, 3].

@@ -14,9 +14,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from data_pipelines.registry.openx_counts import EPISODES, LONG, mean_steps
 from data_pipelines.registry.spec import DatasetSpec
-
-LONG = "_converted_externally_to_rlds"
 
 BASE = {"action/base_displacement_vector": 2, "action/base_displacement_vertical_rotation": 1}
 DELTA_POSE = {"action/world_vector": 3, "action/rotation_delta": 3}
@@ -33,8 +32,12 @@ def openx(
     camera: str = "fixed",
     version: str = "0.1.0",
     unverified: str = "",
+    angles: tuple[int, ...] = (),
 ) -> DatasetSpec:
-    """An entry in short: `action` maps keys to dimensions, `image` is a field of the observation."""
+    """An entry in short: `action` maps keys to dimensions, `image` is a field of the observation.
+
+    `angles`, in radians, are given as sine and cosine.
+    """
     return DatasetSpec(
         name,
         image_key=f"observation/{image}",
@@ -45,6 +48,10 @@ def openx(
         note=note,
         version=version,
         unverified=unverified,
+        angles=angles,
+        angle_form="sine_cosine" if angles else "as_recorded",
+        episodes=EPISODES.get(name, 0),
+        mean_steps=mean_steps(name),
     )
 
 
@@ -99,10 +106,10 @@ OPENX = (
     # DIFFERS: the release appends terminate_episode (8 values).
     openx("columbia_cairlab_pusht_real", 10, CLOSEDNESS,
           "UR5 pushing a T: planar, so four values never move"),
-    # DIFFERS: the release takes `action` and floors 15 / 2 (2.14 Hz).
+    # DIFFERS: the release takes `action` and floors 15 / 2 (2.14 Hz). Roll lies about ±π, where it jumps.
     openx("droid", 15, {"action_dict/cartesian_position": 6, "action_dict/gripper_position": 1},
           "Franka in many places: absolute end-effector pose and gripper", image="exterior_image_1_left",
-          camera="exterior, fixed", version="1.0.1"),
+          camera="exterior, fixed", version="1.0.1", angles=(3, 5)),
     # DIFFERS: the release appends terminate_episode (8 values).
     openx("toto", 30, DELTA_POSE | {"action/open_gripper": 1},
           "Franka scooping and pouring: pose and gripper"),

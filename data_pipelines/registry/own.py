@@ -18,6 +18,8 @@ OWN = (
         camera="over the shoulder, fixed",
         note="WidowX, Bridge V2: end-effector deltas and gripper",
         version="1.0.0",
+        episodes=25,
+        median_steps=10,
     ),
     DatasetSpec(
         "droid_sample",
@@ -28,6 +30,10 @@ OWN = (
         camera="exterior, fixed",
         note="Franka, DROID at 5 Hz: absolute end-effector pose and gripper",
         version="1.0.0",
+        episodes=7,
+        median_steps=80,
+        angles=(3, 5),  # roll and yaw
+        angle_form="sine_cosine",
     ),
     DatasetSpec(
         "unitree_g1_sample",
@@ -38,5 +44,7 @@ OWN = (
         camera="head",
         note="Unitree G1, two arms and hands: absolute joint targets",
         version="1.0.0",
+        episodes=8,
+        median_steps=380.5,
     ),
 )

@@ -6,7 +6,15 @@ import dataclasses
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from data_pipelines.names import NAME_RULE, is_name, shown
+from data_pipelines.registry.angles import (
+    AngleForm,
+    AngleUnit,
+    angle_width,
+    convert_angles,
+)
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import require
 
@@ -31,6 +39,10 @@ class DatasetSpec:
     `action_keys` in their order; `action_dims` says how many values each has. `action[:7]` takes
     the first seven values of a field, for fields whose rest is no action. Without any key the
     dataset is video alone; with `video_targets` False its frames are shown but never predicted.
+
+    `angles` are the values of the action, counted from 0 over all its keys, that are angles in
+    `angle_unit` and wrap; `angle_form` says how they are given (see `angles`). They are part of the
+    action's layout: tokens made with other ones are other data.
     """
 
     name: str
@@ -38,12 +50,19 @@ class DatasetSpec:
     action_keys: tuple[str, ...]
     action_dims: tuple[int, ...]
     hz: float  # native rate of frames and actions
-    camera: str = ""  # for people, as all that follows but `split` and `video_targets`
+    camera: str = ""  # for people, as what `facts` leaves out
     split: str = "train"
     note: str = ""
     video_targets: bool = True
     version: str = ""  # of tfds, for which the keys were written
     unverified: str = ""  # which of this entry's facts no public source confirms
+    angles: tuple[int, ...] = ()  # values that wrap; data, as the next two
+    angle_form: AngleForm = "as_recorded"
+    angle_unit: AngleUnit = "radian"
+    # For people again; 0 where nobody says.
+    episodes: int = 0  # of `split`
+    median_steps: float = 0.0  # of an episode
+    mean_steps: float = 0.0
 
     def __post_init__(self):
         name = self.name
@@ -67,6 +86,16 @@ class DatasetSpec:
                 require(
                     taken == dim, f"dataset {name!r}: {key!r} takes {taken} values, action_dims says {dim}"
                 )
+        width = sum(self.action_dims)
+        require(
+            list(self.angles) == sorted(set(self.angles)) and all(0 <= d < width for d in self.angles),
+            f"dataset {name!r}: angles must be increasing numbers of its {width} action values, counted from 0, "
+            f"got {self.angles}",
+        )
+        require(
+            bool(self.angles) or self.angle_form == "as_recorded",
+            f"dataset {name!r}: angle_form {self.angle_form!r} needs to know which values are angles: add `angles`",
+        )
 
     @property
     def stride(self) -> int:
@@ -75,8 +104,15 @@ class DatasetSpec:
 
     @property
     def action_dim(self) -> int:
-        return sum(self.action_dims)
+        """Values of one native action as the model is given it."""
+        return angle_width(sum(self.action_dims), self.angles, self.angle_form)
+
+    def convert(self, actions: np.ndarray) -> np.ndarray:
+        """float32 [N, action_dim]: the actions of an episode [N, sum(action_dims)], as the model is given them."""
+        return convert_angles(actions, self.angles, self.angle_form, self.angle_unit)
 
     def facts(self) -> DatasetSpec:
         """This entry without its words for people, which do not change the data."""
-        return dataclasses.replace(self, camera="", note="", version="", unverified="")
+        return dataclasses.replace(
+            self, camera="", note="", version="", unverified="", episodes=0, median_steps=0.0, mean_steps=0.0
+        )

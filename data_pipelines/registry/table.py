@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 from data_pipelines.registry.openx import OPENX
 from data_pipelines.registry.openx_more import OPENX_MORE
+from data_pipelines.registry.openx_rest import OPENX_REST
 from data_pipelines.registry.others import OTHERS
 from data_pipelines.registry.own import OWN
 from data_pipelines.registry.spec import DatasetSpec
@@ -29,7 +30,7 @@ def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
     groups = {
         "given by you": tuple(_registered.values()),
         "own and samples": OWN,
-        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE,
+        "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,
         "other datasets of the paper": OTHERS,
         "embedded suite (simulated)": _suite(),
         "simulator suite (extra sim)": _simulators(),
@@ -69,7 +70,7 @@ def _table() -> dict[str, DatasetSpec]:
 
 @functools.cache
 def _built_in() -> dict[str, DatasetSpec]:
-    return {spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OTHERS, *_suite(), *_simulators())}
+    return {spec.name: spec for spec in (*OWN, *OPENX, *OPENX_MORE, *OPENX_REST, *OTHERS, *_suite(), *_simulators())}
 
 
 @functools.cache

@@ -51,7 +51,7 @@ class LeRobotDataset(EpisodeSource):
         split: str = "train",
         *,
         corrupt: Corrupt = "raise",
-        max_skipped: int = MAX_SKIPPED,
+        max_skipped: float = MAX_SKIPPED,
     ):
         super().__init__(corrupt, max_skipped)
         require(split == "train", f"{root}: no split {split!r}; a LeRobot dataset has one, 'train'.")

@@ -35,7 +35,7 @@ def open_source(
     split: str = "train",
     *,
     corrupt: Corrupt = "raise",
-    max_skipped: int = MAX_SKIPPED,
+    max_skipped: float = MAX_SKIPPED,
     files: OpenFiles | None = None,
 ) -> EpisodeSource:
     """The episodes of one split of the dataset at `location`; `files` may be shared by several.

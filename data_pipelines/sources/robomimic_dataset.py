@@ -47,7 +47,7 @@ class RobomimicDataset(EpisodeSource):
         split: str = "train",
         *,
         corrupt: Corrupt = "raise",
-        max_skipped: int = MAX_SKIPPED,
+        max_skipped: float = MAX_SKIPPED,
     ):
         super().__init__(corrupt, max_skipped)
         self.location = self.schema = Path(path)

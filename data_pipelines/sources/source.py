@@ -28,10 +28,20 @@ INSTRUCTION_KEY = "steps/language_instruction"
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
 
-MAX_SKIPPED = 16
-"""Default bound of the policy corrupt='skip'."""
+MAX_SKIPPED = 16.0
+"""Default bound of the policy corrupt='skip': so many episodes or, below 1, this share of them."""
 
 Corrupt = Literal["raise", "skip"]
+
+
+def count_skippable(limit: float, episodes: int) -> int:
+    """How many of `episodes` may be left out: `limit`, or this share of them, rounded down, if it is below 1."""
+    require(
+        limit >= 0 and (limit < 1 or limit == int(limit)),
+        f"max_skipped must be a whole number of episodes or, below 1, a share of them, got {limit:g}",
+    )
+    return int(limit if limit >= 1 else limit * episodes)
+
 
 Fetched = bytes | np.ndarray
 """A frame as its source holds it: encoded, or uint8 [H, W, 3] where no frame stands alone (videos)."""
@@ -82,7 +92,7 @@ class EpisodeSource(ABC):
 
     Damage: with corrupt="raise" every damaged part is an error. With "skip", what can be read is
     listed, `skip` accepts unusable episodes, and all losses are counted in `skipped`; more than
-    `max_skipped` of them raise DataError. A place that cannot be read at all is no damage: it
+    `max_skipped` of them (below 1: more than this share of `runs`) raise DataError. A place that cannot be read at all is no damage: it
     raises UnreachableError under both.
     """
 
@@ -95,10 +105,16 @@ class EpisodeSource(ABC):
     runs: tuple[EpisodeRun, ...]
     files: int  # that hold its episodes
 
-    def __init__(self, corrupt: Corrupt, max_skipped: int):
+    def __init__(self, corrupt: Corrupt, max_skipped: float):
         require(corrupt in ("raise", "skip"), f"corrupt must be 'raise' or 'skip', got {corrupt!r}")
-        self.corrupt, self.max_skipped = corrupt, max_skipped
+        count_skippable(max_skipped, 0)
+        self.corrupt, self._limit = corrupt, max_skipped
         self.skipped: dict[str, int] = {}  # reason -> episodes lost
+
+    @property
+    def max_skipped(self) -> int:
+        """How many episodes may be left out."""
+        return count_skippable(self._limit, sum(run.count for run in self.runs))
 
     @abstractmethod
     def __len__(self) -> int: ...

@@ -24,10 +24,18 @@ from pathlib import Path
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.claims import claim, living_claim, pauses_between_looks
 from data_pipelines.publishing.files import remove, sync
-from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts, load_manifest
+from data_pipelines.tokens.manifest import (
+    FILE,
+    SPLITS,
+    LostEpisodes,
+    Manifest,
+    SplitFacts,
+    load_manifest,
+)
 from data_pipelines.tokens.moments import merge_all
 from data_pipelines.tokens.part_files import Part, PartFacts, read_part
 from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, claims_of
+from data_pipelines.tokens.row_sample import merge_samples
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, stable_hash
 from hma_jax.runtime.locks import Held
@@ -176,6 +184,7 @@ def _merge(plan: Manifest, facts: Sequence[PartFacts], lost: Sequence[LostEpisod
         action_std=moments.std,
         action_min=moments.low,
         action_max=moments.high,
+        action_quantiles=merge_samples(f.sample for f in facts).quantiles(),
         skipped=(*lost, *(loss for f in facts for loss in f.lost)),
         **splits,
     )

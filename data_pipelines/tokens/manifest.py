@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.identity import EpisodeRun
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import Embodiment
 
 FILE = "manifest.json"
@@ -30,6 +31,9 @@ SPLITS = ("train", "val")
 COLUMNS_FILE = "episodes.columns"
 LISTS = ("episodes", "steps")
 """Columns with an entry per episode: up to millions, so no code looks at them one by one."""
+
+LATER = ("angles", "angle_form", "angle_unit", "episodes", "median_steps", "mean_steps")
+"""Fields of a spec that manifests of earlier versions lack: where they say nothing, the hash stays what it was."""
 
 FORMAT, READ = 3, (2, 3)
 """Of the store's layout, and those that are read. 1 had one file per split, 2 the columns as JSON."""
@@ -113,6 +117,7 @@ class Manifest:
     val: SplitFacts
     action_min: tuple[float, ...] = ()
     action_max: tuple[float, ...] = ()
+    action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
     skipped: tuple[LostEpisodes, ...] = ()  # what was left out
     runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
     format: int = FORMAT
@@ -141,8 +146,16 @@ class Manifest:
         empty = dict.fromkeys(LISTS, ())
         return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
-    def embodiment(self) -> Embodiment:
-        """The model's view of this dataset's actions."""
+    def embodiment(
+        self, scale: ActionScale = "deviation", quantiles: Sequence[Sequence[float]] | None = None
+    ) -> Embodiment:
+        """The model's view of this dataset's actions. `quantiles`, as `row_sample.QUANTILES` lists them, are of the
+        actions that count, if those are not all of the train split's.
+
+        By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
+        extremes. Raises DataError for a manifest of a version that kept no quantiles.
+        """
+        low, high = self._quantile_scale(quantiles or self.action_quantiles) if scale == "quantiles" else ((), ())
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
@@ -150,16 +163,37 @@ class Manifest:
             self.action_mean,
             self.action_std,
             self.spec.video_targets,
+            low,
+            high,
         )
+
+    def _quantile_scale(
+        self, quantiles: Sequence[Sequence[float]]
+    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        if not self.action_mean:
+            return (), ()
+        if not quantiles:
+            raise DataError(
+                f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
+                "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
+            )
+        pairs = zip(quantiles[0], quantiles[-1], self.action_min, self.action_max, strict=True)
+        chosen = [(a, b) if b > a else (least, most) for a, b, least, most in pairs]
+        return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 
     def hash(self) -> str:
         return stable_hash([self._facts(), list(self._digests().values())])
 
     def _facts(self) -> dict[str, Any]:
-        """All but the columns, as plain JSON."""
+        """All but the columns, as plain JSON. What earlier versions did not write is left out where it says
+        nothing: the hash of a store made by them stays what it was."""
         values = to_dict(self._without_lists())
-        if not self.runs:  # of a store made before there were any, whose hash stays what it was
-            del values["runs"]
+        for name in ("runs", "action_quantiles"):
+            if not values[name]:
+                del values[name]
+        for later in fields(DatasetSpec):
+            if later.name in LATER and values["spec"][later.name] == to_dict(later.default):
+                del values["spec"][later.name]
         return values
 
     def _columns(self) -> dict[str, Column]:

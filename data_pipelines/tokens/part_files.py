@@ -25,6 +25,7 @@ from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, part_name
 from data_pipelines.tokens.moments import Moments, merge_all
+from data_pipelines.tokens.row_sample import RowSample, RowSampler, rows_of_part
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 
@@ -66,6 +67,7 @@ class PartFacts:
     val: PartSplit
     moments: Moments  # of the native actions of the train split
     lost: tuple[LostEpisodes, ...]
+    sample: RowSample = RowSample()  # of the same actions
 
 
 def write_part(
@@ -81,7 +83,7 @@ def write_part(
         for split in SPLITS
     }
     lost: list[LostEpisodes] = []
-    moments = []
+    moments, sampler = [], RowSampler(rows_of_part(part.count))
     for item in items:
         if isinstance(item, LostEpisodes):
             lost.append(item)
@@ -89,9 +91,10 @@ def write_part(
         split, episode = item
         if split == "train" and len(episode.actions):
             moments.append(Moments.of(episode.actions))
+            sampler.add(episode.actions, episode.episode)
         writers[split].add(episode)
     splits = [writers[split].close() for split in SPLITS]
-    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost))
+    facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost), sampler.sample())
     new_facts = scratch / "facts.json"
     new_facts.write_text(json.dumps(to_dict(facts)))
     sync(new_facts)

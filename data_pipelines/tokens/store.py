@@ -16,8 +16,10 @@ from array_record.python import array_record_module
 from data_pipelines.errors import DataError
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, load_manifest, part_name
+from data_pipelines.tokens.row_sample import RowSampler
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
+from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import EmbodimentTable
 
 _File = tuple[str, str, int]  # dataset, split, part
@@ -64,9 +66,9 @@ class TokenStore:
         chosen = sorted(self.names if names is None else names)
         return stable_hash({name: self.manifest(name).hash() for name in chosen})
 
-    def embodiment_table(self, names: Sequence[str]) -> EmbodimentTable:
-        """The table of `names`, in that order."""
-        return EmbodimentTable(tuple(self.manifest(name).embodiment() for name in names))
+    def embodiment_table(self, names: Sequence[str], scale: ActionScale = "deviation") -> EmbodimentTable:
+        """The table of `names`, in that order. Raises what `Manifest.embodiment` raises."""
+        return EmbodimentTable(tuple(self.manifest(name).embodiment(scale) for name in names))
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
         """Episode `i` of a split, in store order. Raises DataError for a damaged record."""
@@ -80,6 +82,17 @@ class TokenStore:
                 f"{path}: episode {at} cannot be read: {error}. "
                 f"Remove {path.parent} and tokenise the dataset again."
             ) from error
+
+    def action_quantiles(self, name: str, episodes: Sequence[int]) -> tuple[tuple[float, ...], ...]:
+        """Those of `row_sample.QUANTILES`, of the actions of these training episodes alone (positions in the store).
+
+        Reads the episodes. Raises DataError for a damaged record.
+        """
+        sampler = RowSampler()
+        for i in episodes:
+            item = self.episode(name, "train", int(i))
+            sampler.add(item.actions, item.episode)
+        return sampler.sample().quantiles()
 
     def check_table(self, table: EmbodimentTable, names: Sequence[str]) -> None:
         """Raises ConfigError unless `table` has each of `names` with the action layout stored here."""

@@ -27,9 +27,20 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
-from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.dataset_writer import (
+    PART_SIZE,
+    Progress,
+    cut_parts,
+    write_dataset,
+)
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
-from data_pipelines.tokens.manifest import JobSettings, LostEpisodes, Manifest, SplitFacts, TokenizerFacts
+from data_pipelines.tokens.manifest import (
+    JobSettings,
+    LostEpisodes,
+    Manifest,
+    SplitFacts,
+    TokenizerFacts,
+)
 from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
 from hma_jax.config import require
@@ -53,7 +64,7 @@ def tokenize_dataset(
     threads: int | None = None,
     part_size: int = PART_SIZE,
     corrupt: Literal["raise", "skip"] = "raise",
-    max_skipped: int = MAX_SKIPPED,
+    max_skipped: float = MAX_SKIPPED,
     overwrite: bool = False,
     wait: bool = True,
     progress: Progress | None = None,
@@ -90,7 +101,7 @@ def tokenize_dataset(
         cut_parts(source.sizes(), part_size),
         work.make,
         lost=lost,
-        max_lost=max_skipped if corrupt == "skip" else 0,
+        max_lost=source.max_skipped if corrupt == "skip" else 0,
         overwrite=overwrite,
         wait=wait,
         progress=progress,
@@ -220,7 +231,11 @@ class _Work:
             frames = np.stack(episode.frames) if episode.keep else None
             episode.frames.clear()
             yield self._split(begin.index), StoredEpisode(
-                int(self._numbers[begin.index]), begin.success, tokens.astype(self._dtype), begin.actions, frames
+                int(self._numbers[begin.index]),
+                begin.success,
+                tokens.astype(self._dtype),
+                self._plan.spec.convert(begin.actions),
+                frames,
             )
 
     def _lose(self, error: EpisodeError) -> LostEpisodes:

@@ -21,6 +21,7 @@ from experiments.cli.sim import data_sim, data_sim_table
 from experiments.commands import data as commands
 from experiments.commands import registry as registry_commands
 from experiments.commands import study as study_commands
+from experiments.commands import view as view_commands
 from experiments.setting import Where, make_setting
 
 data_app = SubcommandApp()
@@ -79,6 +80,37 @@ def data_inspect(
     registry_commands.inspect(
         directory, split=split, hz=hz, out=out, episodes=episodes, frames=frames, as_json=json,
         entry=entry, registry=registry,
+    )  # fmt: skip
+
+
+@data_app.command(name="view")
+def data_view(
+    datasets: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET [DATASET ...]")],
+    out: Path = Path("runs/view.html"),
+    split: str | None = None,
+    hz: float | None = None,
+    stride: int | None = None,
+    frames: int = 12,
+    episodes: int = 64,
+    shown: int = 6,
+    registry: Path | None = None,
+) -> None:
+    """Write one HTML page about datasets: clips with their actions, statistics, windows, what stands out.
+
+    Args:
+        datasets: RLDS directories, paths or URLs.
+        out: The page, a single file that needs nothing else.
+        split: The split to look at; the registry's, or train, if not given.
+        hz: Native rate of the frames, if the registry does not know the dataset or is wrong.
+        stride: Native frames per frame of the model; what comes nearest to 2 Hz if not given.
+        frames: Frames of the model's window, to count windows.
+        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        shown: Episodes to show.
+        registry: TOML file with entries of your own.
+    """
+    view_commands.view(
+        datasets, out, split=split, hz=hz, stride=stride, frames=frames, episodes=episodes, shown=shown,
+        registry=registry,
     )  # fmt: skip
 
 

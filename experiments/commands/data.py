@@ -71,9 +71,13 @@ def _convert(source: Source, to: To, default_name: str) -> None:
     _say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
     for reason, count in done.left_out.items():
         _say(f"left out {count:,} x: {reason}")
-    _say("to read it, add this entry to data_pipelines/registry/own.py, unless one of this name is known:")
+    inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
+    _say(
+        "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "
+        "that file to all others with --registry; or add this to data_pipelines/registry/own.py:"
+    )
     _say(f"    {entry(done.spec)}")
-    wrote(done.directory, then=command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}"))
+    wrote(done.directory, then=inspect)
 
 
 def entry(spec: DatasetSpec) -> str:

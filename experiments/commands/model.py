@@ -67,7 +67,8 @@ def adapt(
     seed = study.seeds[0]
     new = [name for name in study.dataset_names() if name not in trained.table.names]
     require(bool(new), f"{source} already knows {', '.join(study.dataset_names())}: there is nothing to add")
-    robots = [materials.store.manifest(name).embodiment() for name in new]
+    scale = study.train.action_scale
+    robots = [materials.store.manifest(name).embodiment(scale) for name in new]
     params, table = add_embodiments(trained.params, trained.model, trained.table, robots, seed)
     only = () if everything else tuple(new)
     trial = dataclasses.replace(

@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.text import Text
 
 from experiments.atomic import write_atomically
+from experiments.commands.after_data import no_window, tokenize_command
 from experiments.commands.study import wrote
-from experiments.presets import get_preset
 from experiments.progress import console, step, tidy_table
-from experiments.setting import Where, command, use_entries
+from experiments.setting import use_entries
 from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ def list_datasets(words: Sequence[str], mixture: str | None, registry: Path | No
     if not shown:
         raise ConfigError(f"no entry has {' and '.join(map(repr, words))} in it; `hma data list` shows all")
     console.print(
-        f"{shown} entries. * not confirmed by a public source: the entry says what. Mixtures: "
+        f"{shown} entries. steps: of the middle episode, ~ of the mean one, ? nobody says. "
+        "* not confirmed by a public source: the entry says what. Mixtures: "
         f"{', '.join(MIXTURES)} (--mixture). A dataset of your own is one more entry; "
         "`hma data inspect DIR` suggests it."
     )
@@ -53,7 +54,7 @@ def _fits(spec: DatasetSpec, title: str, words: Sequence[str]) -> bool:
 
 
 def _table_of(title: str, specs: Sequence[DatasetSpec]):
-    table = tidy_table(title, "name", "dims", "Hz", "stride")
+    table = tidy_table(title, "name", "dims", "Hz", "stride", "episodes", "steps")
     table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
     table.add_column("image", overflow="fold")
     table.add_column("what it is", min_width=30)
@@ -64,6 +65,8 @@ def _table_of(title: str, specs: Sequence[DatasetSpec]):
             f"{spec.action_dim}",
             f"{spec.hz:g}",
             f"{spec.stride}",
+            f"{spec.episodes:,}" if spec.episodes else "?",
+            f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
             spec.image_key.removeprefix("observation/"),
             escape(spec.note) + unsure,
         )
@@ -93,7 +96,8 @@ def inspect(
         raise ConfigError(f"--hz must be positive, got {hz:g}")
     use_entries(registry)
     with step(f"read {directory}"):
-        facts, examples = inspect_dataset(directory, split, episodes=episodes)
+        sample = inspect_dataset(directory, split, episodes=episodes)
+    facts = sample.facts
     known = find_spec(facts.name)
     hz = hz or facts.hz
     suggestion = suggest_entry(facts, hz or (known.hz if known else None))
@@ -116,7 +120,7 @@ def inspect(
     blank = [c.key for c in facts.cameras if c.is_blank]
     title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
     sheet, aside = folder / SHEET, folder / f".{SHEET}"
-    draw_sheet(title, examples, blank).save(aside, format="png")
+    draw_sheet(title, sample.shown, blank).save(aside, format="png")
     aside.replace(sheet)
     wrote(sheet)
     if as_json is not None:
@@ -181,6 +185,7 @@ def _print_entry(facts: Facts, known: DatasetSpec | None, suggestion: Suggestion
     else:
         same = (known.image_key, known.action_keys, known.action_dims)
         fits = same == (suggestion.image_key, suggestion.action_keys, suggestion.action_dims)
+        fits &= set(suggestion.angles) <= set(known.angles)
         agrees = ", as its contents suggest" if fits else ". Its contents alone would suggest:"
         console.print(f"[bold]in the registry[/]: {escape(_in_words(known))}{agrees}", soft_wrap=True)
         if fits:
@@ -210,24 +215,11 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -> None:
-    """The command that reads the dataset as it was counted here, or why there is none."""
+    """The command that reads the dataset as it was counted here, or what to try where nothing can be read."""
     if windows is None:
         return
-    if not windows.total:
-        fits = facts.lengths.longest // windows.stride
-        advice = f"frames={fits} would fit" if fits > 1 else "they are too short for any window"
-        console.print(
-            f"next: nothing yet. No episode that was read is as long as a window of {windows.frames} frames; {advice}. "
-            "Is the rate another one (--hz)?",
-            soft_wrap=True,
-        )
-        return
-    preset = get_preset(Where.preset)
-    changes = {}
-    if windows.frames != preset.model.frames:
-        changes["model.frames"] = windows.frames
-    if windows.frames <= preset.eval.prompt_frames:
-        changes["eval.prompt_frames"] = max(windows.frames // 2, 1)
-    settings = tuple(f"{name}={value}" for name, value in changes.items())
-    asked = Where(data=(facts.directory,), registry=entries, set=settings).anywhere()
-    console.print(Text(f"next: {command('tokenize', *asked.words())}"), soft_wrap=True)
+    if windows.total:
+        words = tokenize_command((facts.directory,), windows.frames, entries)
+    else:
+        words = no_window(facts, windows.stride, entries)
+    console.print(Text(f"next: {words}"), soft_wrap=True)

@@ -15,6 +15,10 @@ Weights = Literal["auto", "last", "ema"]
 """Which weights of a run: the last ones, their moving average, or (`auto`) the average where the run
 keeps one (`TrainConfig.ema_decay`)."""
 
+ActionScale = Literal["deviation", "quantiles"]
+"""What actions are measured in: standard deviations from their mean, or such that their quantiles of 1 % and
+99 % become -1 and 1."""
+
 
 @dataclass(frozen=True)
 class MaskingConfig:
@@ -90,6 +94,7 @@ class TrainConfig:
     masking: MaskingConfig = field(default_factory=MaskingConfig)
     only: tuple[str, ...] = ()  # train these robots' own parameters and nothing else; (): everything
     ema_decay: float = 0.0  # of a moving average of the weights, kept beside them; 0: none
+    action_scale: ActionScale = "deviation"  # of robots new to the model
 
     def __post_init__(self):
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")

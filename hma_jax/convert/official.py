@@ -176,7 +176,7 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     remarks += _remarks(run.model, form)
     tensors = to_official(nested(arrays), official_parts(form, run.table, leaves))
     for entry in run.table.entries:
-        for name, values in zip(_statistics(entry.name), (entry.mean, entry.std), strict=True):
+        for name, values in zip(_statistics(entry.name), (entry.centre, entry.unit), strict=True):
             tensors[name] = np.asarray(values, np.float32)
     halves = run.provenance.get("official", {}).get("halves", {})
     return {name: _narrow(x, halves.get(name)) for name, x in tensors.items()}, remarks

@@ -6,6 +6,7 @@ the only place where the order of the embodiment axis E is decided.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax
@@ -24,6 +25,10 @@ class Embodiment:
 
     `mean` and `std` are over single native actions, length `action_dim`, in raw units. The
     action chunk of a frame is `stride` native actions, flattened sub-step-major.
+
+    A model is given actions in standard deviations from the mean or, where there are `low` and
+    `high`, on the scale on which these are -1 and 1; they are the quantiles of 1 % and 99 %, say, and
+    values beyond are not cut off.
     """
 
     name: str
@@ -33,6 +38,8 @@ class Embodiment:
     std: tuple[float, ...]
     # False: its video is of no use as a target (a policy dataset with blank cameras, say).
     video_targets: bool = True
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
 
     def __post_init__(self):
         require(
@@ -45,6 +52,25 @@ class Embodiment:
             bool(np.isfinite(self.mean).all() and np.isfinite(self.std).all()),
             f"embodiment {self.name!r}: action statistics are not finite; check its actions for NaN",
         )
+        require(
+            (len(self.low), len(self.high)) in ((0, 0), (self.action_dim, self.action_dim)),
+            f"embodiment {self.name!r}: low and high must both have {self.action_dim} entries, or none",
+        )
+        require(
+            bool(np.isfinite((*self.low, *self.high)).all())
+            and all(b > a or std <= DEAD_STD for a, b, std in zip(self.low, self.high, self.std)),
+            f"embodiment {self.name!r}: low must lie below high where actions vary, got {self.low} and {self.high}",
+        )
+
+    @property
+    def centre(self) -> tuple[float, ...]:
+        """What is 0 to a model, length `action_dim`, in raw units."""
+        return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True)) or self.mean
+
+    @property
+    def unit(self) -> tuple[float, ...]:
+        """What is 1 more, likewise."""
+        return tuple((b - a) / 2 for a, b in zip(self.low, self.high, strict=True)) or self.std
 
     @property
     def chunk(self) -> int:
@@ -90,34 +116,42 @@ class EmbodimentTable:
 
     def statistics(self) -> tuple[np.ndarray, np.ndarray]:
         """(mean_EU, std_EU), float32; both are 0 in the padding, std also in dead dimensions."""
-        mean = np.zeros((self.size, self.action_width), np.float32)
-        std = np.zeros((self.size, self.action_width), np.float32)
-        for i, e in enumerate(self.entries):
-            alive = [s if s > DEAD_STD else 0.0 for s in e.std]
-            mean[i, : e.chunk] = np.tile(e.mean, e.stride)
-            std[i, : e.chunk] = np.tile(alive, e.stride)
-        return mean, std
+        return self._tiled([(e.mean, e.std) for e in self.entries])
+
+    def scale(self) -> tuple[np.ndarray, np.ndarray]:
+        """(centre_EU, unit_EU) of what a model is given, float32, with zeros where `statistics` has them."""
+        return self._tiled([(e.centre, e.unit) for e in self.entries])
+
+    def _tiled(self, values: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[np.ndarray, np.ndarray]:
+        """One (zero, one) of single actions per robot, as float32 [E, U]; `one` is 0 in dead dimensions."""
+        zero = np.zeros((self.size, self.action_width), np.float32)
+        one = np.zeros((self.size, self.action_width), np.float32)
+        for i, (e, (centre, unit)) in enumerate(zip(self.entries, values, strict=True)):
+            alive = [u if s > DEAD_STD else 0.0 for u, s in zip(unit, e.std, strict=True)]
+            zero[i, : e.chunk] = np.tile(centre, e.stride)
+            one[i, : e.chunk] = np.tile(alive, e.stride)
+        return zero, one
 
     def alive(self) -> np.ndarray:
         """bool [E, U]: values that carry a signal, neither padding nor a dead dimension."""
         return self.statistics()[1] > 0
 
     def normalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """Raw chunks [B, ..., U] in units of each robot's standard deviation, from its mean.
+        """Raw chunks [B, ..., U] on each robot's own scale: see `Embodiment`.
 
         DIFFERS: padding and dead dimensions become exactly 0; the release divides by std + 1e-10,
         which turns rounding noise on a constant dimension into values of order 100 (reference
         section 5.6).
         """
-        mean, std = self._of(embodiment_B, actions.ndim)
-        return (actions - mean) * jnp.where(std > 0, 1 / jnp.where(std > 0, std, 1), 0)
+        centre, unit = self._of(embodiment_B, actions.ndim)
+        return (actions - centre) * jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1), 0)
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
-        """The inverse of `normalise`: raw units; dead dimensions take their mean."""
-        mean, std = self._of(embodiment_B, actions.ndim)
-        return actions * std + mean
+        """The inverse of `normalise`: raw units; dead dimensions take their centre."""
+        centre, unit = self._of(embodiment_B, actions.ndim)
+        return actions * unit + centre
 
     def _of(self, embodiment_B: jax.Array, ndim: int) -> tuple[jax.Array, jax.Array]:
-        """(mean, std) of each example's robot, shaped to meet [B, ..., U]."""
+        """(centre, unit) of each example's robot, shaped to meet [B, ..., U]."""
         shape = (-1, *(1,) * (ndim - 2), self.action_width)
-        return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.statistics())
+        return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.scale())

@@ -79,12 +79,13 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
     assert main([*tokenise, *small]) == 0
 
 
-def test_inspection_of_episodes_without_a_window_suggests_no_command(robot, tmp_path, capsys):
+def test_inspection_of_episodes_without_a_window_leads_to_those_that_fit(robot, tmp_path, capsys):
     arguments = ["--hz", "4", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
     assert main(["data", "inspect", str(robot), *arguments]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "about 0 windows" in said and "hma tokenize" not in said
-    assert "next: nothing yet. No episode that was read is as long as a window of 9 frames; frames=7 would fit." in said
+    assert f"next: hma data view {robot} --frames 7 --registry {tmp_path}/my.toml" in said
+    assert "so many frames fit its longest episode, 15 steps; train with --set model.frames=7" in said
 
 
 def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsys):
@@ -142,7 +143,7 @@ def test_contact_sheet_shows_every_frame_where_it_says():
     colours = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
     frames = [np.full((56, 40, 3), c, np.uint8) for c in colours]
     cameras = {"observation/a": frames, "observation/b": frames}
-    example = Shown(7, 30, True, "push the red thing", (0, 14, 29), cameras)
+    example = Shown(7, 30, True, "push the red thing", (0, 14, 29), cameras, {})
     pixels = np.asarray(draw_sheet("title", [example, example]))
     for colour in colours:  # a tile is 112 x 80: doubled, pixels kept; two cameras, two episodes
         assert (pixels == colour).all(axis=2).sum() == pytest.approx(4 * 112 * 80, rel=0.05)

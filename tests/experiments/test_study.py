@@ -78,9 +78,11 @@ def test_user_data_cuts_the_counts():
 
 def test_override_sets_nested_fields_and_lists():
     study = override(SMOKE, ["model.frames=3", "widths=4,16", "train.optimizer.learning_rate=1", "seeds=[0,1]",
-                             "execution.dtype=bfloat16", "store.frame_step=1", "model.mup.enabled=false"])  # fmt: skip
+                             "execution.dtype=bfloat16", "store.frame_step=1", "model.mup.enabled=false",
+                             "store.max_skipped=0.01", "train.action_scale=quantiles"])  # fmt: skip
     assert (study.model.frames, study.widths, study.seeds) == (3, (4, 16), (0, 1))
     assert study.train.optimizer.learning_rate == 1.0 and study.store.frame_step == 1
+    assert (study.store.max_skipped, study.train.action_scale) == (0.01, "quantiles")
     assert study.execution.dtype == "bfloat16" and study.model.mup.enabled is False
 
 
@@ -99,6 +101,8 @@ def test_override_sets_nested_fields_and_lists():
         ("model.diffusion.width=4", "model.diffusion is null in this study"),
         ("trajectory_counts=8,4", "must increase"),
         ("train.optimizer.schedule=linear", "train.optimizer.schedule: 'linear'.*constant, cosine, wsd"),
+        ("store.max_skipped=1.5", "store.max_skipped must be a whole number of episodes or, below 1, a share"),
+        ("train.action_scale=best", "train.action_scale: 'best'.*deviation, quantiles"),
         ("store.corrupt=ignore", "store.corrupt: 'ignore'.*raise, skip"),
         ("model.frames=null", "model.frames: expected int, got None"),
         ("widths=4,8.5", "widths: expected int, got 8.5"),

@@ -58,7 +58,7 @@ class RldsDataset(EpisodeSource):
         split: str = "train",
         *,
         corrupt: Corrupt = "raise",
-        max_skipped: int = MAX_SKIPPED,
+        max_skipped: float = MAX_SKIPPED,
         files: OpenFiles | None = None,
     ):
         super().__init__(corrupt, max_skipped)

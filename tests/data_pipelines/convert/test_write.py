@@ -8,10 +8,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from data_pipelines.sources.units import Episode, Layout, LeftOut, UnitError, require_module
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
+from data_pipelines.sources import robomimic, video
+from data_pipelines.sources.human import detections
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
+from data_pipelines.sources.units import (
+    Episode,
+    Layout,
+    LeftOut,
+    UnitError,
+    require_module,
+)
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import contents, number, picture, read_back
 
@@ -122,6 +130,20 @@ def test_damage_stops_or_is_left_out_and_counted(tmp_path):
     source = Counting(damaged=(4,), stop_at=1)  # what was done before is not read again
     done = convert(source, tmp_path, "toy", shard_bytes=1, skip_damaged=True)
     assert done.episodes == 6 and done.left_out == {"nothing in it": 3, "u4 is damaged": 1}
+
+
+@pytest.mark.parametrize("advice", [detections.ADVICE, robomimic.ADVICE, video.ADVICE])
+def test_who_leaves_damage_out_is_not_advised_to(tmp_path, monkeypatch, advice):
+    def read(self, unit):
+        if unit == 4:
+            raise UnitError(f"u4.mp4: no readable video. {advice}")
+        yield from plain(self, unit)
+
+    plain = Counting.read
+    monkeypatch.setattr(Counting, "read", read)
+    with pytest.raises(UnitError, match="--skip-damaged"):
+        convert(Counting(), tmp_path, "toy")
+    assert "u4.mp4: no readable video." in convert(Counting(), tmp_path, "toy", skip_damaged=True).left_out
 
 
 def spoil(part, key, value):

@@ -45,7 +45,7 @@ def hint(*episodes: np.ndarray) -> str:
 
 
 def test_counts_lengths_and_schema_of_a_known_directory(toy):
-    facts, _ = inspect_dataset(toy)
+    facts = inspect_dataset(toy).facts
     assert (facts.name, facts.version, facts.episodes, facts.sampled) == ("toy", "1.0.0", 6, 6)
     assert [(s.name, s.episodes, s.shards) for s in facts.splits] == [("train", 6, 2)]
     assert sorted(facts.steps) == LENGTHS
@@ -58,7 +58,7 @@ def test_counts_lengths_and_schema_of_a_known_directory(toy):
 
 
 def test_action_statistics_are_those_of_all_sampled_steps(toy):
-    facts, _ = inspect_dataset(toy)
+    facts = inspect_dataset(toy).facts
     (action,) = facts.actions
     steps = np.concatenate([np.arange(n) for n in LENGTHS])
     index, step, flag = action.dimensions
@@ -69,15 +69,15 @@ def test_action_statistics_are_those_of_all_sampled_steps(toy):
 
 
 def test_sample_is_bounded_in_episodes_and_bytes(toy):
-    facts, shown = inspect_dataset(toy, episodes=3, shown=2)
+    sample = inspect_dataset(toy, episodes=3, shown=2)
+    facts, shown = sample.facts, sample.shown
     assert (facts.sampled, facts.episodes, len(shown)) == (3, 6, 2)
-    assert inspect_dataset(toy, episodes=3)[0].steps == inspect_dataset(toy, episodes=3)[0].steps
-    assert inspect_dataset(toy, max_bytes=1)[0].sampled == 1
+    assert inspect_dataset(toy, episodes=3).facts.steps == inspect_dataset(toy, episodes=3).facts.steps
+    assert inspect_dataset(toy, max_bytes=1).facts.sampled == 1
 
 
 def test_shown_frames_are_those_of_their_times(toy):
-    _, shown = inspect_dataset(toy, frames=3)
-    for example in shown:
+    for example in inspect_dataset(toy, frames=3).shown:
         assert example.times[0] == 0 and example.times[-1] == example.steps - 1
         assert example.instruction == "push" and example.success is bool(example.index % 2)
         (frames,) = example.frames.values()
@@ -89,7 +89,7 @@ def test_blank_camera_is_recognised_and_not_offered_as_a_target(tmp_path):
         features["steps/observation/image"] = [png(np.full((8, 8, 3), 9, np.uint8))] * 5
 
     directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
-    facts, _ = inspect_dataset(directory)
+    facts = inspect_dataset(directory).facts
     assert facts.cameras[0].is_blank and facts.cameras[0].still
     assert "video_targets=False" in suggest_entry(facts, 4).python()
 
@@ -101,7 +101,7 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
         if episode == 2:
             features["steps/observation/image"][0] = b"no image"
 
-    facts, _ = inspect_dataset(write_rlds(tmp_path, make_spec(), [5, 5, 5, 5], change=change))
+    facts = inspect_dataset(write_rlds(tmp_path, make_spec(), [5, 5, 5, 5], change=change)).facts
     assert facts.sampled == 2 and sum(facts.damaged.values()) == 2
     assert any("differ in length" in reason for reason in facts.damaged)
 
@@ -163,7 +163,7 @@ def test_camera_that_sees_from_outside_is_chosen(cameras, chosen):
 
 
 def test_suggested_python_is_an_entry_that_reads_the_dataset(toy):
-    facts, _ = inspect_dataset(toy)
+    facts = inspect_dataset(toy).facts
     suggestion = suggest_entry(facts, 4)
     (spec,) = eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})  # what pasting it does
     assert spec == suggestion.spec()
@@ -171,7 +171,7 @@ def test_suggested_python_is_an_entry_that_reads_the_dataset(toy):
 
 
 def test_without_a_rate_the_entry_says_where_it_is_missing(toy):
-    suggestion = suggest_entry(inspect_dataset(toy)[0], None)
+    suggestion = suggest_entry(inspect_dataset(toy).facts, None)
     assert "FILL IN" in suggestion.python() and any("--hz" in reason for reason in suggestion.reasons)
     with pytest.raises(ConfigError, match="hz, the native rate, must be positive"):
         eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})
@@ -179,18 +179,18 @@ def test_without_a_rate_the_entry_says_where_it_is_missing(toy):
 
 def test_dict_actions_are_suggested_field_by_field(tmp_path):
     spec = make_spec("parts", (2, 1))
-    suggestion = suggest_entry(inspect_dataset(write_rlds(tmp_path, spec, [5, 6]))[0], spec.hz)
+    suggestion = suggest_entry(inspect_dataset(write_rlds(tmp_path, spec, [5, 6])).facts, spec.hz)
     assert (suggestion.action_keys, suggestion.action_dims) == (spec.action_keys, spec.action_dims)
 
 
 def test_real_dataset_gets_the_entry_it_has():
-    facts, _ = inspect_dataset(REAL_DATA)
+    facts = inspect_dataset(REAL_DATA).facts
     known = get_spec("bridge_dataset")
     assert known in OWN
     assert suggest_entry(facts, 5).spec().facts() == known.facts()
 
 
 def test_windows_are_counted_over_the_sample(toy):
-    windows = window_facts(inspect_dataset(toy)[0], stride=2, frames=4)  # 8 steps each
+    windows = window_facts(inspect_dataset(toy).facts, stride=2, frames=4)  # 8 steps each
     assert (windows.needed, windows.long_enough) == (8, 4)
     assert windows.total == pytest.approx(1 + 1 + 2 + 2)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import inspect
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +16,12 @@ from data_pipelines.registry import (
     known_groups,
     register,
 )
+from data_pipelines.registry import openx_rest
 from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.openx import OPENX
+from data_pipelines.registry.openx_counts import EPISODES, LONG
+from data_pipelines.registry.openx_more import OPENX_MORE
+from data_pipelines.registry.openx_rest import OPENX_REST
 from data_pipelines.registry.toml_file import load_entries, to_toml
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.embodiments import EMBODIMENTS
@@ -79,9 +86,37 @@ def test_rates_that_the_release_gets_wrong_are_right():
 
 
 def test_termination_flags_and_future_actions_are_no_part_of_the_action():
-    dims = {"fractal20220817_data": 10, "kuka": 7, "bc_z": 7, "cmu_stretch": 7, "toto": 7, "droid": 7}
+    dims = {"fractal20220817_data": 10, "kuka": 7, "bc_z": 7, "cmu_stretch": 7, "toto": 7, "droid": 9}
     assert {name: get_spec(name).action_dim for name in dims} == dims
     assert not [s.name for s in all_specs() if any("terminate" in key for key in s.action_keys)]
+
+
+def test_open_x_entries_say_how_many_episodes_there_are():
+    """But bridge_data_v2, which tfds gives no count of."""
+    unknown = {s.name for s in (*OPENX, *OPENX_MORE, *OPENX_REST) if not s.episodes}
+    assert unknown == {"bridge_data_v2"}
+    assert set(EPISODES) <= {s.name for s in all_specs()}
+    language_table = get_spec("language_table")
+    assert (language_table.episodes, language_table.mean_steps) == (442_226, 15.9)
+    assert (get_spec("bridge_dataset").episodes, get_spec("bridge_dataset").median_steps) == (25, 10)
+
+
+def test_every_importable_dataset_of_the_catalogue_has_an_entry_or_a_reason():
+    from tensorflow_datasets.robotics.rtx import rtx
+
+    text = inspect.getsource(rtx)
+    published = set(re.findall(r"return '([a-z0-9_]+)/\d+\.\d+\.\d+'", text))
+    assert len(published) > 60
+    left_out = {"tidybot", "vima_converted_externally_to_rlds", "robo_ai_u_r5e"}
+    assert published - {s.name for s in all_specs()} == left_out
+    for name in left_out:
+        assert name.removesuffix(LONG) in inspect.getdoc(openx_rest)
+
+
+def test_what_an_entry_says_to_people_does_not_change_the_data():
+    spec = get_spec("droid_sample")
+    assert replace(spec, episodes=9, median_steps=1, mean_steps=2, note="x").facts() == spec.facts()
+    assert replace(spec, angles=(3,)).facts() != spec.facts()
 
 
 def test_constant_action_dimensions_are_safe_to_normalise():

@@ -304,6 +304,22 @@ def test_skip_is_bounded(directory):
         RldsDataset(directory, corrupt="skip", max_skipped=2)
 
 
+@pytest.mark.parametrize(("share", "lost"), [(0.34, 2), (0.17, 1), (0.16, 0), (0, 0)])
+def test_the_bound_may_be_a_share_of_the_episodes(directory, share, lost):
+    dataset = RldsDataset(directory, corrupt="skip", max_skipped=share)
+    assert dataset.max_skipped == lost
+    for i in range(lost):
+        dataset.skip(EpisodeError(f"episode {i} is broken"))
+    with pytest.raises(DataError, match=f"more than max_skipped={lost}"):
+        dataset.skip(EpisodeError("one too many"))
+
+
+@pytest.mark.parametrize("wrong", [1.5, -1, -0.1])
+def test_a_bound_that_is_neither_a_number_nor_a_share_is_refused(directory, wrong):
+    with pytest.raises(ConfigError, match="max_skipped must be a whole number"):
+        RldsDataset(directory, corrupt="skip", max_skipped=wrong)
+
+
 def test_skip_counts_an_episode_once(directory):
     dataset = RldsDataset(directory, corrupt="skip", max_skipped=1)
     error = EpisodeError("episode 1 is broken")

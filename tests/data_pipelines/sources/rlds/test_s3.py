@@ -59,7 +59,7 @@ def test_slow_and_failing_store_gives_the_same_index_episodes_and_facts(store, s
     for i in (7, 0):
         a, b = (d.episode(i, SPEC.image_key, SPEC.action_keys) for d in (here, there))
         assert np.array_equal(a.images, b.images) and np.array_equal(a.actions, b.actions)
-    (facts, _), (expected, _) = inspect_dataset(URL), inspect_dataset(str(store))
+    facts, expected = (inspect_dataset(where).facts for where in (URL, str(store)))
     assert facts.directory == f"{URL}/1.0.0" and facts.steps == expected.steps
     assert repr(facts.actions) == repr(expected.actions)  # some of their figures are NaN
 

@@ -1,0 +1,86 @@
+"""Episodes that are probably the same recording, within a split or in two of them.
+
+What is compared survives another compression or another size of the pictures: a coarse picture of
+an episode's first and last frame, and its actions at sixteen times. A fixed camera sees much the same
+in every episode, so pictures alone say little: where there are actions that vary, they decide too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.sources.rlds.images import fit_image
+
+SIDE = 16
+"""A picture is compared as SIDE x SIDE grey cells of its central square."""
+
+SAME_PICTURE = 7.0
+"""Grey levels, root mean square over the cells. The same frame of the three real samples compressed again
+or at 5/8 of its size differs by at most 5.3, frames of two episodes by 18 or more."""
+
+TIMES = 16
+SAME_ACTIONS = 0.02
+"""Standard deviations by which every compared action may differ."""
+
+
+@dataclass(frozen=True)
+class Fingerprint:
+    """What is compared of one episode."""
+
+    split: str
+    index: int
+    steps: int
+    pictures: np.ndarray  # float64 [2 for every camera, SIDE, SIDE], the first and the last frame
+    actions: np.ndarray  # float64 [TIMES, A]
+
+    @property
+    def name(self) -> str:
+        return f"{self.split} {self.index}"
+
+
+def coarse(frame: np.ndarray) -> np.ndarray:
+    """float64 [SIDE, SIDE]: the mean grey of each cell of a frame [H, W, 3]."""
+    return fit_image(frame, 4 * SIDE).mean(axis=2).reshape(SIDE, 4, SIDE, 4).mean(axis=(1, 3))
+
+
+def take_fingerprint(
+    split: str, index: int, steps: int, frames: dict[str, Sequence[np.ndarray]], actions: Sequence[np.ndarray]
+) -> Fingerprint:
+    """Of an episode: `frames` by camera, whose first and last are compared, and fields of `actions` [N, A]."""
+    pictures = [coarse(shown[at]) for _, shown in sorted(frames.items()) for at in (0, -1)]
+    times = np.linspace(0, steps - 1, TIMES).round().astype(int)
+    rows = [np.asarray(field, np.float64)[times] for field in actions]
+    pictures = np.reshape(pictures, (-1, SIDE, SIDE))
+    return Fingerprint(split, index, steps, pictures, np.concatenate([np.zeros((TIMES, 0)), *rows], axis=1))
+
+
+def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, ...]]:
+    """Groups of two or more that are probably one recording, each in the order given."""
+    if not episodes:
+        return []
+    rows = np.nan_to_num(np.concatenate([e.actions for e in episodes]))
+    scale = rows.std(axis=0)
+    alive = scale > 1e-6
+    groups: list[list[Fingerprint]] = []
+    for episode in episodes:
+        for group in groups:
+            if _same(group[0], episode, scale, alive):
+                group.append(episode)
+                break
+        else:
+            groups.append([episode])
+    return [tuple(group) for group in groups if len(group) > 1]
+
+
+def _same(a: Fingerprint, b: Fingerprint, scale: np.ndarray, alive: np.ndarray) -> bool:
+    if a.steps != b.steps or len(a.pictures) != len(b.pictures):
+        return False
+    moves = np.abs(np.nan_to_num(a.actions) - np.nan_to_num(b.actions))[:, alive]
+    if (moves > SAME_ACTIONS * scale[alive]).any():
+        return False
+    if not alive.any() and not (a.pictures.std(axis=(1, 2)) > SAME_PICTURE).any():
+        return False  # blank pictures and still actions: nothing to tell episodes apart by
+    return not (np.sqrt(((a.pictures - b.pictures) ** 2).mean(axis=(1, 2))) > SAME_PICTURE).any()

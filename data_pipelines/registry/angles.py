@@ -1,0 +1,46 @@
+"""Angles in an action that wrap: they jump by a whole turn where the motion goes on.
+
+Half of the values of such an angle lie at one end of its range and half at the other, so neither a
+mean nor a difference of them means anything. Told which values are angles, a reader gives them
+without the jumps, or as their sine and cosine, which have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+AngleForm = Literal["as_recorded", "unwrapped", "sine_cosine"]
+AngleUnit = Literal["radian", "degree", "turn"]
+
+TURN: dict[AngleUnit, float] = {"radian": 2 * np.pi, "degree": 360.0, "turn": 1.0}
+"""One whole turn in each unit."""
+
+
+def angle_width(width: int, angles: Sequence[int], form: AngleForm) -> int:
+    """Values of an action of `width` recorded ones, of which `angles` are given as `form`."""
+    return width + (len(angles) if form == "sine_cosine" else 0)
+
+
+def convert_angles(actions: np.ndarray, angles: Sequence[int], form: AngleForm, unit: AngleUnit) -> np.ndarray:
+    """float32 [N, A'] from the actions of one episode [N, A] in order, with the columns `angles` as `form`.
+
+    `unwrapped`: a step of more than half a turn becomes the shorter way round, counted from the
+    episode's first value, which stays as it is; the unit stays too. `sine_cosine`: the sine stands
+    where the angle stood and the cosine behind it, so that A' = A + len(angles).
+    """
+    if form == "as_recorded" or not angles:
+        return np.asarray(actions, np.float32)
+    columns = []
+    for d in range(actions.shape[1]):
+        values = actions[:, d].astype(np.float64)
+        if d not in angles:
+            columns.append(values)
+        elif form == "unwrapped":
+            columns.append(np.unwrap(values, period=TURN[unit]))
+        else:
+            phase = values * (2 * np.pi / TURN[unit])
+            columns += [np.sin(phase), np.cos(phase)]
+    return np.stack(columns, axis=1).astype(np.float32)

@@ -1,0 +1,113 @@
+"""Quantiles of actions that come in pieces: of all rows while they are few, of a sample of them beyond.
+
+The sample are the rows whose (episode, step) has the smallest hash. Which rows those are depends on
+the rows alone, not on the pieces, their order or who merged them. Up to `ROWS` rows the quantiles are
+exact. Beyond, the rows are a simple random sample: the value given as the p-quantile is that of a
+share p ± sqrt(p (1 - p) / ROWS) of the rows (one standard deviation): 0.16 points at 1 % and 99 %,
+0.78 at the median.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.loading.order import hash64, stream_seed
+
+ROWS = 4096
+"""Rows that a dataset's quantiles are taken of, at most."""
+
+QUANTILES = (0.01, 0.05, 0.5, 0.95, 0.99)
+"""Those that are kept."""
+
+MOST_STEPS = np.uint64(2**32)
+"""Of an episode, so that every (episode, step) has a number of its own."""
+
+SEED = stream_seed("quantiles")
+
+
+@dataclass(frozen=True)
+class RowSample:
+    """Rows of actions by increasing hash; JSON keeps them as text."""
+
+    hashes: str = ""  # uint64, little-endian, base64
+    rows: str = ""  # float32 [n, A] likewise
+    dim: int = 0  # A
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+        """(hashes uint64 [n], rows float32 [n, A])."""
+        hashes = np.frombuffer(base64.b64decode(self.hashes), "<u8")
+        return hashes, np.frombuffer(base64.b64decode(self.rows), "<f4").reshape(len(hashes), self.dim)
+
+    def quantiles(self) -> tuple[tuple[float, ...], ...]:
+        """For each of `QUANTILES` the values of all columns; () without rows.
+
+        A value that occurs: the smallest that at least so large a share of the rows does not exceed.
+        """
+        values = np.sort(self.arrays()[1], axis=0)
+        if not values.size:
+            return ()
+        at = [max(math.ceil(q * len(values)) - 1, 0) for q in QUANTILES]
+        return tuple(tuple(row) for row in values[at].astype(np.float64).tolist())
+
+
+class RowSampler:
+    """Collects the sample of rows that come episode by episode."""
+
+    def __init__(self, limit: int = ROWS):
+        self._limit = limit
+        self._hashes: list[np.ndarray] = []
+        self._rows: list[np.ndarray] = []
+        self._held = 0
+
+    def add(self, rows: np.ndarray, episode: int) -> None:
+        """The actions [N, A] of episode `episode` of the dataset, which comes once."""
+        numbers = np.uint64(episode) * MOST_STEPS + np.arange(len(rows), dtype=np.uint64)
+        self._put(hash64(numbers, SEED), np.asarray(rows, np.float32))
+
+    def add_sample(self, sample: RowSample) -> None:
+        """What another sampler kept, of other episodes."""
+        self._put(*sample.arrays())
+
+    def sample(self) -> RowSample:
+        self._shrink()
+        if not self._held:
+            return RowSample()
+        hashes, rows = self._hashes[0].astype("<u8"), self._rows[0].astype("<f4")
+        texts = (base64.b64encode(x.tobytes()).decode() for x in (hashes, rows))
+        return RowSample(*texts, rows.shape[1])
+
+    def _put(self, hashes: np.ndarray, rows: np.ndarray) -> None:
+        if rows.size:
+            self._hashes.append(hashes)
+            self._rows.append(rows)
+            self._held += len(hashes)
+        if self._held > 8 * self._limit:
+            self._shrink()
+
+    def _shrink(self) -> None:
+        if self._held:
+            hashes, rows = np.concatenate(self._hashes), np.concatenate(self._rows)
+            order = np.argsort(hashes, kind="stable")[: self._limit]
+            self._hashes, self._rows, self._held = [hashes[order]], [rows[order]], len(order)
+
+
+def merge_samples(samples: Iterable[RowSample]) -> RowSample:
+    """Of the rows of all, which are of different episodes; the same in whatever order and groups."""
+    sampler = RowSampler()
+    for sample in samples:
+        sampler.add_sample(sample)
+    return sampler.sample()
+
+
+def rows_of_part(parts: int) -> int:
+    """Rows to keep of one of `parts` parts: eight times its even share, so that all parts together stay small.
+
+    The parts have about as many bytes each. One with more than eight times its share of the dataset's
+    rows would be under-represented.
+    """
+    return min(ROWS, max(8 * ROWS // max(parts, 1), 32))

@@ -1,0 +1,159 @@
+"""What stands out of a dataset, each remark on data made to deserve it and on data that does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import simplejpeg
+from PIL import Image
+
+from data_pipelines.inspection.duplicates import Fingerprint, find_duplicates, take_fingerprint
+from data_pipelines.inspection.inspect import inspect_dataset
+from data_pipelines.inspection.remarks import make_remarks
+from data_pipelines.inspection.suggest import window_facts
+from data_pipelines.sources.rlds.images import decode_image
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
+
+SPEC = make_spec("toy", (3,))
+
+
+def scene(seed: int, shift: int = 0) -> np.ndarray:
+    """Blocks of colours, the same for one seed; `shift` moves them."""
+    blocks = np.random.default_rng(seed).integers(0, 255, (8, 8, 3)).astype(np.uint8)
+    return np.roll(np.kron(blocks, np.ones((8, 8, 1), np.uint8)), shift, axis=1)
+
+
+def healthy(episode: int, features: dict) -> None:
+    """A picture that moves and actions of every kind, different in every episode."""
+    steps = len(features["steps/action"])
+    features["steps/observation/image"] = [png(scene(episode, 2 * t)) for t in range(steps)]
+    features["steps/action"][:] = np.random.default_rng(episode).normal(size=(steps, 3))
+
+
+def remarks_of(tmp_path, change=healthy, lengths=(20,) * 8, spec=SPEC, frames=4) -> dict[str, str]:
+    def both(episode, features):
+        healthy(episode, features)
+        change(episode, features)
+
+    directory = write_rlds(tmp_path, make_spec("toy", (3,)), list(lengths), change=both)
+    sample = inspect_dataset(directory)
+    windows = window_facts(sample.facts, 2, frames)
+    found = make_remarks(sample.facts, spec, windows, find_duplicates(sample.fingerprints))
+    return {r.title: f"{r.kind}: {r.text}" for r in found}
+
+
+def test_nothing_stands_out_of_healthy_data(tmp_path):
+    assert remarks_of(tmp_path) == {}
+
+
+def test_no_window(tmp_path):
+    assert remarks_of(tmp_path, lengths=[5, 7], frames=4) == {
+        "no window": "bad: a window of 4 frames at stride 2 takes 8 steps; the longest of 2 episodes has 7"
+    }
+
+
+def test_some_short_episodes(tmp_path):
+    found = remarks_of(tmp_path, lengths=[5, 7, 8, 9], frames=4)
+    assert found["short episodes"].endswith("2 of 4 episodes are shorter")
+
+
+def test_constant_actions(tmp_path):
+    def change(episode, features):
+        features["steps/action"][:, 1] = 0.25
+
+    assert remarks_of(tmp_path, change) == {"constant action": "doubt: action: value 1 never changes"}
+
+
+def test_blank_camera_in_use(tmp_path):
+    def change(episode, features):
+        features["steps/observation/image"] = [png(np.full((8, 8, 3), 7, np.uint8))] * 20
+
+    found = remarks_of(tmp_path, change)
+    assert found["blank camera"].startswith("bad: observation/image (the camera in use)")
+
+
+def test_actions_and_frames_of_different_number(tmp_path):
+    def change(episode, features):
+        if episode == 2:
+            features["steps/action"] = features["steps/action"][:-1]
+
+    found = remarks_of(tmp_path, change)
+    assert found["cannot be read"].startswith("bad: 1 of the episodes drawn") and "action 19" in found["cannot be read"]
+
+
+def test_numbers_that_are_not_finite(tmp_path):
+    def change(episode, features):
+        if episode == 2:
+            features["steps/action"][3, 0] = np.nan
+
+    assert remarks_of(tmp_path, change)["not finite"].startswith("bad: action: value 0: 1 numbers are NaN")
+
+
+def wrapping(episode: int, features: dict) -> None:
+    features["steps/action"][:, 2] = (0.5 * np.arange(20) + np.pi) % (2 * np.pi) - np.pi
+
+
+def test_angles_that_wrap_unless_the_entry_mends_them(tmp_path):
+    found = remarks_of(tmp_path / "a", wrapping)
+    assert "value 2 jumps by a whole turn" in found["wrapping angle"] and "angles = [2]" in found["wrapping angle"]
+    for form in ("sine_cosine", "unwrapped"):
+        mended = replace(SPEC, angles=(2,), angle_form=form)
+        assert "wrapping angle" not in remarks_of(tmp_path / form, wrapping, spec=mended)
+
+
+def test_an_entry_that_names_what_is_not_there(tmp_path):
+    wrong = replace(SPEC, image_key="observation/rgb", action_keys=("action[:9]",), action_dims=(9,))
+    text = remarks_of(tmp_path, spec=wrong)["entry does not fit"]
+    assert text.startswith("bad") and "wants observation/rgb, action[:9] with 9 values" in text
+
+
+# --- duplicates ---------------------------------------------------------------------------------
+
+
+def test_the_same_recording_twice(tmp_path):
+    def change(episode, features):
+        if episode in (3, 6):
+            healthy(99, features)
+
+    assert remarks_of(tmp_path, change) == {"likely duplicates": "doubt: 1 episodes repeat another: train 3 = train 6"}
+
+
+@pytest.mark.parametrize("what", ["steps/action", "steps/observation/image"])
+def test_one_of_pictures_and_actions_alone_makes_no_duplicate(tmp_path, what):
+    def change(episode, features):
+        if episode in (3, 6):
+            other: dict = {"steps/action": np.zeros((20, 3), np.float32)}
+            healthy(99, other)
+            features[what] = other[what]
+
+    assert remarks_of(tmp_path, change) == {}
+
+
+def test_pictures_decide_where_no_action_varies(tmp_path):
+    def change(episode, features):
+        healthy(episode % 4, features)
+        features["steps/action"][:] = 0
+
+    assert "4 episodes repeat another" in remarks_of(tmp_path, change)["likely duplicates"]
+
+
+def test_a_recording_is_known_again_compressed_and_smaller():
+    """Real frames: one episode, the same at 5/8 of its size and as JPEG of quality 60, and another."""
+    one, other = inspect_dataset(REAL_DATA, shown=2).shown
+
+    def prints(index: int, change) -> Fingerprint:
+        frames = {camera: [change(np.ascontiguousarray(f)) for f in shown] for camera, shown in one.frames.items()}
+        return take_fingerprint("train", index, one.steps, frames, list(one.actions.values()))
+
+    same = prints(0, lambda f: f)
+    small = prints(1, lambda f: np.asarray(Image.fromarray(f).resize((40, 40), Image.Resampling.BOX)))
+    jpeg = prints(2, lambda f: decode_image(simplejpeg.encode_jpeg(f, quality=60)))
+    another = take_fingerprint("train", 3, other.steps, other.frames, list(other.actions.values()))
+    (group,) = find_duplicates([same, another, small, jpeg])
+    assert [e.index for e in group] == [0, 1, 2]
+
+
+def test_real_episodes_are_not_taken_for_each_other():
+    assert find_duplicates(inspect_dataset(REAL_DATA).fingerprints) == []

@@ -1,0 +1,158 @@
+"""Quantiles of a dataset's actions: exact while rows are few, within what is stated beyond, the same for everyone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.tokens.manifest import LATER, load_manifest
+from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, merge_samples, rows_of_part
+from data_pipelines.tokens.share import Share
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
+
+SPEC = make_spec("toy", (3,))
+
+
+def make_rows(episode: int, steps: int) -> np.ndarray:
+    return np.random.default_rng(episode).normal(size=(steps, 2)).astype(np.float32) * [1, 100]
+
+
+def sample_of(episodes: dict[int, np.ndarray], limit: int = ROWS) -> RowSample:
+    sampler = RowSampler(limit)
+    for number, rows in episodes.items():
+        sampler.add(rows, number)
+    return sampler.sample()
+
+
+def test_quantiles_of_few_rows_are_exact():
+    episodes = {e: make_rows(e, 40 + e) for e in range(8)}
+    rows = np.concatenate(list(episodes.values()))
+    expected = np.quantile(rows, QUANTILES, axis=0, method="inverted_cdf")
+    assert sample_of(episodes).quantiles() == tuple(map(tuple, expected.astype(np.float32).tolist()))
+
+
+def test_quantiles_of_many_rows_are_those_of_a_random_sample():
+    """Rows that drift within an episode and between episodes, as actions do."""
+    episodes = {e: np.sin(e / 50 + np.arange(200) / 60)[:, None].astype(np.float32) for e in range(500)}
+    rows = np.sort(np.concatenate(list(episodes.values()))[:, 0])
+    for q, (value,) in zip(QUANTILES, sample_of(episodes).quantiles(), strict=True):
+        share = np.searchsorted(rows, value, side="right") / len(rows)
+        assert abs(share - q) < 4 * np.sqrt(q * (1 - q) / ROWS)
+
+
+def test_neither_order_nor_pieces_change_a_bit():
+    episodes = {e: make_rows(e, 100) for e in range(120)}  # 12,000 rows
+    whole = sample_of(episodes)
+    backwards = sample_of(dict(reversed(episodes.items())))
+    thirds = [sample_of({e: rows for e, rows in episodes.items() if e % 3 == k}) for k in range(3)]
+    assert whole == backwards == merge_samples(thirds) == merge_samples(thirds[::-1])
+    assert from_dict(RowSample, json.loads(json.dumps(to_dict(whole)))) == whole
+    assert len(whole.arrays()[0]) == ROWS
+
+
+def test_what_all_parts_keep_is_small_and_yet_the_smallest_of_all():
+    parts = 64
+    pieces = [sample_of({p: make_rows(p, 1000)}, rows_of_part(parts)) for p in range(parts)]
+    assert merge_samples(pieces) == sample_of({p: make_rows(p, 1000) for p in range(parts)})
+    for parts in (1, 7, 64, 1024, 100_000):
+        assert 32 <= rows_of_part(parts) <= ROWS
+        assert rows_of_part(parts) == 32 or parts * rows_of_part(parts) <= 8 * ROWS + parts
+
+
+def test_video_alone_has_no_quantiles():
+    assert sample_of({0: np.zeros((5, 0), np.float32)}).quantiles() == ()
+    assert merge_samples([RowSample()]) == RowSample()
+
+
+def test_manifest_keeps_the_quantiles_whatever_the_number_of_processes(tmp_path):
+    rlds = write_rlds(tmp_path, SPEC, [5, 6, 7, 8, 9, 10, 11, 12], shards=2)
+    alone = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "one", part_size=500)
+    for process in range(3):
+        share = Share(process, 3)
+        shared = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "three", part_size=500, share=share)
+    rows = np.float32([(e, t, 0) for e in alone.train.episodes for t in range(5 + e)])
+    expected = np.quantile(rows, QUANTILES, axis=0, method="inverted_cdf")
+    assert alone.action_quantiles == tuple(map(tuple, expected.tolist()))
+    assert len(alone.train.parts) > 3
+    texts = [(tmp_path / store / "toy/manifest.json").read_bytes() for store in ("one", "three")]
+    assert texts[0] == texts[1] and shared == alone
+
+
+# --- as the scale of actions --------------------------------------------------------------------
+
+
+def test_quantiles_become_minus_one_and_one_and_back():
+    table = EmbodimentTable((Embodiment("arm", 2, 2, (0.0, 5.0), (3.0, 1e-9), low=(-2.0, 5.0), high=(6.0, 5.0)),))
+    raw = np.float32([[[-2, 5, 6, 5.1], [2, 5, 10, 5]]])
+    given = np.asarray(table.normalise(raw, np.array([0])))
+    np.testing.assert_allclose(given, [[[-1, 0, 1, 0], [0, 0, 2, 0]]])  # not cut off; dead values are 0
+    back = np.asarray(table.unnormalise(given, np.array([0])))
+    np.testing.assert_allclose(back, [[[-2, 5, 6, 5], [2, 5, 10, 5]]])
+
+
+def test_the_scale_is_an_option_and_off_by_default(tmp_path):
+    rlds = write_rlds(tmp_path, SPEC, [30] * 8)
+    manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
+    store = TokenStore(tmp_path / "store")
+    (plain,) = store.embodiment_table(["toy"]).entries
+    (scaled,) = store.embodiment_table(["toy"], "quantiles").entries
+    assert (plain.low, plain.high, plain.centre, plain.unit) == ((), (), plain.mean, plain.std)
+    assert (scaled.low[:2], scaled.high[:2]) == (
+        manifest.action_quantiles[0][:2], manifest.action_quantiles[-1][:2],
+    )  # fmt: skip
+    assert replace(scaled, low=(), high=()) == plain
+
+
+def test_a_value_that_moves_in_less_than_a_hundredth_is_measured_by_its_extremes(tmp_path):
+    def change(episode, features):
+        features["steps/action"][0, 2] = 4 if episode == 3 else 0
+
+    rlds = write_rlds(tmp_path, SPEC, [60] * 8, change=change)
+    manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", min_val=0, val_fraction=0.0)
+    assert manifest.action_quantiles[0][2] == manifest.action_quantiles[-1][2] == 0
+    scaled = manifest.embodiment("quantiles")
+    assert (scaled.low[2], scaled.high[2]) == (0, 4)
+
+
+def test_quantiles_of_some_trajectories_are_of_those_alone(tmp_path):
+    manifest = tokenize_dataset(SPEC, write_rlds(tmp_path, SPEC, [30] * 8), FakeTokenizer(), tmp_path / "store")
+    store = TokenStore(tmp_path / "store")
+    everything = range(len(manifest.train.episodes))
+    assert store.action_quantiles("toy", everything) == manifest.action_quantiles
+    first = store.action_quantiles("toy", [0])
+    number = manifest.train.episodes[0]
+    assert (first[0][0], first[-1][0], first[2][1]) == (number, number, 14)
+    assert manifest.embodiment("quantiles", first).high[1] == first[-1][1]
+
+
+def test_a_manifest_of_an_earlier_version_keeps_its_hash(tmp_path):
+    """As commit 282e5c0 wrote it and named it, with the fields that it had."""
+    tokenize_dataset(SPEC, write_rlds(tmp_path, SPEC, [6] * 6), FakeTokenizer(), tmp_path / "store")
+    path = tmp_path / "store/toy/manifest.json"
+    values = json.loads(path.read_text())
+    del values["action_quantiles"]
+    for name in LATER:
+        del values["spec"][name]
+    path.write_text(json.dumps(values))
+    assert load_manifest(path).hash() == "65a9e7defe4b3fd2"
+
+
+def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
+    rlds = write_rlds(tmp_path, SPEC, [6] * 6)
+    tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
+    path = tmp_path / "store/toy/manifest.json"
+    values = json.loads(path.read_text())
+    del values["action_quantiles"]
+    path.write_text(json.dumps(values))
+    manifest = load_manifest(path)
+    assert manifest.embodiment().low == ()
+    with pytest.raises(DataError, match="toy: its tokens .* kept no quantiles.*train.action_scale=deviation"):
+        manifest.embodiment("quantiles")

@@ -1,0 +1,143 @@
+"""`hma data view` from the command line: one page that needs nothing else, and what to run next."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.toml_file import to_toml
+from experiments.cli.main import main
+from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
+
+SPEC = make_spec("toy", (3,), hz=4)
+
+
+@pytest.fixture(autouse=True)
+def _registry(monkeypatch):
+    monkeypatch.setattr(registry_table, "_registered", {})
+
+
+def change(episode: int, features: dict) -> None:
+    random = np.random.default_rng(episode)
+    steps = len(features["steps/action"])
+    pictures = random.integers(0, 255, (steps, 8, 8, 3)).astype(np.uint8)
+    features["steps/observation/image"] = [png(picture) for picture in pictures]
+    features["steps/action"][:] = random.normal(size=(steps, 3))
+    features["steps/language_instruction"] = [b"<script>alert(1)</script>"] * steps
+
+
+@pytest.fixture
+def toy(tmp_path):
+    directory = write_rlds(tmp_path, SPEC, [20, 24, 30, 31], change=change)
+    (tmp_path / "my.toml").write_text(to_toml(SPEC))
+    return directory, tmp_path / "my.toml"
+
+
+class Page(HTMLParser):
+    """What a page holds, and that its tags close."""
+
+    VOID = {"meta", "img", "text", "line", "rect", "polyline", "br"}
+
+    def __init__(self, text: str):
+        super().__init__()
+        self.tags: list[str] = []
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.sources += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+
+def test_page_is_one_file_with_clips_curves_and_statistics(toy, tmp_path, capsys):
+    directory, entries = toy
+    out = tmp_path / "pages/page.html"
+    arguments = ["data", "view", str(directory), "--registry", str(entries), "--frames", "4", "--out", str(out)]
+    assert main(arguments) == 0
+    said, text = capsys.readouterr().out, out.read_text()
+    page = Page(text)
+    assert not page.open and "script" not in page.tags and "<script>" not in text
+    assert all(source.startswith(("data:image/webp", "#")) for source in page.sources)  # nothing is fetched
+    clips = [source for source in page.sources if source.startswith("data:")]
+    assert len(clips) == 4
+    with Image.open(io.BytesIO(base64.b64decode(clips[0].split(",")[1]))) as image:
+        assert image.is_animated and image.n_frames > 10
+    assert page.tags.count("polyline") == 4 * 3
+    for heading in ("histogram", "mean", "deviation", "1%", "5%", "50%", "95%", "99%", "min", "max"):
+        assert f"<th>{heading}</th>" in text or f"<th class=text>{heading}</th>" in text
+    assert 'name="viewport"' in text and "overflow-x: auto" in text
+    assert "toy: nothing stands out" in said and f"wrote {out}" in said
+    (command,) = re.findall(r"next: (hma tokenize .*)", said)
+    assert "--set model.frames=4" in command and "--registry" in command and str(directory) in command
+
+
+def test_a_dataset_without_windows_gets_a_command_that_finds_some(toy, tmp_path, capsys):
+    directory, entries = toy
+    arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]
+    assert main([*arguments, "--frames", "40"]) == 0
+    said = capsys.readouterr().out
+    assert "toy: no window: a window of 40 frames at stride 2 takes 80 steps; the longest of 4 episodes has 31" in said
+    assert "hma tokenize" not in said and re.search(r"next for toy: hma data view \S+ --frames 15 ", said)
+    assert main([*arguments, "--frames", "15"]) == 0 and "hma tokenize" in capsys.readouterr().out
+
+
+def test_several_datasets_share_a_page_and_only_those_with_windows_go_on(toy, tmp_path, capsys):
+    directory, entries = toy
+    out = tmp_path / "page.html"
+    arguments = ["data", "view", str(REAL_DATA), str(directory), "--registry", str(entries), "--out", str(out)]
+    assert main([*arguments, "--frames", "8"]) == 0
+    said, text = capsys.readouterr().out, out.read_text()
+    assert "bridge_dataset: no window" in said and "next for bridge_dataset: hma data view" in said
+    (command,) = re.findall(r"next: (hma tokenize .*)", said)
+    assert str(directory) in command and "bridge_dataset" not in command
+    assert text.count("<section") == 3 and "<td><b>0</b></td>" in text
+
+
+def test_an_unknown_dataset_is_shown_and_its_entry_comes_next(toy, tmp_path, capsys):
+    directory, _ = toy
+    out = tmp_path / "page.html"
+    assert main(["data", "view", str(directory), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "toy: rate unknown" in said
+    assert re.search(r"next for toy: hma data inspect \S+ --hz HZ --entry my_robots.toml", said)
+    assert main(["data", "view", str(directory), "--out", str(out), "--hz", "4"]) == 0
+    assert "--hz 4 --entry" in capsys.readouterr().out and "Not in the registry" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (("--hz", "0"), 2, "--hz must be positive"),
+        (("--frames", "1"), 2, "--frames must be at least 2"),
+        (("--shown", "9", "--episodes", "3"), 2, "--shown must lie between 1"),
+        (("--split", "nonsense"), 2, "no split 'nonsense'"),
+    ],
+)
+def test_a_mistake_is_one_message(toy, tmp_path, capsys, options, code, message):
+    assert main(["data", "view", str(toy[0]), "--out", str(tmp_path / "x.html"), *options]) == code
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and message in error and not (tmp_path / "x.html").exists()
+
+
+def test_the_same_page_twice_is_the_same_bytes(toy, tmp_path):
+    directory, entries = toy
+    out = tmp_path / "page.html"
+    pages = []
+    for _ in range(2):
+        assert main(["data", "view", str(directory), "--registry", str(entries), "--out", str(out)]) == 0
+        pages.append(out.read_bytes())
+    assert pages[0] == pages[1]
