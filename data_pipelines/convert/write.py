@@ -31,7 +31,7 @@ from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 from hma_jax.runtime.locks import Held
 
-ADVICE = re.compile(r" Fetch the file again, or leave [\w ]+ out with --skip-damaged\.$")
+ADVICE = re.compile(r" Fetch the file again, or leave [\w ]+ out with --skip-damaged[^.]*\.$")
 """What the message of a UnitError advises, of no use to whoever followed it."""
 
 CONVERTER = 1

@@ -194,7 +194,8 @@ def test_every_format_gives_frames_to_a_tokenizer(places):
 
 def test_every_format_is_inspected(places):
     for spec, place in places[:2]:
-        facts, shown = inspect_dataset(place)
+        sample = inspect_dataset(place)
+        facts, shown = sample.facts, sample.shown
         assert (facts.name, facts.hz, facts.episodes, facts.sampled) == (spec.name, spec.hz, 4, 4)
         assert spec.image_key in [c.key for c in facts.cameras] and shown[0].instruction
         assert spec.image_key in shown[0].frames and not facts.damaged
