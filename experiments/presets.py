@@ -24,7 +24,7 @@ from hma_jax.config import (
 
 SMOKE = Study(
     name="smoke",  # seconds: proves that every part runs; its numbers mean nothing
-    suite=SuiteConfig(scale=0.02),
+    suite=SuiteConfig(scale=0.02, validation=4),
     tokenizer=TokenizerConfig(image_size=16, downsample=4, bits=8, channels=16),
     tokenizer_train=TokenizerTrainConfig(steps=3, batch=4),
     model=ModelConfig(

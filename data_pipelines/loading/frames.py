@@ -18,7 +18,7 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.loading.mixture import make_mixture
 from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.loading.splits import held_out
+from data_pipelines.loading.splits import held_out_episodes
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
@@ -60,7 +60,7 @@ def make_frame_loader(
     for spec, directory in datasets:
         source = RldsDataset(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-        mask = held_out(spec.name, len(source), val_fraction, min_val, max_val)
+        mask = held_out_episodes(spec, source, val_fraction, min_val, max_val)
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):

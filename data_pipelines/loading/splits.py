@@ -7,9 +7,25 @@ everybody who reads the dataset.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from data_pipelines.loading.order import hash64, stream_seed
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
+    from data_pipelines.rlds.dataset import RldsDataset
+
+
+def held_out_episodes(
+    spec: DatasetSpec, source: RldsDataset, fraction: float, min_val: int, max_val: int
+) -> np.ndarray:
+    """bool [episodes] of a dataset, True for validation: the split that its entry names for that, whatever
+    its size, or else as `held_out` chooses."""
+    if spec.val_split:
+        return source.in_split(spec.val_split)
+    return held_out(spec.name, len(source), fraction, min_val, max_val)
 
 
 def held_out(

@@ -75,7 +75,7 @@ class OpenEpisode:
 
 
 class RldsDataset:
-    """Random access to the episodes of one split.
+    """Random access to the episodes of one split, or of several one after the other ("train+val").
 
     `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, then the
     newest version is taken. Shards are indexed when the object is made. Thread-safe; pickles.
@@ -110,6 +110,7 @@ class RldsDataset:
         meta = read_metadata(self.directory, split)
         self.name, self.version = meta.name, meta.version
         self.features = meta.features
+        self._shard_splits = meta.shard_splits
         self._index(meta.shards, meta.shard_lengths)
 
     def __len__(self) -> int:
@@ -192,6 +193,10 @@ class RldsDataset:
         """The flat features of episode `i`, as `example.parse_example` gives them."""
         with self._open(i, keys, lazy=False) as record:
             return record
+
+    def in_split(self, split: str) -> np.ndarray:
+        """bool [episodes]: those that lie in this one of the splits that are read."""
+        return np.array([s == split for s in self._shard_splits])[self._shard_of]
 
     def sizes(self) -> np.ndarray:
         """int64 [episodes]: bytes of each record."""

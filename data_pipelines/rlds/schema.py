@@ -40,13 +40,14 @@ class FlatFeature:
 
 @dataclass(frozen=True)
 class SplitMetadata:
-    """What tfds recorded about one split: flat schema, shard files and their record counts."""
+    """What tfds recorded about a split, or several: flat schema, shard files with their record counts and splits."""
 
     name: str
     version: str
     features: dict[str, FlatFeature]
     shards: list[Location]
     shard_lengths: list[int]
+    shard_splits: list[str]
 
 
 def resolve_version(directory: str | Location) -> Location:
@@ -85,7 +86,10 @@ def dataset_name(directory: str | Location) -> str:
 
 
 def read_metadata(directory: Location, split: str) -> SplitMetadata:
-    """Metadata of one split. Raises DataError for damaged files, ConfigError for an unknown split."""
+    """Metadata of one split, or of several one after the other as in "train+val".
+
+    Raises DataError for damaged files, ConfigError for an unknown split.
+    """
     # Imported here: it takes half a second that readers of a token store need not pay.
     import tensorflow_datasets as tfds
     from google.protobuf.json_format import ParseError
@@ -101,16 +105,19 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
         ) from error
     if file_format != "tfrecord":
         raise DataError(f"{directory}: fileFormat is {file_format!r}; only 'tfrecord' can be read.")
-    require(
-        split in info.splits,
-        f"{info.name}: no split {split!r} in {directory}; splits there: {listing(sorted(info.splits))}",
-    )
+    parts = split.split("+")
+    for part in parts:
+        require(
+            part in info.splits,
+            f"{info.name}: no split {part!r} in {directory}; splits there: {listing(sorted(info.splits))}",
+        )
     return SplitMetadata(
         name=info.name,
         version=str(info.version),
         features=_flatten(info.features, ""),
-        shards=[directory / Path(p).name for p in info.splits[split].filepaths],
-        shard_lengths=list(info.splits[split].shard_lengths),
+        shards=[directory / Path(p).name for part in parts for p in info.splits[part].filepaths],
+        shard_lengths=[n for part in parts for n in info.splits[part].shard_lengths],
+        shard_splits=[part for part in parts for _ in info.splits[part].shard_lengths],
     )
 
 

@@ -24,9 +24,11 @@ def arm(
     paint: int = 0,
     fist: float = 0.0,
     pushers: int = 1,
+    stripe: int = 1,
 ) -> Body:
     """A chain of revolute links. `heading` (degrees) is straight out; the first joint swings
-    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner.
+    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner, and after
+    every `stripe` links another colour comes.
 
     The last `pushers` links push objects; with a `fist` (its radius) only that does, and the
     arm passes above them.
@@ -42,7 +44,7 @@ def arm(
                 mount=base if i == 0 else (0.0, 0.0),
                 length=length,
                 radius=radius * taper**i,
-                paint=(paint + i) % 3,
+                paint=(paint + i // stripe) % 3,
                 touches=i >= len(lengths) - pushers and not fist,
             )
         )

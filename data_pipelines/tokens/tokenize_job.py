@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.loading.splits import held_out
+from data_pipelines.loading.splits import held_out_episodes
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
@@ -165,7 +165,7 @@ class _Work:
         self._source, self._plan, self._threads = source, plan, threads
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
-        self._is_val = held_out(plan.spec.name, len(source), s.val_fraction, s.min_val, s.max_val)
+        self._is_val = held_out_episodes(plan.spec, source, s.val_fraction, s.min_val, s.max_val)
 
     def make(self, part: Part) -> Iterator[Made]:
         """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""

@@ -42,17 +42,17 @@ def deltas(unit: float, grip: float = 1.0) -> tuple[JointRate | JointTarget, ...
 
 
 PICKER = family("picker",  # three links and a gripper: how far to turn each joint per step
-    Row(SLATE, 4, 240, (4, 14), claw_arm((0.6, 0.5, 0.14), 0.18, 0.34, 0.0, swing=80), deltas(1.0)),
-    Row(CHALK, 6, 90, (2, 12), claw_arm((0.56, 0.52, 0.18), 0.17, 0.36, 0.1, swing=75), deltas(DEGREE), Camera(zoom=0.95)),
-    Row(CLAY, 8, 36, (4, 20), claw_arm((0.64, 0.46, 0.12), 0.19, 0.32, -0.1, swing=80), deltas(0.1, 0.08), Camera(rotate=9), dict(delay=1)),
-    Row(PLUM, 2, 14, (10, 60), claw_arm((0.58, 0.48, 0.2), 0.16, 0.34, 0.05, swing=85), deltas(TICK, 0.01), Camera(rotate=-7, zoom=0.92)),
-    Row(SAND, 16, 8, (1, 15), claw_arm((0.62, 0.5, 0.16), 0.18, 0.36, -0.05, swing=75), deltas(2 * math.pi), Camera(tilt=0.92)),
+    Row(SLATE, 4, 240, (4, 14), claw_arm((0.6, 0.5, 0.14), 0.18, 0.34, 0.0, swing=60, bend=95), deltas(1.0)),
+    Row(CHALK, 6, 90, (2, 12), claw_arm((0.56, 0.52, 0.18), 0.17, 0.36, 0.1, swing=56, bend=92), deltas(DEGREE), Camera(zoom=0.95)),
+    Row(CLAY, 8, 36, (4, 20), claw_arm((0.64, 0.46, 0.12), 0.19, 0.32, -0.1, swing=60, bend=95), deltas(0.1, 0.08), Camera(rotate=9), dict(delay=1)),
+    Row(PLUM, 2, 14, (10, 60), claw_arm((0.58, 0.48, 0.2), 0.16, 0.34, 0.05, swing=62, bend=98), deltas(TICK, 0.01), Camera(rotate=-7, zoom=0.92)),
+    Row(SAND, 16, 8, (1, 15), claw_arm((0.62, 0.5, 0.16), 0.18, 0.36, -0.05, swing=56, bend=92), deltas(2 * math.pi), Camera(tilt=0.92)),
     task=Carry(objects=1, size=0.23), instruction="bring the puck to the mark",
     physics=Physics(inertia=0.07, friction=3.0, bounce=0.1))
 
 
 def pair(lengths: tuple[float, ...], x: float, radius: float, fingers: float) -> Body:
-    return two_arms(lengths, tip=gripper(fingers, 0.09), base=(x, -0.8), radius=radius, swing=60, bend=100, taper=0.88)
+    return two_arms(lengths, tip=gripper(fingers, 0.09), base=(x, -0.8), radius=radius, swing=55, bend=85, taper=0.88)
 
 
 def targets(count: int, unit: float, offset: float = 0.0) -> tuple[JointTarget]:
@@ -70,8 +70,8 @@ BIMANUAL = family("bimanual",  # two arms of three joints, each with a gripper: 
 
 
 def cart(base: float, lengths: tuple[float, ...], radius: float, fingers: float) -> Body:
-    drive = rover(size=(base, base), reach=0.5, round_=True, speed=0.9, turn=1.8)
-    return attach(drive, attach(arm(lengths, heading=0, radius=radius, swing=80, bend=80, paint=1), gripper(fingers, 0.09)), at=2)
+    drive = rover(size=(base, base), reach=0.42, round_=True, speed=0.9, turn=1.8)
+    return attach(drive, attach(arm(lengths, heading=0, radius=radius, swing=70, bend=70, paint=1), gripper(fingers, 0.09)), at=2)
 
 
 def split(unit: float, turn: float, arm_unit: float = 1.0, grip: float = 1.0) -> tuple[Drive | JointTarget, ...]:

@@ -18,7 +18,7 @@ from data_pipelines.suite.tasks import Push, Reach
 def torso(lengths: tuple[float, ...], x: float, radius: float, fingers: float) -> Body:
     """Arms of six joints with hands of four fingers, two joints each."""
     return two_arms(lengths, tip=claw(4, 2, length=fingers, radius=0.075), base=(x, -0.85), radius=radius, taper=0.95,
-                    swing=60, bend=50)
+                    swing=60, bend=50, stripe=3)
 
 
 def by_side(unit: float, offset: float = 0.0) -> tuple[JointTarget, ...]:
@@ -39,7 +39,7 @@ HUMANOID = family("humanoid",  # where each joint is to be
 def trunks(link: float, x: float, radius: float, taper: float, bend: float) -> Body:
     """Two chains of fourteen joints; their last five links push."""
     return two_arms((link,) * 14, base=(x, -0.95), heading=95, radius=radius, taper=taper, swing=45, bend=bend, speed=1.6,
-                    pushers=5)
+                    pushers=5, stripe=5)
 
 
 def rates(unit: float) -> tuple[JointRate]:

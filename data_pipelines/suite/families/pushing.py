@@ -45,11 +45,11 @@ def rates(unit: float, count: int) -> tuple[JointRate]:
 
 
 ARM = family("arm",  # three links; the fist pushes, the rest passes above
-    Row(CHALK, 4, 300, (4, 14), arm((0.55, 0.45, 0.3), base=(0, -0.8), radius=0.17, fist=0.24, swing=80, bend=110), rates(1.0, 3)),
-    Row(SAND, 6, 110, (3, 16), arm((0.5, 0.5, 0.25), base=(-0.1, -0.85), radius=0.16, fist=0.26, swing=75, bend=105), rates(DEGREE, 3), Camera(rotate=8)),
-    Row(PLUM, 2, 40, (8, 40), arm((0.6, 0.42, 0.32), base=(0.1, -0.85), radius=0.18, fist=0.23, swing=70, bend=110), rates(2.4, 3), Camera(zoom=0.92)),
-    Row(SKY, 12, 16, (2, 10), arm((0.52, 0.4, 0.34), base=(0, -0.75), radius=0.15, fist=0.25, swing=85, bend=100), rates(0.5, 3), Camera(rotate=-9, zoom=1.05), dict(delay=2)),
-    Row(NIGHT, 30, 8, (6, 20), arm((0.58, 0.48, 0.26), base=(0.05, -0.9), radius=0.17, fist=0.25, swing=80, bend=115), rates(TICK, 3), Camera(tilt=0.9, zoom=0.96)),
+    Row(CHALK, 4, 300, (4, 14), arm((0.55, 0.45, 0.3), base=(0, -0.8), radius=0.17, fist=0.24, swing=60, bend=95), rates(1.0, 3)),
+    Row(SAND, 6, 110, (3, 16), arm((0.5, 0.5, 0.25), base=(-0.1, -0.85), radius=0.16, fist=0.26, swing=58, bend=92), rates(DEGREE, 3), Camera(rotate=8)),
+    Row(PLUM, 2, 40, (8, 40), arm((0.6, 0.42, 0.32), base=(0.1, -0.85), radius=0.18, fist=0.23, swing=55, bend=96), rates(2.4, 3), Camera(zoom=0.92)),
+    Row(SKY, 12, 16, (2, 10), arm((0.52, 0.4, 0.34), base=(0, -0.75), radius=0.15, fist=0.25, swing=62, bend=90), rates(0.5, 3), Camera(rotate=-9, zoom=1.05), dict(delay=2)),
+    Row(NIGHT, 30, 8, (6, 20), arm((0.58, 0.48, 0.26), base=(0.05, -0.9), radius=0.17, fist=0.25, swing=58, bend=98), rates(TICK, 3), Camera(tilt=0.9, zoom=0.96)),
     task=Push(objects=1, size=0.27), instruction="knock the puck onto the mark",
     physics=Physics(inertia=0.07, friction=2.5, bounce=0.4))
 
