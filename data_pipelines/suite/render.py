@@ -26,6 +26,9 @@ in numpy's indexing than rows of three."""
 LIGHT = np.array([-0.6, 0.8])
 """Where the light comes from, on the floor."""
 
+SOFTNESS = 2.0
+"""Pixels over which an edge fades, as a lens has it: one at the size of the studies."""
+
 SHADOW = 0.06
 """How far shadows fall from what throws them, world units."""
 
@@ -175,7 +178,7 @@ def _paint(canvas, view: View, centre, angle, half, radius: float, colour, relie
     frames, height, width = canvas.shape[:3]
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.abs([[cos, sin], [sin, cos]])  # how far each half extent reaches along x and y
-    extent = (np.einsum("aef,e->fa", turned, half) + radius) * view.scale + 1.0
+    extent = (np.einsum("aef,e->fa", turned, half) + radius) * view.scale + SOFTNESS
     size = np.minimum(np.ceil(2 * extent.max(0)).astype(int) + 1, (width, height))
     corner = np.clip(np.floor(centre - extent).astype(int), 0, np.array([width, height]) - size)
     across, down = 1 / view.scale  # world units per pixel
@@ -190,7 +193,7 @@ def _paint(canvas, view: View, centre, angle, half, radius: float, colour, relie
         if half[1] > 0:
             v = v - np.clip(v, -np.float32(half[1]), np.float32(half[1]))
     distance = np.sqrt(u * u + v * v)
-    cover = ((np.float32(radius + across / 2) - distance) * np.float32(view.scale[0])).ravel()
+    cover = ((np.float32(radius) - distance) * np.float32(view.scale[0] / SOFTNESS) + 0.5).ravel()
     # From here on only covered pixels: position in the window -> position in the canvas.
     hit = np.flatnonzero(cover > 0)
     area = int(size[0] * size[1])
