@@ -12,7 +12,7 @@ import numpy as np
 
 from data_pipelines.suite.spec import EmbodimentSpec
 
-CONTRAST = 0.75
+CONTRAST = 0.6
 """Colours are drawn towards mid-grey by this factor, as a real camera's are."""
 
 
@@ -33,9 +33,9 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
     """The looks of the episodes with these seeds, each a function of its own seed alone."""
     n, palette, count = len(seeds), spec.palette, spec.task.objects
     draws = [np.random.default_rng([seed, 4]) for seed in seeds]
-    light = np.array([rng.uniform(0.95, 1.05) for rng in draws])[:, None, None]
+    light = np.array([rng.uniform(0.97, 1.03) for rng in draws])[:, None, None]
     order = np.array([rng.permutation(len(palette.objects)) for rng in draws])[:, :count]
-    slope = np.array([rng.uniform(-3, 3, 2) for rng in draws], np.float32)
+    slope = np.array([rng.uniform(-2, 2, 2) for rng in draws], np.float32)
 
     def colours(base: np.ndarray) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))

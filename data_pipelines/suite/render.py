@@ -26,8 +26,11 @@ in numpy's indexing than rows of three."""
 LIGHT = np.array([-0.6, 0.8])
 """Where the light comes from, on the floor."""
 
-SOFTNESS = 2.0
-"""Pixels over which an edge fades, as a lens has it: one at the size of the studies."""
+SOFTNESS = 3.0
+"""Pixels over which an edge fades, as a lens has it: half as many at the size of the studies."""
+
+CAP = 0.7
+"""Of an object's contrast to mid-grey in the flat cap on its middle."""
 
 SHADOW = 0.06
 """How far shadows fall from what throws them, world units."""
@@ -130,7 +133,7 @@ def _scene(spec, looks, pose: Pose, objects, episode) -> Shapes:
     middle = (pose.origin[:, visible] + pose.tip[:, visible]) / 2
     count, size = objects.shape[1], spec.task.size
     robot = looks.robot[:, [links[i].paint for i in visible]]
-    cap = np.minimum(looks.objects * 0.7 + 70, 250)
+    cap = looks.objects * CAP + 128 * (1 - CAP)
     colours = np.concatenate([looks.objects, cap, robot], 1)[episode]
     return Shapes(
         centre=np.concatenate([objects, objects, middle], 1),
@@ -222,5 +225,5 @@ def _tone(u, v, distance, radius: float, angle, half) -> np.ndarray:
         cos, sin = np.cos(angle), np.sin(angle)
         slope = (cos * x + sin * y).astype(np.float32)[:, None, None] * u
         slope = slope + (cos * y - sin * x).astype(np.float32)[:, None, None] * v
-    tone = 1.06 + 0.3 * slope / radius - 0.25 * np.minimum(distance / radius, 1) ** 4
+    tone = 1.05 + 0.22 * slope / radius - 0.2 * np.minimum(distance / radius, 1) ** 4
     return np.clip(tone, 0.5, 1.3).astype(np.float32).ravel()

@@ -9,6 +9,7 @@ import pytest
 
 from data_pipelines.suite import EMBODIMENTS, Environment
 from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.render import CAP
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from hma_jax.config import ConfigError
 
@@ -67,7 +68,7 @@ def test_a_kept_state_does_not_change_when_the_environment_does():
         np.testing.assert_array_equal(value, before[name], err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["pusher_slate", "pusher_night", "rover_clay", "gripper_road"])
+@pytest.mark.parametrize("name", ["pusher_night", "rover_clay", "omni_night", "gripper_sky"])
 def test_positions_are_where_things_are_in_the_frame(name):
     """The middle of an object has its cap's colour, wherever the camera stands."""
     env, found = Environment(name), 0
@@ -80,7 +81,7 @@ def test_positions_are_where_things_are_in_the_frame(name):
         if not (4 < thing.min() and thing.max() < 59) or np.linalg.norm(tool - thing) < 26:
             continue
         looks = draw_appearance(env.spec, [seed])
-        cap = np.minimum(looks.objects[0, 0, :3] * 0.7 + 70, 250)
+        cap = looks.objects[0, 0, :3] * CAP + 128 * (1 - CAP)
         column, row = np.round(thing).astype(int)
         assert np.abs(frame[row, column] - cap).max() <= 2
         found += 1

@@ -117,6 +117,24 @@ def test_the_validation_split_is_what_is_held_out(suite):
         RldsDataset(suite / spec.name, "train+test")
 
 
+def test_the_token_store_and_the_frame_loader_hold_out_the_validation_split(suite, tmp_path):
+    from data_pipelines.loading.frames import make_frame_loader
+    from data_pipelines.registry import get_spec
+    from data_pipelines.rlds.dataset import RldsDataset
+    from data_pipelines.tokens.tokenize_job import tokenize_dataset
+    from tests.data_pipelines.fakes import FakeTokenizer
+
+    spec = get_spec("pusher_mint")
+    manifest = tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path, min_val=1, max_val=1)
+    assert (len(manifest.train.episodes), len(manifest.val.episodes)) == (FEWEST, 3)
+
+    source = RldsDataset(suite / spec.name, "val")
+    recorded = np.concatenate([source.episode(i, spec.image_key, ()).images for i in range(3)])
+    batches = make_frame_loader([(spec, suite / spec.name)], 64, 8, 0, min_val=1, max_val=1, split="val")
+    for frame in next(batches):
+        assert (frame == recorded).all((1, 2, 3)).any(), "a frame of no validation episode"
+
+
 def test_images_are_jpegs_without_chroma_subsampling(suite):
     from data_pipelines.rlds.example import parse_example
 
