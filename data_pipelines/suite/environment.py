@@ -6,10 +6,9 @@ import numpy as np
 
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
-from data_pipelines.suite.render import render_frames
+from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
-from data_pipelines.suite.write import positions_of
 from hma_jax.config import require
 
 

@@ -100,6 +100,16 @@ def render_frames(
     return images
 
 
+def positions_of(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np.ndarray:
+    """float32 [F, P, 2]: where `spec.points` truly are in each frame, in pixels (column, row).
+
+    q [F, C], objects [F, K, 2]. (0, 0) is the middle of the first pixel; what is out of view lies
+    outside the image.
+    """
+    tools = spec.body.tool_points(spec.body.pose(q))
+    return View(spec.camera).points(np.concatenate([tools, objects], 1)).astype(np.float32)
+
+
 def _render_chunk(spec, view, looks, goals, q, objects, episode) -> np.ndarray:
     pose = spec.body.pose(q)
     ids, which = np.unique(episode, return_inverse=True)

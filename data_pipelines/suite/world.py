@@ -140,13 +140,14 @@ class World:
             queue = np.concatenate([s.pending, action[:, None]], 1)
             action, s.pending = queue[:, 0], queue[:, 1:]
         for _ in range(self.substeps):
-            self._move_body(action, h)
+            before = self._move_body(action, h)
             if self.spec.task.carries:
                 self._grip(h)
             self._slide(h)
-            self._separate(*self._before, h)
+            self._separate(*before, h)
 
-    def _move_body(self, action: np.ndarray, h: float) -> None:
+    def _move_body(self, action: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
+        """Moves the joints for h seconds; returns where all links began and ended before, [n, L, 2] each."""
         s, body, start = self._state, self.body, 0
         wanted = np.zeros_like(s.v)
         for control in self.spec.controls:
@@ -159,9 +160,10 @@ class World:
         s.q += (wanted + gap * (1 - fade) * self.spec.physics.inertia / h) * h
         s.v = wanted + gap * fade
         s.v[body.beyond(s.q)] = 0.0  # joints stop at their limits
-        self._before = self.pose.origin, self.pose.tip
+        before = self.pose.origin, self.pose.tip
         body.confine(s.q)
         self.pose = body.pose(s.q)
+        return before
 
     def _grip(self, h: float) -> None:
         """Closed grippers hold what is between their fingers; open ones let go, or throw."""
@@ -195,7 +197,8 @@ class World:
         s.object_v *= np.where(held, 1.0, slower)
 
     def _separate(self, old_origin: np.ndarray, old_tip: np.ndarray, h: float) -> None:
-        """Contact: links push objects, objects push each other, walls stop them."""
+        """Contact: links push objects, objects push each other, walls stop them. The links were at
+        `old_origin` and `old_tip` [n, L, 2] h seconds ago."""
         s, size, bounce = self._state, self.spec.task.size, self.spec.physics.bounce
         for i in self.pushers:
             link = self.body.links[i]

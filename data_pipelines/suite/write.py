@@ -27,7 +27,7 @@ from data_pipelines.rlds.writer import (
     write_info,
 )
 from data_pipelines.suite.appearance import draw_appearance
-from data_pipelines.suite.render import View, render_frames
+from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.spec import IMAGE_KEY, IMAGE_SIZE, EmbodimentSpec
 
@@ -105,16 +105,6 @@ def _records(spec: EmbodimentSpec, rollout: Rollout, start: int, stop: int) -> I
         positions = positions_of(spec, q, objects)
         for k, i in enumerate(block):
             yield encode_example(_features(spec, rollout, int(i), frames[episode == k], positions[episode == k]))
-
-
-def positions_of(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np.ndarray:
-    """float32 [F, P, 2]: where `spec.points` truly are in each frame, in pixels (column, row).
-
-    q [F, C], objects [F, K, 2]. (0, 0) is the middle of the first pixel; what is out of view lies
-    outside the image.
-    """
-    tools = spec.body.tool_points(spec.body.pose(q))
-    return View(spec.camera).points(np.concatenate([tools, objects], 1)).astype(np.float32)
 
 
 def _features(

@@ -24,9 +24,9 @@ import numpy as np
 
 from data_pipelines.registry.spec import stride_of
 from data_pipelines.suite.embodiments import EMBODIMENTS, siblings, strangers
+from data_pipelines.suite.render import positions_of
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
-from data_pipelines.suite.write import positions_of
 
 OUT = Path("experiments/results/suite/siblings.csv")
 EPISODES = 64

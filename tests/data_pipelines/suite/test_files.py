@@ -14,9 +14,8 @@ from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.generate import FEWEST, fingerprint, generate_suite
-from data_pipelines.suite.render import render_frames
+from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
-from data_pipelines.suite.write import positions_of
 from hma_jax.config import ConfigError
 
 NAMES = ("pusher_mint", "rover_slate", "mobile_sky")
