@@ -49,7 +49,7 @@ class Environment:
         return render_frames(self.spec, looks, world.goals, world.q, world.objects, np.zeros(1, int))[0]
 
     def positions(self) -> np.ndarray:
-        """float32 [P, 2]: where `spec.points` are in the frame, in pixels (column, row)."""
+        """float32 [P, 2]: where the points that the spec names are in the frame, in pixels (column, row)."""
         return positions_of(self.spec, self._world.q, self._world.objects)[0]
 
     def success(self) -> bool:

@@ -101,7 +101,7 @@ def render_frames(
 
 
 def positions_of(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np.ndarray:
-    """float32 [F, P, 2]: where `spec.points` truly are in each frame, in pixels (column, row).
+    """float32 [F, P, 2]: where the points that the spec names truly are in each frame, in pixels (column, row).
 
     q [F, C], objects [F, K, 2]. (0, 0) is the middle of the first pixel; what is out of view lies
     outside the image.

@@ -21,6 +21,9 @@ SUBSTEP_SECONDS = 1 / 15
 EDGE = 1.0
 """Objects stay on the floor, [-EDGE, EDGE] x [-EDGE, EDGE]."""
 
+START_GAP = 0.02
+"""Room between things at the start of an episode."""
+
 
 @dataclass
 class State:
@@ -119,8 +122,8 @@ class World:
             goals=goals, hand=np.zeros(n, int), seeds=seeds,
         )  # fmt: skip
         self.pose = body.pose(draws[0])
-        for _ in range(30):  # random places overlap; nothing may move by itself later
-            self._separate(self.pose.origin, self.pose.tip, 1.0)
+        for _ in range(60):  # random places overlap; apart, things do not move by themselves
+            self._separate(self.pose.origin, self.pose.tip, 1.0, START_GAP)
         self._state.object_v[:] = 0
         self._state.hand = np.linalg.norm(self.tools - objects[:, :1], axis=-1).argmin(1)
         self._state.pending = np.repeat(self._idle()[:, None], self.spec.delay, 1)
@@ -196,9 +199,9 @@ class World:
         s.objects += np.where(held, 0.0, s.object_v * (1 + slower) / 2 * h)
         s.object_v *= np.where(held, 1.0, slower)
 
-    def _separate(self, old_origin: np.ndarray, old_tip: np.ndarray, h: float) -> None:
+    def _separate(self, old_origin: np.ndarray, old_tip: np.ndarray, h: float, gap: float = 0.0) -> None:
         """Contact: links push objects, objects push each other, walls stop them. The links were at
-        `old_origin` and `old_tip` [n, L, 2] h seconds ago."""
+        `old_origin` and `old_tip` [n, L, 2] h seconds ago. Things nearer than `gap` are in contact."""
         s, size, bounce = self._state, self.spec.task.size, self.spec.physics.bounce
         for i in self.pushers:
             link = self.body.links[i]
@@ -211,7 +214,7 @@ class World:
             away = s.objects - near
             distance = np.linalg.norm(away, axis=-1, keepdims=True)
             normal = away / np.maximum(distance, 1e-6)
-            overlap = np.maximum(size + link.radius + link.half_width - distance, 0.0)
+            overlap = np.maximum(size + link.radius + link.half_width + gap - distance, 0.0)
             s.objects += normal * overlap
             closing = ((s.object_v - (near - before) / h) * normal).sum(-1, keepdims=True)
             s.object_v -= np.where((overlap > 0) & (closing < 0), (1 + bounce) * closing, 0.0) * normal
@@ -220,7 +223,7 @@ class World:
                 away = s.objects[:, k] - s.objects[:, j]
                 distance = np.linalg.norm(away, axis=1, keepdims=True)
                 normal = away / np.maximum(distance, 1e-6)
-                overlap = np.maximum(2 * size - distance, 0.0)
+                overlap = np.maximum(2 * size + gap - distance, 0.0)
                 closing = ((s.object_v[:, k] - s.object_v[:, j]) * normal).sum(-1, keepdims=True)
                 push = np.where((overlap > 0) & (closing < 0), -(1 + bounce) * closing / 2, 0.0)  # of equal mass
                 for which, sign in ((k, 0.5), (j, -0.5)):

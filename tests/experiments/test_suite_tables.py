@@ -7,11 +7,13 @@ import csv
 import numpy as np
 import pytest
 
-from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
+from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED, siblings
 from experiments.suite import explained as explained_module
 from experiments.suite.clips import animation, clip
 from experiments.suite.explained import explained, read_table
 from experiments.suite.siblings import OUT, Samples, judge, predictor, sample
+from experiments.suite.tokenizer import OUT as TOKENIZER
+from experiments.suite.tokenizer import quality
 
 BY_NAME = {s.name: s for s in EMBODIMENTS}
 
@@ -93,3 +95,20 @@ def test_a_clip_plays():
     frames = clip(spec, seconds=1.0)
     assert frames.shape == (10, 64, 64, 3) and (frames[0] != frames[-1]).any()
     assert animation(frames, spec.hz).startswith('<img alt="" src="data:image/webp;base64,')
+
+
+def test_pixels_that_change_are_judged_by_themselves():
+    pairs = np.zeros((1, 2, 4, 4, 3), np.uint8)
+    pairs[0, 1, 0] = 200  # one row of four changes
+    decoded = pairs[:, 1].astype(float)
+    decoded[0, 0] += 25.5  # and is wrong by a tenth of the range
+    mean, changed, share = quality(decoded, pairs)
+    assert share == pytest.approx(0.25)
+    assert changed == pytest.approx(20.0) and mean == pytest.approx(20 + 10 * np.log10(4))
+
+
+def test_the_default_tokenizer_gives_back_what_moves():
+    with TOKENIZER.open(newline="") as file:
+        *robots, mean = csv.DictReader(file)
+    assert [r["robot"] for r in robots] == sorted(s.name for s in TRAINED) and mean["robot"] == "mean"
+    assert float(mean["psnr"]) >= 30 and float(mean["psnr_changed"]) >= 24
