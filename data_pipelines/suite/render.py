@@ -29,6 +29,9 @@ LIGHT = np.array([-0.6, 0.8])
 SOFTNESS = 3.0
 """Pixels over which an edge fades, as a lens has it: half as many at the size of the studies."""
 
+DARK = 60.0
+"""Grey levels that a shadow takes away."""
+
 CAP = 0.7
 """Of an object's contrast to mid-grey in the flat cap on its middle."""
 
@@ -117,10 +120,10 @@ def _render_chunk(spec, view, looks, goals, q, objects, episode) -> np.ndarray:
     shapes = _scene(spec, looks, pose, objects, episode)
     shadows = [p for p in range(len(shapes.radius)) if shapes.relief[p]]
     shade = np.zeros((*canvas.shape[:3], 4), np.float32)  # one painting for all, so that none is darker where two meet
-    black = np.full((len(q), 4), 60, np.float32)
+    dark = np.full((len(q), 4), DARK, np.float32)
     for p in shadows:
         centre = view.points(shapes.centre[:, p] - SHADOW * LIGHT)
-        _paint(shade, view, centre, view.angles(shapes.angle[:, p]), shapes.half[p], shapes.radius[p], black, 0.0)
+        _paint(shade, view, centre, view.angles(shapes.angle[:, p]), shapes.half[p], shapes.radius[p], dark, 0.0)
     canvas = np.maximum(canvas - shade, 0)
     for p in range(len(shapes.radius)):
         _paint(
