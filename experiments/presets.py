@@ -66,7 +66,7 @@ CPU = Study(
     eval=EvalConfig(windows_per_dataset=8, batch=8),
     dataset_counts=(5, 20, 40),
     trajectory_counts=(4, 32, 500),
-    widths=(16, 32),
+    widths=(16, 32, 48),
     transfer=TransferConfig(datasets=10, steps=400),
     flops_per_second=2.5e10,
     trial_seconds=60.0,
