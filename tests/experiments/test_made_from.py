@@ -22,7 +22,7 @@ STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
 def made(tmp_path_factory) -> tuple[Path, list[str]]:
     """A directory in which `hma tokenize` ran with settings of its own."""
     root = tmp_path_factory.mktemp("made")
-    robots = (ARM, get_spec("bridge_data_v2"))
+    robots = (ARM, get_spec("dlr_edan_shared_control_converted_externally_to_rlds"))
     data = ["--data", *(str(write_rlds(root / "rlds", spec, LENGTHS)) for spec in robots)]
     assert main(["tokenize", *SMOKE, "--out", str(root / "out"), *data, "--set", "tokenizer_train.steps=5"]) == 0
     return root / "out", data
@@ -122,7 +122,7 @@ def test_the_command_of_the_issue(hma, out):
 def test_other_data_is_refused(hma, out, made, tmp_path):
     before, (_, arm, pusher) = contents(out), made[1]
     code, said = hma("tokenize", data=["--data", arm])
-    assert code == 2 and "datasets: 2 -> 1, without bridge_data_v2" in said and "--replace windows" in said
+    assert code == 2 and "datasets: 2 -> 1, without dlr_edan_shared_control_converted_externally_to_rlds" in said and "--replace windows" in said
     other = str(write_rlds(tmp_path, ARM, [20] * 6))
     code, said = hma("tokenize", data=["--data", other, pusher])
     assert code == 2 and f"data of {ARM.name}.shards: " in said and "--replace tokenizer" in said
@@ -273,6 +273,6 @@ def test_to_replace_a_step_is_to_replace_what_is_made_of_it():
 def test_the_stamp_holds_the_inputs(made):
     stamp = json.loads((made[0] / "tokenizer" / STAMP).read_text())
     assert stamp["inputs"]["tokenizer_train"]["steps"] == 5
-    assert stamp["inputs"]["datasets"] == [ARM.name, "bridge_data_v2"]
+    assert stamp["inputs"]["datasets"] == [ARM.name, "dlr_edan_shared_control_converted_externally_to_rlds"]
     assert set(stamp["recorded"]) == {"tau", "sources"}
     assert BASE.name not in stamp["inputs"]["data"]
