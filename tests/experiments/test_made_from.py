@@ -219,7 +219,7 @@ def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp
     before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]
     assert main([*command, "--set", "suite.seed=3", "--set", "suite.scale=0.1", "--set", "suite.validation=5"]) == 2
     said = capsys.readouterr().err
-    assert "suite.seed: 0 -> 3" in said and "suite.scale: 8 -> " in said and "--replace suite" in said
+    assert "suite.seed: 0 -> 3" in said and "suite.scale: 10 -> 50 episodes" in said and "--replace suite" in said
     assert "suite.validation: 4 -> 5 episodes" in said
     assert contents(out) == before
     assert main([*command, "--set", "suite.seed=3", "--replace", "suite"]) == 0
