@@ -169,11 +169,11 @@ def test_damage_can_be_left_out_and_is_counted(arm, tmp_path, capsys):
 
 def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
     def spoil(episode, features):
-        if episode >= 2:
+        if 2 <= episode <= 18:
             features["steps/action"][0] = np.nan
 
-    rlds = write_rlds(tmp_path, ARM, [8] * 24, change=spoil)
-    skip = ("--set", "store.corrupt=skip")
+    rlds = write_rlds(tmp_path, ARM, [8] * 40, change=spoil)
+    skip = ("--set", "store.corrupt=skip", "--set", "store.min_val=8")  # some of those held out are whole
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
     assert "17 episodes are unusable, more than max_skipped=16" in message and "episode 18" in message
     allowed = ("--set", "store.max_skipped=22")

@@ -7,12 +7,11 @@ import csv
 import numpy as np
 import pytest
 
-from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED, siblings
+from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
 from experiments.suite import explained as explained_module
 from experiments.suite.clips import animation, clip
 from experiments.suite.explained import explained, read_table
 from experiments.suite.siblings import OUT, Samples, judge, predictor, sample
-from experiments.suite.tokenizer import OUT as TOKENIZER
 from experiments.suite.tokenizer import quality
 
 BY_NAME = {s.name: s for s in EMBODIMENTS}
@@ -105,10 +104,3 @@ def test_pixels_that_change_are_judged_by_themselves():
     mean, changed, share = quality(decoded, pairs)
     assert share == pytest.approx(0.25)
     assert changed == pytest.approx(20.0) and mean == pytest.approx(20 + 10 * np.log10(4))
-
-
-def test_the_default_tokenizer_gives_back_what_moves():
-    with TOKENIZER.open(newline="") as file:
-        *robots, mean = csv.DictReader(file)
-    assert [r["robot"] for r in robots] == sorted(s.name for s in TRAINED) and mean["robot"] == "mean"
-    assert float(mean["psnr"]) >= 30 and float(mean["psnr_changed"]) >= 24
