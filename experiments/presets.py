@@ -24,7 +24,7 @@ from hma_jax.config import (
 
 SMOKE = Study(
     name="smoke",  # seconds: proves that every part runs; its numbers mean nothing
-    suite=SuiteConfig(scale=0.02),
+    suite=SuiteConfig(scale=0.02, validation=4),
     tokenizer=TokenizerConfig(image_size=16, downsample=4, bits=8, channels=16),
     tokenizer_train=TokenizerTrainConfig(steps=3, batch=4),
     model=ModelConfig(
@@ -47,25 +47,26 @@ CPU = Study(
     name="cpu",  # the study of the README: two cores, minutes
     suite=SuiteConfig(scale=1.0),
     store=StoreConfig(min_val=8),
-    tokenizer=TokenizerConfig(image_size=32, downsample=8, bits=12),
-    tokenizer_train=TokenizerTrainConfig(steps=2000, batch=32),
+    # 30 dB on held-out frames and 26 on what changes in them; 16 tokens of 24 bits come to 25 and 22.
+    tokenizer=TokenizerConfig(image_size=32, downsample=4, bits=16),
+    tokenizer_train=TokenizerTrainConfig(steps=3000, batch=32),
     model=ModelConfig(
-        width=64, layers=2, heads=2, frames=12, tokens=16, action_tokens=1, factor_vocab=64,
-        action_heads=False, mup=MupConfig(base_width=64),
-        # Twelve thousand windows must do where the release has millions: residual branches and
+        width=48, layers=2, heads=2, frames=12, tokens=64, action_tokens=1, factor_vocab=256,
+        action_heads=False, mup=MupConfig(base_width=48),
+        # Six thousand windows must do where the release has millions: residual branches and
         # stems that do not start near zero, and the chunk that leads to a frame given with it.
         trunk_gain=0.5, stem_gain=1.0, action_alignment="causal",
     ),
     execution=ExecutionConfig(remat="none"),
     train=TrainConfig(
-        steps=1000, batch=12,
+        steps=500, batch=12,
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
         masking=MaskingConfig(max_corrupt_rate=0.0, non_mlm_ratio=0.0),
     ),
-    eval=EvalConfig(windows_per_dataset=12, batch=12),
-    dataset_counts=(5, 10, 20, 40),
-    trajectory_counts=(4, 8, 16, 480),
-    widths=(24, 32, 64, 96),
+    eval=EvalConfig(windows_per_dataset=8, batch=8),
+    dataset_counts=(5, 20, 40),
+    trajectory_counts=(4, 32, 500),
+    widths=(16, 32, 48),
     transfer=TransferConfig(datasets=10, steps=400),
     flops_per_second=2.5e10,
     trial_seconds=60.0,

@@ -32,8 +32,9 @@ from hma_jax.config.json import from_dict, to_dict
 class SuiteConfig:
     """The simulated datasets; not used when a study runs on the user's own."""
 
-    scale: float = 1.0  # multiplies every dataset's number of episodes
+    scale: float = 1.0  # multiplies the largest dataset's number of episodes; the smallest keep theirs
     seed: int = 0
+    validation: int = 24  # held-out episodes of every dataset
 
 
 @dataclass(frozen=True)
@@ -158,14 +159,14 @@ class Study:
         """Every dataset of the study, in the order in which the datasets axis adds them."""
         if self.datasets:
             return self.datasets
-        from data_pipelines.suite.embodiments import EMBODIMENTS
+        from data_pipelines.suite.embodiments import TRAINED
 
         count = self.dataset_counts[-1]
         require(
-            count <= len(EMBODIMENTS),
-            f"dataset_counts asks for {count} datasets; the suite has {len(EMBODIMENTS)}",
+            count <= len(TRAINED),
+            f"dataset_counts asks for {count} datasets; the suite has {len(TRAINED)} to train on",
         )
-        return tuple(e.name for e in EMBODIMENTS[:count])
+        return tuple(e.name for e in TRAINED[:count])
 
 
 def on_user_data(study: Study, names: Sequence[str]) -> Study:

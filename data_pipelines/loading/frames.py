@@ -18,7 +18,7 @@ import numpy as np
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.loading.mixture import make_mixture
 from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.loading.splits import held_out
+from data_pipelines.loading.splits import held_out_episodes
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
@@ -61,7 +61,7 @@ def make_frame_loader(
     for spec, directory in datasets:
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-        mask = held_out(spec.name, source.ids, val_fraction, min_val, max_val)[source.numbers]
+        mask = held_out_episodes(spec, source, val_fraction, min_val, max_val)[source.numbers]
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):

@@ -8,9 +8,25 @@ divided is all episodes that there should be: which are damaged changes the plac
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from data_pipelines.loading.order import hash64, stream_seed
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
+    from data_pipelines.sources.source import EpisodeSource
+
+
+def held_out_episodes(
+    spec: DatasetSpec, source: EpisodeSource, fraction: float, min_val: int, max_val: int
+) -> np.ndarray:
+    """bool [episodes] of a dataset, all that are named, True for validation: the split that its entry names for
+    that, whatever its size, or else as `held_out` chooses."""
+    if spec.val_split:
+        return source.in_split(spec.val_split)
+    return held_out(spec.name, source.ids, fraction, min_val, max_val)
 
 
 def held_out(

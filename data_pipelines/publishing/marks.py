@@ -19,11 +19,11 @@ def read_metadata(directory: Path) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-def shard_lengths(directory: Path) -> list[int]:
-    """Records of every shard, as dataset_info.json says; empty if it cannot be read."""
+def shard_lengths(directory: Path, split: str | None = None) -> list[int]:
+    """Records of every shard, of one split or of all, as dataset_info.json says; empty if it cannot be read."""
     try:
         splits = json.loads((directory / "dataset_info.json").read_text())["splits"]
-        return [int(n) for split in splits for n in split["shardLengths"]]
+        return [int(n) for s in splits if split in (None, s["name"]) for n in s["shardLengths"]]
     except (OSError, ValueError, KeyError, TypeError):
         return []
 

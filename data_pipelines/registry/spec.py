@@ -63,6 +63,7 @@ class DatasetSpec:
     episodes: int = 0  # of `split`
     median_steps: float = 0.0  # of an episode
     mean_steps: float = 0.0
+    val_split: str = ""  # the part of `split` ("train+val") that is held out; "": episodes chosen by hash
 
     def __post_init__(self):
         name = self.name
@@ -78,6 +79,11 @@ class DatasetSpec:
         require(
             all(d >= 1 for d in self.action_dims),
             f"dataset {name!r}: action_dims must be at least 1, got {self.action_dims}",
+        )
+        require(
+            not self.val_split or self.val_split in self.split.split("+")[1:],
+            f"dataset {name!r}: val_split {self.val_split!r} is held out, so it must follow another in split, "
+            f"such as 'train+{self.val_split}'; got {self.split!r}",
         )
         for key, dim in zip(self.action_keys, self.action_dims, strict=True):
             part = field_slice(key)[1]

@@ -76,22 +76,22 @@ def _built_in() -> dict[str, DatasetSpec]:
 @functools.cache
 def _suite() -> tuple[DatasetSpec, ...]:
     from data_pipelines.suite.embodiments import EMBODIMENTS  # not needed to know the real ones
+    from data_pipelines.suite.spec import IMAGE_KEY
 
-    specs = []
-    for e in EMBODIMENTS:
-        prefix = "action/" if e.dict_actions else ""
-        specs.append(
-            DatasetSpec(
-                e.name,
-                image_key=f"observation/{e.image_keys[0]}",
-                action_keys=tuple(prefix + key for key, _ in e.action_layout),
-                action_dims=tuple(dim for _, dim in e.action_layout),
-                hz=e.hz,
-                camera=e.image_keys[0],
-                note=f"simulated {e.kind}, {e.convention} actions",
-            )
+    return tuple(
+        DatasetSpec(
+            e.name,
+            image_key=f"observation/{IMAGE_KEY}",
+            action_keys=tuple(key for key, _ in e.action_layout),
+            action_dims=tuple(dim for _, dim in e.action_layout),
+            hz=e.hz,
+            camera=IMAGE_KEY,
+            split="train+val",
+            val_split="val",
+            note=f"simulated {e.family}, {'video alone' if e.video_only else f'{e.convention} actions'}",
         )
-    return tuple(specs)
+        for e in EMBODIMENTS
+    )
 
 
 @functools.cache

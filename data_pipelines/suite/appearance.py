@@ -1,11 +1,11 @@
-"""How the episodes of an embodiment differ in looks: light, floor shade, object colours.
+"""How the episodes of a robot differ in looks: light and object colours.
 
-Drawn anew for every episode, so that a few trajectories do not cover the appearance of the
-rest and held-out episodes look new.
+Drawn anew for every episode from its seed, so that held-out episodes look new.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,53 +13,43 @@ import numpy as np
 from data_pipelines.suite.spec import EmbodimentSpec
 
 CONTRAST = 0.6
-"""Colours are drawn towards mid-grey by this factor, as a real camera's are. It sets the scale
-of all squared errors alike, so differences of PSNR do not depend on it."""
+"""Colours are drawn towards mid-grey by this factor, as a real camera's are."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """What differs between episodes: colours [n, ., 4] 0..255 and a light gradient [n, 2]."""
+    """What differs between episodes: colours float32 [n, ., 4] 0..255 (the fourth channel is
+    unused) and a gradient of the light [n, 2]."""
 
     floor: np.ndarray
     outside: np.ndarray
     robot: np.ndarray
     objects: np.ndarray
     goal: np.ndarray
-    distractors: np.ndarray
     slope: np.ndarray
 
 
-def draw_appearance(spec: EmbodimentSpec, n: int, seed: int) -> Appearance:
-    """The looks of n episodes: pure in (spec, n, seed)."""
-    rng = np.random.default_rng([seed, 4])
-    look = spec.look
-    light = rng.uniform(0.95, 1.05, (n, 1, 1)) * (1 + 0.008 * rng.standard_normal((n, 1, 3)))
+def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
+    """The looks of the episodes with these seeds, each a function of its own seed alone."""
+    n, palette, count = len(seeds), spec.palette, spec.task.objects
+    draws = [np.random.default_rng([seed, 4]) for seed in seeds]
+    light = np.array([rng.uniform(0.97, 1.03) for rng in draws])[:, None, None]
+    order = np.array([rng.permutation(len(palette.objects)) for rng in draws])[:, :count]
+    slope = np.array([rng.uniform(-2, 2, 2) for rng in draws], np.float32)
 
-    def colours(base: np.ndarray, spread: float) -> np.ndarray:
+    def colours(base: np.ndarray) -> np.ndarray:
         base = np.broadcast_to(base, (n, *np.shape(base)[-2:]))
-        lit = (base + spread * rng.standard_normal(base.shape)) * light
-        lit = np.clip(128 + CONTRAST * (lit - 128), 8, 247)
+        lit = np.clip(128 + CONTRAST * (base * light - 128), 8, 247)
         return np.pad(lit, ((0, 0), (0, 0), (0, 1))).astype(np.float32)
 
-    floor = np.array([look.floor]) + look.shade * rng.standard_normal((n, 1, 1))
-    things = [_hues(rng, (n, k)) for k in (spec.task.objects, look.distractors)]
-    if spec.task.objects:
-        goal = 0.55 * things[0][:, :1] + 0.45 * floor  # the mark has a pale shade of its object
-    else:
-        goal = 0.4 * np.array(look.robot[:1]) + 0.6 * floor
+    floor, objects = np.array([palette.floor]), np.array(palette.objects, float)[order]
+    owner = objects[:, :1] if spec.task.marks_object else np.array(palette.robot[:1])
+    goal = 0.45 * owner + 0.55 * floor  # a pale shade of what belongs there
     return Appearance(
-        floor=colours(floor, 2.0),
-        outside=colours(np.array([look.outside]), 2.5),
-        robot=colours(np.array(look.robot), 2.5),
-        objects=colours(things[0], 2.0),
-        goal=colours(goal, 1.0),
-        distractors=colours(things[1] * 0.75 + 40, 2.0),
-        slope=rng.uniform(-3, 3, (n, 2)).astype(np.float32),
+        floor=colours(floor),
+        outside=colours(np.array([palette.outside])),
+        robot=colours(np.array(palette.robot)),
+        objects=colours(objects),
+        goal=colours(goal),
+        slope=slope,
     )
-
-
-def _hues(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Strong colours [*shape, 3] from a wheel of six, all of similar brightness."""
-    phase = rng.integers(6, size=(*shape, 1)) * (np.pi / 3) + np.array([0.0, 2.1, 4.2])
-    return 130 + 95 * np.cos(phase)

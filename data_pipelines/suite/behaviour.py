@@ -19,19 +19,21 @@ class Behaviour:
     """
 
     def __init__(self, world: World, rng: np.random.Generator):
-        n = len(world.q)
+        n = len(world)
         self.world, self.rng = world, rng
         self.purpose = world.spec.purpose * rng.uniform(0.0, 2.0, n)  # some only play
         self.on_task = rng.random(n) < self.purpose
         self.wish = world.body.random(rng, n)
         self.bias = np.zeros_like(world.q)
+        self.done = np.zeros(n, bool)
 
     def act(self) -> np.ndarray:
         """[n, A] actions for the present state."""
         world, spec, body, rng = self.world, self.world.spec, self.world.body, self.rng
-        n = len(world.q)
+        n = len(world)
+        self.done |= world.success()
         change = rng.random(n) < spec.restless * world.dt
-        self.on_task = np.where(change, rng.random(n) < self.purpose, self.on_task) & ~world.done
+        self.on_task = np.where(change, rng.random(n) < self.purpose, self.on_task) & ~self.done
         arrived = np.abs(self.wish - world.q).max(1) < 0.15
         wish = body.random(rng, n)
         for grip in body.grips:
@@ -55,7 +57,7 @@ class Behaviour:
         far = np.linalg.norm(move, axis=-1, keepdims=True)
         move = move * np.minimum(1.0, 0.4 / np.maximum(far, 1e-9))
         goal = world.q + body.solve(world.pose, move)
-        busy = body.tool_joints[world.hand] if world.objects.shape[1] else body.tool_joints.any(0)
+        busy = body.tool_joints[world.hand]
         goal = np.where(busy, goal, self.wish)
         for m, grip in enumerate(body.grips):
             if grip >= 0:

@@ -2,10 +2,10 @@
 
 Owns geometry only: links, joints, where things are for a configuration, and which small
 change of configuration moves a tool somewhere. What an action means is `controls`, what a
-robot wants is `tasks`. World units: the fixed cameras see about [-1, 1] x [-1, 1].
+robot wants is `tasks`. World units: the cameras see about [-1, 1] x [-1, 1].
 
 Array letters of this package: n episodes (or frames), C configuration entries, L links,
-M tools.
+M tools, K objects, A action values.
 """
 
 from __future__ import annotations
@@ -87,6 +87,11 @@ class Body:
     @cached_property
     def speed(self) -> np.ndarray:
         return np.array([j.speed for j in self.joints])
+
+    def beyond(self, q: np.ndarray) -> np.ndarray:
+        """bool [n, C]: entries of q past a limit at which they stop."""
+        stops = np.array([not j.wraps for j in self.joints])
+        return stops & ((q < self.low) | (q > self.high))
 
     def confine(self, q: np.ndarray) -> None:
         """Brings q [n, C] back within the limits, in place."""

@@ -6,9 +6,9 @@ Bytes depend on the table, scale and seed, never on the number of workers.
 from __future__ import annotations
 
 import hashlib
+import math
 import multiprocessing
 import os
-import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
@@ -22,11 +22,17 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.write import write_dataset
 from hma_jax.config import ConfigError, require
 
-GENERATOR = 7
+GENERATOR = 8
 """Raise it when simulation, rendering or encoding change: older datasets are then remade."""
 
-MIN_EPISODES = 8
-"""At any scale: enough for a held-out split."""
+FEWEST = 8
+"""Training episodes of the smallest datasets, at any scale."""
+
+MOST = 500
+"""Training episodes of the largest dataset at scale 1."""
+
+VALIDATION = 24
+"""Held-out episodes of every dataset, whatever its size, in a split "val" of their own."""
 
 Progress = Callable[[str, int, int], None]
 """Called with (name of the dataset just finished or found complete, how many are, of how many)."""
@@ -43,12 +49,15 @@ def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
 
 
 def episode_count(spec: EmbodimentSpec, scale: float) -> int:
-    return max(MIN_EPISODES, round(spec.episodes * scale))
+    """Training episodes at a scale: the largest dataset has `scale` times as many as at 1, the
+    smallest always FEWEST, and what lies between is stretched evenly in the logarithm."""
+    stretch = max(math.log(scale * MOST / FEWEST) / math.log(MOST / FEWEST), 0.0)
+    return round(FEWEST * (spec.episodes / FEWEST) ** stretch)
 
 
-def fingerprint(spec: EmbodimentSpec, scale: float, seed: int) -> str:
+def fingerprint(spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION) -> str:
     """Hash of everything the bytes of this dataset depend on."""
-    text = repr((GENERATOR, spec, episode_count(spec, scale), seed))
+    text = repr((GENERATOR, spec, episode_count(spec, scale), validation, seed))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -57,17 +66,20 @@ def generate_suite(
     *,
     scale: float = 1.0,
     seed: int = 0,
+    validation: int = VALIDATION,
     names: Sequence[str] | None = None,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
-    `scale` multiplies the episode counts of the table. Datasets already complete with the
+    `scale` multiplies the size of the largest dataset, see `episode_count`; each has `validation`
+    held-out episodes besides. Datasets already complete with the
     same fingerprint are left as they are, others are remade; each appears all at once.
     Raises ConfigError for bad arguments or a root that cannot be written.
     """
     require(scale > 0, f"suite scale must be positive, got {scale}")
+    require(validation >= 1, f"suite validation must be at least 1 episode, got {validation}")
     require(workers >= 1, f"suite workers must be at least 1, got {workers}")
     specs, root = select(names), Path(root)
     try:
@@ -81,13 +93,13 @@ def generate_suite(
     missing = []
     finished = 0
     for spec, path in zip(specs, paths, strict=True):
-        if is_complete(path, fingerprint(spec, scale, seed)):
+        if is_complete(path, fingerprint(spec, scale, seed, validation)):
             finished += 1
             if progress:
                 progress(spec.name, finished, len(specs))
         else:
             missing.append(spec)
-    missing.sort(key=lambda s: -s.episodes * s.hz * len(s.cameras))  # the longest first
+    missing.sort(key=lambda s: -(episode_count(s, scale) + validation) * s.hz * sum(s.seconds))  # the longest first
 
     def report(name: str) -> None:
         nonlocal finished
@@ -97,31 +109,31 @@ def generate_suite(
 
     if workers == 1 or len(missing) <= 1:
         for spec in missing:
-            _make(spec.name, root, scale, seed)
+            _make(spec.name, root, scale, seed, validation)
             report(spec.name)
         return paths
     # Spawned, not forked: the caller may have started threads (JAX has).
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context) as pool:
-        jobs = {pool.submit(_make, spec.name, root, scale, seed): spec.name for spec in missing}
+        jobs = {pool.submit(_make, spec.name, root, scale, seed, validation): spec.name for spec in missing}
         for job in as_completed(jobs):
             job.result()
             report(jobs[job])
     return paths
 
 
-def _make(name: str, root: Path, scale: float, seed: int) -> None:
+def _make(name: str, root: Path, scale: float, seed: int, validation: int) -> None:
     """One dataset, unless another process makes it meanwhile."""
     (spec,) = select([name])
-    final, mark = root / name / VERSION, fingerprint(spec, scale, seed)
+    final, mark = root / name / VERSION, fingerprint(spec, scale, seed, validation)
     with claim(final.with_name(f".{VERSION}"), wait=True) as held:
         if is_complete(final, mark):
             return
         write_dataset(
             spec,
             held.scratch,
-            episodes=episode_count(spec, scale),
-            seed=zlib.crc32(f"{seed}/{name}".encode()),
-            metadata={FINGERPRINT: mark, "generator": GENERATOR, "seed": seed},
+            episodes={"train": episode_count(spec, scale), "val": validation},
+            seed=seed,
+            metadata={FINGERPRINT: mark, "generator": GENERATOR, "seed": seed, "family": spec.family},
         )
         publish(held.scratch, final)

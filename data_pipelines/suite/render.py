@@ -1,8 +1,8 @@
-"""The renderer: rounded boxes on a floor, antialiased, many frames at once.
+"""The renderer: rounded boxes on a floor, antialiased and shaded, many frames at once.
 
 Every shape is a rounded box: a disc has no extent but its corner radius, a capsule is a
-segment with one. Coverage comes from the signed distance, computed in a window just large
-enough for the shape, so the cost follows the painted area.
+segment with one. Coverage and shading come from the signed distance, computed in a window just
+large enough for the shape, so the cost follows the painted area.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ import numpy as np
 
 from data_pipelines.suite.appearance import Appearance
 from data_pipelines.suite.bodies import Pose
-from data_pipelines.suite.rollout import Rollout
-from data_pipelines.suite.spec import Camera, EmbodimentSpec
+from data_pipelines.suite.spec import IMAGE_SIZE, Camera, EmbodimentSpec
 
 CHUNK = 48
 """Frames drawn together: about what keeps canvas and windows in the cache."""
@@ -23,13 +22,56 @@ PIXEL = np.complex128
 """Pixels are moved as one 16-byte element (four float32, the last unused): six times faster
 in numpy's indexing than rows of three."""
 
+LIGHT = np.array([-0.6, 0.8])
+"""Where the light comes from, on the floor."""
+
+SOFTNESS = 3.0
+"""Pixels over which an edge fades, as a lens has it: half as many at the size of the studies."""
+
+DARK = 60.0
+"""Grey levels that a shadow takes away."""
+
+CAP = 0.7
+"""Of an object's contrast to mid-grey in the flat cap on its middle."""
+
+SHADOW = 0.06
+"""How far shadows fall from what throws them, world units."""
+
+
+class View:
+    """World to pixel, for one camera."""
+
+    def __init__(self, camera: Camera, size: int = IMAGE_SIZE):
+        turn = np.radians(camera.rotate)
+        cos, sin = np.cos(turn), np.sin(turn)
+        self.size, self.turn = size, turn
+        self.rotation = np.array([[cos, -sin], [sin, cos]])
+        self.centre = np.array(camera.centre)
+        self.scale = camera.zoom * size / 2 * np.array([1.0, camera.tilt])
+        """Pixels per world unit, across and down the image."""
+
+    def points(self, point: np.ndarray) -> np.ndarray:
+        """[..., 2] pixel (column, row), (0, 0) the middle of the first; the world's y points up."""
+        away = (point - self.centre) @ self.rotation.T
+        return self.size / 2 - 0.5 + self.scale * away * [1, -1]
+
+    def angles(self, angle: np.ndarray) -> np.ndarray:
+        """[...] in pixel axes (rows point down)."""
+        return -(angle + self.turn)
+
+    def world(self) -> np.ndarray:
+        """World (x, y) of every pixel, [H, W, 2]."""
+        row, column = np.mgrid[: self.size, : self.size]
+        seen = (np.stack([column, row], -1) - (self.size / 2 - 0.5)) / self.scale * [1, -1]
+        return seen @ self.rotation + self.centre
+
 
 @dataclass(frozen=True)
 class Shapes:
     """P rounded boxes in F frames, painted in order. World units, radians, colours 0..255.
 
     centre [F, P, 2], angle [F, P], half [P, 2] (extent without the corners), radius [P],
-    colour float32 [P, F, 4].
+    colour float32 [P, F, 4], relief [P] (0: flat, 1: round as a ball or a pipe).
     """
 
     centre: np.ndarray
@@ -37,155 +79,136 @@ class Shapes:
     half: np.ndarray
     radius: np.ndarray
     colour: np.ndarray
-
-
-def frame_index(rollout: Rollout, episodes: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """(episode, step) of every frame of these episodes, in order."""
-    lengths = rollout.lengths[episodes]
-    return np.repeat(episodes, lengths), np.concatenate([np.arange(k) for k in lengths])
+    relief: np.ndarray
 
 
 def render_frames(
     spec: EmbodimentSpec,
-    rollout: Rollout,
     looks: Appearance,
-    camera: Camera,
+    goals: np.ndarray,
+    q: np.ndarray,
+    objects: np.ndarray,
     episode: np.ndarray,
-    step: np.ndarray,
 ) -> np.ndarray:
-    """uint8 [F, H, W, 3] for the given (episode, step) pairs [F]."""
-    images = np.empty((len(step), camera.height, camera.width, 3), np.uint8)
-    for start in range(0, len(step), CHUNK):
+    """uint8 [F, H, W, 3] of configurations q [F, C] and objects [F, K, 2].
+
+    `episode` [F] says which of the n episodes of `looks` and `goals` [n, M, 2] a frame is of.
+    """
+    view = View(spec.camera)
+    images = np.empty((len(q), view.size, view.size, 3), np.uint8)
+    for start in range(0, len(q), CHUNK):
         part = slice(start, start + CHUNK)
-        images[part] = _render_chunk(spec, rollout, looks, camera, episode[part], step[part])
+        images[part] = _render_chunk(spec, view, looks, goals, q[part], objects[part], episode[part])
     return images
 
 
-def _render_chunk(spec, rollout, looks, camera, episode, step) -> np.ndarray:
-    pose = spec.body.pose(rollout.q[episode, step])
-    view = _View(camera, pose)
-    canvas = _background(spec, looks, view, episode)
-    shapes = _scene(spec, rollout, looks, pose, episode, step)
+def positions_of(spec: EmbodimentSpec, q: np.ndarray, objects: np.ndarray) -> np.ndarray:
+    """float32 [F, P, 2]: where the points that the spec names truly are in each frame, in pixels (column, row).
+
+    q [F, C], objects [F, K, 2]. (0, 0) is the middle of the first pixel; what is out of view lies
+    outside the image.
+    """
+    tools = spec.body.tool_points(spec.body.pose(q))
+    return View(spec.camera).points(np.concatenate([tools, objects], 1)).astype(np.float32)
+
+
+def _render_chunk(spec, view, looks, goals, q, objects, episode) -> np.ndarray:
+    pose = spec.body.pose(q)
+    ids, which = np.unique(episode, return_inverse=True)
+    canvas = _still(spec, view, looks, goals, ids)[which]
+    shapes = _scene(spec, looks, pose, objects, episode)
+    shadows = [p for p in range(len(shapes.radius)) if shapes.relief[p]]
+    shade = np.zeros((*canvas.shape[:3], 4), np.float32)  # one painting for all, so that none is darker where two meet
+    dark = np.full((len(q), 4), DARK, np.float32)
+    for p in shadows:
+        centre = view.points(shapes.centre[:, p] - SHADOW * LIGHT)
+        _paint(shade, view, centre, view.angles(shapes.angle[:, p]), shapes.half[p], shapes.radius[p], dark, 0.0)
+    canvas = np.maximum(canvas - shade, 0)
     for p in range(len(shapes.radius)):
         _paint(
             canvas,
+            view,
             view.points(shapes.centre[:, p]),
             view.angles(shapes.angle[:, p]),
-            shapes.half[p] * view.scale,
-            shapes.radius[p] * view.scale,
+            shapes.half[p],
+            shapes.radius[p],
             shapes.colour[p],
+            shapes.relief[p],
         )
-    return canvas.astype(np.uint8)[..., :3]
+    return np.clip(canvas[..., :3] + 0.5, 0, 255).astype(np.uint8)
 
 
-def _scene(spec, rollout, looks, pose: Pose, episode, step) -> Shapes:
-    """Goals, objects, distractors and robot, back to front."""
-    task, look, links = spec.task, spec.look, spec.body.links
-    frames = len(step)
-    goals = rollout.goals[episode][:, : 1 if task.objects else None]
-    objects, drift = rollout.objects[episode, step], rollout.distractors[episode, step]
+def _scene(spec, looks, pose: Pose, objects, episode) -> Shapes:
+    """Objects, each with a flat cap in the middle, and the robot, back to front."""
+    links = spec.body.links
     visible = [i for i, link in enumerate(links) if link.radius > 0]
     middle = (pose.origin[:, visible] + pose.tip[:, visible]) / 2
-    discs = np.concatenate([goals, objects, drift], 1)
-    sizes = [max(task.radius, 0.15)] * goals.shape[1]
-    sizes += [task.size] * objects.shape[1] + [look.distractor_size] * drift.shape[1]
-    count = discs.shape[1]
-    colours = [np.repeat(looks.goal, goals.shape[1], 1), looks.objects, looks.distractors]
-    colours.append(looks.robot[:, [links[i].paint for i in visible]])
+    count, size = objects.shape[1], spec.task.size
+    robot = looks.robot[:, [links[i].paint for i in visible]]
+    cap = looks.objects * CAP + 128 * (1 - CAP)
+    colours = np.concatenate([looks.objects, cap, robot], 1)[episode]
     return Shapes(
-        centre=np.concatenate([discs, middle], 1),
-        angle=np.concatenate([np.zeros((frames, count)), pose.angle[:, visible]], 1),
-        half=np.array([(0, 0)] * count + [(links[i].length / 2, links[i].half_width) for i in visible]),
-        radius=np.array(sizes + [links[i].radius for i in visible]),
-        colour=np.ascontiguousarray(np.concatenate(colours, 1)[episode].swapaxes(0, 1)),
+        centre=np.concatenate([objects, objects, middle], 1),
+        angle=np.concatenate([np.zeros((len(episode), 2 * count)), pose.angle[:, visible]], 1),
+        half=np.array([(0, 0)] * 2 * count + [(links[i].length / 2, links[i].half_width) for i in visible]),
+        radius=np.array([size] * count + [0.45 * size] * count + [links[i].radius for i in visible]),
+        colour=np.ascontiguousarray(colours.swapaxes(0, 1)),
+        relief=np.array([1.0] * count + [0.0] * count + [1.0] * len(visible)),
     )
 
 
-class _View:
-    """World to pixel for every frame of a chunk."""
-
-    def __init__(self, camera: Camera, pose: Pose):
-        frames = len(pose.angle)
-        turn = np.full(frames, np.radians(camera.rotate))
-        centre = np.broadcast_to(np.array(camera.centre, float), (frames, 2))
-        self.moving = camera.follow is not None
-        if self.moving:
-            heading = pose.angle[:, camera.follow]
-            cos, sin = np.cos(heading), np.sin(heading)
-            x, y = camera.centre
-            centre = pose.tip[:, camera.follow] + np.stack([cos * x - sin * y, sin * x + cos * y], 1)
-            turn = turn + np.pi / 2 - heading  # the link points up in the image
-        self.camera, self.centre, self.turn = camera, centre, turn
-        self.cos, self.sin = np.cos(turn), np.sin(turn)
-        self.scale = camera.zoom * min(camera.height, camera.width) / 2
-        self.mirror = -1.0 if camera.flip else 1.0
-        self.origin = np.array([camera.width / 2 - 0.5, camera.height / 2 - 0.5])
-
-    def points(self, point: np.ndarray) -> np.ndarray:
-        """[F, 2] pixel (column, row); the world's y points up."""
-        away = point - self.centre
-        x = (self.cos * away[:, 0] - self.sin * away[:, 1]) * self.mirror
-        y = self.sin * away[:, 0] + self.cos * away[:, 1]
-        return self.origin + self.scale * np.stack([x, -y], 1)
-
-    def angles(self, angle: np.ndarray) -> np.ndarray:
-        """[F] in pixel axes (rows point down)."""
-        return -self.mirror * (angle + self.turn)
-
-    def world(self) -> tuple[np.ndarray, np.ndarray]:
-        """World x and y of every pixel, [F or 1, H*W] float32."""
-        row, column = np.mgrid[: self.camera.height, : self.camera.width].reshape(2, -1).astype(np.float32)
-        left, top = (float(v) for v in self.origin)  # python floats keep the arrays float32
-        x = (column - left) / self.scale * self.mirror
-        y = (top - row) / self.scale
-        keep = slice(None) if self.moving else slice(0, 1)
-        cos, sin = self.cos[keep, None].astype(np.float32), self.sin[keep, None].astype(np.float32)
-        centre = self.centre[keep].astype(np.float32)
-        return cos * x + sin * y + centre[:, :1], -sin * x + cos * y + centre[:, 1:]
-
-
-def _background(spec, looks: Appearance, view: _View, episode: np.ndarray) -> np.ndarray:
-    """float32 canvas [F, H, W, 4]: floor, outside and the light's slope."""
-    x, y = view.world()
-    pattern = spec.look.pattern
-    inside = np.clip(((1.02 - np.maximum(np.abs(x), np.abs(y))) * view.scale), 0, 1)
+def _still(spec, view: View, looks: Appearance, goals, ids: np.ndarray) -> np.ndarray:
+    """float32 canvas [episodes, H, W, 4] of what does not move: floor, light, the goals' marks."""
+    xy = view.world().astype(np.float32)
+    x, y = xy[..., 0], xy[..., 1]
+    edge = float(view.scale[0])
+    inside = np.clip((1.03 - np.maximum(np.abs(x), np.abs(y))) * edge, 0, 1)
+    tint = np.zeros_like(x)
+    pattern = spec.palette.pattern
     if pattern == "table":
-        inside = np.clip((0.62 - np.abs(y + 0.15)) * view.scale, 0, 1)
+        tint = -14 * np.clip((np.abs(y + 0.1) - 0.55) * edge, 0, 1)
     elif pattern == "stripe":
-        inside = np.clip((np.abs(x) - 0.28) * view.scale, 0, 1)
-    elif pattern == "slope":
-        inside = np.clip(0.75 + 0.35 * y, 0, 1)
-    ids, which = np.unique(episode, return_inverse=True)
-    if view.moving:  # every frame sees another part of the floor
-        ids, which = episode, slice(None)
-    floor, outside = looks.floor[ids], looks.outside[ids]
-    light = looks.slope[ids, :1] * x + looks.slope[ids, 1:] * y
-    canvas = outside + inside[..., None] * (floor - outside) + light[..., None]
-    canvas = np.clip(canvas, 0, 254).reshape(-1, view.camera.height, view.camera.width, 4)
-    return canvas if view.moving else canvas[which]
+        tint = 16 * np.clip((0.16 - np.abs(x)) * edge, 0, 1)
+    elif pattern == "tiles":
+        tint = 12 * np.clip(np.sin(np.pi * x) * np.sin(np.pi * y) * edge, -1, 1)
+    elif pattern == "rings":
+        tint = 12 * np.clip((0.62 - np.hypot(x, y)) * edge, 0, 1)
+    light = looks.slope[ids, :1, None] * x + looks.slope[ids, 1:, None] * y
+    floor = looks.floor[ids][:, :, None] + (tint[..., None] + np.zeros(4, np.float32))
+    canvas = looks.outside[ids][:, :, None] + inside[..., None] * (floor - looks.outside[ids][:, :, None])
+    canvas = np.clip(canvas + light[..., None], 0, 254).astype(np.float32)
+    marks = goals[ids][:, : 1 if spec.task.marks_object else None]
+    for m in range(marks.shape[1]):
+        centre, angle = view.points(marks[:, m]), np.zeros(len(ids))
+        for radius, colour in ((spec.task.radius, looks.goal[ids, 0]), (0.72 * spec.task.radius, looks.floor[ids, 0])):
+            _paint(canvas, view, centre, angle, np.zeros(2), radius, np.ascontiguousarray(colour), 0.0)
+    return canvas
 
 
-def _paint(canvas, centre, angle, half, radius, colour) -> None:
-    """Blends one rounded box per frame into `canvas` [F, H, W, 4], in place. Pixel units."""
+def _paint(canvas, view: View, centre, angle, half, radius: float, colour, relief: float) -> None:
+    """Blends one rounded box per frame into `canvas` [F, H, W, 4], in place.
+
+    `centre` [F, 2] and `angle` [F] as the view gives them, `half` and `radius` in world units.
+    """
     frames, height, width = canvas.shape[:3]
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.abs([[cos, sin], [sin, cos]])  # how far each half extent reaches along x and y
-    extent = np.einsum("aef,e->fa", turned, half) + radius + 1.0
+    extent = (np.einsum("aef,e->fa", turned, half) + radius) * view.scale + SOFTNESS
     size = np.minimum(np.ceil(2 * extent.max(0)).astype(int) + 1, (width, height))
     corner = np.clip(np.floor(centre - extent).astype(int), 0, np.array([width, height]) - size)
-    dx = (corner[:, :1] + np.arange(size[0]) - centre[:, :1])[:, None, :].astype(np.float32)
-    dy = (corner[:, 1:] + np.arange(size[1]) - centre[:, 1:])[:, :, None].astype(np.float32)
+    across, down = 1 / view.scale  # world units per pixel
+    dx = ((corner[:, :1] + np.arange(size[0]) - centre[:, :1]) * across)[:, None, :].astype(np.float32)
+    dy = ((corner[:, 1:] + np.arange(size[1]) - centre[:, 1:]) * down)[:, :, None].astype(np.float32)
     if half[0] == half[1] == 0:
-        squared = dx * dx + dy * dy
+        u, v = dx, dy
     else:
-        cos, sin = (v.astype(np.float32)[:, None, None] for v in (cos, sin))
-        u = np.abs(cos * dx + sin * dy)
-        u = np.maximum(u - np.float32(half[0]), 0)
-        v = np.abs(cos * dy - sin * dx)
+        cos, sin = (a.astype(np.float32)[:, None, None] for a in (cos, sin))
+        u, v = cos * dx + sin * dy, cos * dy - sin * dx
+        u = u - np.clip(u, -np.float32(half[0]), np.float32(half[0]))
         if half[1] > 0:
-            v = np.maximum(v - np.float32(half[1]), 0)
-        squared = u * u + v * v
-    cover = (np.float32(radius + 0.5) - np.sqrt(squared)).ravel()
+            v = v - np.clip(v, -np.float32(half[1]), np.float32(half[1]))
+    distance = np.sqrt(u * u + v * v)
+    cover = ((np.float32(radius) - distance) * np.float32(view.scale[0] / SOFTNESS) + 0.5).ravel()
     # From here on only covered pixels: position in the window -> position in the canvas.
     hit = np.flatnonzero(cover > 0)
     area = int(size[0] * size[1])
@@ -197,7 +220,22 @@ def _paint(canvas, centre, angle, half, radius, colour) -> None:
     under = pixels[index]
     channels = under.view(np.float32).reshape(-1, 4)
     paint = np.repeat(colour.view(PIXEL)[:, 0], counts).view(np.float32).reshape(-1, 4)
+    if relief:
+        paint *= _tone(u, v, distance, radius, angle, half)[hit][:, None]
     paint -= channels
     paint *= np.minimum(cover[hit], 1)[:, None]
     channels += paint
     pixels[index] = under
+
+
+def _tone(u, v, distance, radius: float, angle, half) -> np.ndarray:
+    """How light a round surface is, flat over the window: its slope faces the light or not."""
+    x, y = LIGHT[0], -LIGHT[1]
+    if half[0] == half[1] == 0:
+        slope = x * u + y * v
+    else:  # u and v lie in the shape's axes
+        cos, sin = np.cos(angle), np.sin(angle)
+        slope = (cos * x + sin * y).astype(np.float32)[:, None, None] * u
+        slope = slope + (cos * y - sin * x).astype(np.float32)[:, None, None] * v
+    tone = 1.05 + 0.22 * slope / radius - 0.2 * np.minimum(distance / radius, 1) ** 4
+    return np.clip(tone, 0.5, 1.3).astype(np.float32).ravel()

@@ -1,4 +1,4 @@
-"""Builders of the robots that `embodiments` lists: arms, gantries, rovers, grippers, hands.
+"""Builders of the robots that `families` lists: arms, gantries, rovers, grippers, claws.
 
 Each returns a `Body`; `attach` and `join` combine them. Lengths in world units (the image is
 2 wide), angles in radians, speeds per second.
@@ -23,12 +23,15 @@ def arm(
     speed: float = 2.4,
     paint: int = 0,
     fist: float = 0.0,
+    pushers: int = 1,
+    stripe: int = 1,
 ) -> Body:
     """A chain of revolute links. `heading` (degrees) is straight out; the first joint swings
-    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner.
+    by +-`swing`, the others by +-`bend` degrees. Each link is `taper` times thinner, and after
+    every `stripe` links another colour comes.
 
-    The last link pushes objects; with a `fist` (its radius) only that does, and the arm
-    passes above them.
+    The last `pushers` links push objects; with a `fist` (its radius) only that does, and the
+    arm passes above them.
     """
     swing = bend if swing is None else swing
     links, joints = [], []
@@ -41,8 +44,8 @@ def arm(
                 mount=base if i == 0 else (0.0, 0.0),
                 length=length,
                 radius=radius * taper**i,
-                paint=(paint + i) % 3,
-                touches=i == len(lengths) - 1 and not fist,
+                paint=(paint + i // stripe) % 3,
+                touches=i >= len(lengths) - pushers and not fist,
             )
         )
         limit = math.radians(swing if i == 0 else bend)
@@ -73,22 +76,18 @@ def gripper(size: float = 0.2, radius: float = 0.06, paint: int = 2) -> Body:
 def finger(
     phalanges: int,
     *,
-    mount: tuple[float, float] = (0.0, 0.0),
     angle: float = 0.0,
     length: float = 0.25,
     radius: float = 0.07,
     curl: tuple[float, float] = (-0.2, 1.3),
-    coupled: bool = False,
-    tool: bool = True,
     paint: int = 1,
 ) -> Body:
-    """A finger that curls; `coupled` moves all phalanges by one joint (a tendon)."""
+    """A finger that curls. It carries no tool."""
     links = [
         Link(
             parent=i - 1,
-            joint=0 if coupled else i,
+            joint=i,
             angle=angle if i == 0 else 0.0,
-            mount=mount if i == 0 else (0.0, 0.0),
             length=length * 0.9**i,
             radius=radius * 0.92**i,
             paint=paint,
@@ -96,78 +95,43 @@ def finger(
         )
         for i in range(phalanges)
     ]
-    joints = (Joint(*curl, 3.5),) * (1 if coupled else phalanges)
-    return Body(tuple(links), joints, (phalanges - 1,) if tool else (), (-1,) if tool else ())
-
-
-def hand(
-    fingers: int,
-    phalanges: int,
-    *,
-    base: tuple[float, float] = (0.0, -0.55),
-    palm: float = 0.3,
-    length: float = 0.4,
-    radius: float = 0.1,
-    coupled: bool = False,
-) -> Body:
-    """A palm with fingers that fan out upwards, all of them tools."""
-    links = (Link(mount=base, angle=math.pi / 2, length=0.0, radius=palm),)
-    body = Body(links, (), (), ())
-    for i in range(fingers):
-        place = i / (fingers - 1) * 2 - 1  # -1 left ... 1 right, seen along the hand
-        curl = (-0.25, 1.35) if place > 0 else (-1.35, 0.25)
-        part = finger(
-            phalanges,
-            mount=(palm * 0.75 * math.cos(place * 1.3), -palm * 0.95 * math.sin(place * 1.3)),
-            angle=-place * 0.9,
-            length=length,
-            radius=radius,
-            curl=curl,
-            coupled=coupled,
-            paint=1 + i % 2,
-        )
-        body = attach(body, part, at=0)
-    return body
+    return Body(tuple(links), (Joint(*curl, 3.5),) * phalanges, (), ())
 
 
 def gantry(
     *,
-    reach: float = 0.72,
-    speed: float = 0.9,
-    size: float = 0.24,
+    reach: float = 0.68,
+    speed: float = 1.1,
+    size: float = 0.3,
     rail: bool = False,
     turns: bool = False,
-    bar: float = 0.3,
-    thick: float = 0.1,
     touches: bool = True,
 ) -> Body:
-    """A head that slides along x and y, drawn as a disc; with `rail` also its moving beam;
-    with `turns` the head carries a rotating bar of half-length `bar`, half-width `thick`."""
+    """A head that slides along x and y, drawn as a disc; with `rail` also its moving beam; with
+    `turns` it ends in a joint that turns what is attached to it."""
     links = [Link(joint=0, kind="slide_x")]
     if rail:
-        links.append(Link(parent=0, mount=(0.0, -1.2), angle=math.pi / 2, length=2.4, radius=0.09))
+        links.append(Link(parent=0, mount=(0.0, -1.2), angle=math.pi / 2, length=2.4, radius=0.08))
     links.append(Link(parent=0, joint=1, kind="slide_y", radius=size, paint=1, touches=touches))
+    links.append(Link(parent=len(links) - 1, radius=0.45 * size, paint=2))  # a cap: a head looks like no puck
     joints = [Joint(-reach, reach, speed)] * 2
     if turns:
-        links.append(Link(parent=len(links) - 1, joint=2))
+        links.append(Link(parent=len(links) - 2, joint=2))
         joints.append(Joint(-math.pi / 2, math.pi / 2, 2.4))
-    tool = len(links) - 1
-    if turns:
-        links.append(
-            Link(parent=tool, mount=(-bar, 0.0), length=2 * bar, radius=thick, paint=2, touches=touches)
-        )
-    return Body(tuple(links), tuple(joints), (tool,), (-1,))
+    return Body(tuple(links), tuple(joints), (len(links) - 1,), (-1,))
 
 
 def rover(
     *,
-    reach: float = 0.68,
-    size: tuple[float, float] = (0.26, 0.2),
-    speed: float = 0.8,
+    reach: float = 0.66,
+    size: tuple[float, float] = (0.32, 0.26),
+    speed: float = 1.0,
     turn: float = 2.6,
     round_: bool = False,
+    blade: float = 0.0,
 ) -> Body:
-    """A base free in x, y and heading: a box (or disc) with a nose that shows the heading."""
+    """A base free in x, y and heading: a box with wheels, or a disc, with a nose that shows the
+    heading, and a `blade` of that half width in front of it."""
     length, width = size
     links = [
         Link(joint=0, kind="slide_x"),
@@ -191,7 +155,12 @@ def rover(
                 touches=True,
             )
         )
-    links.append(Link(parent=2, mount=(0.45 * length, 0.0), length=0.3 * length, radius=0.1, paint=1))
+    links.append(Link(parent=2, mount=(0.4 * length, 0.0), length=0.3 * length, radius=0.11, paint=1))
+    if blade:
+        links.append(
+            Link(parent=2, mount=(length + 0.05, -blade), angle=math.pi / 2, length=2 * blade, radius=0.08, paint=2,
+                 touches=True)
+        )  # fmt: skip
     slide, heading = Joint(-reach, reach, speed), Joint(-math.pi, math.pi, turn, wraps=True)
     return Body(tuple(links), (slide, slide, heading), (2,), (-1,))
 
@@ -206,7 +175,6 @@ def claw(fingers: int, phalanges: int, *, length: float = 0.17, radius: float = 
                 length=length,
                 radius=radius,
                 curl=(-0.7, 0.7),
-                tool=False,
                 paint=2,
             )
             for i in range(fingers)
@@ -218,24 +186,13 @@ def two_arms(
     lengths: tuple[float, ...],
     *,
     tip: Body | None = None,
-    radius: float = 0.14,
-    base: tuple[float, float] = (0.5, -0.7),
+    base: tuple[float, float] = (0.5, -0.8),
     heading: float = 102.0,
-    swing: float = 55.0,
-    bend: float = 100.0,
-    taper: float = 0.88,
+    **shape: float,
 ) -> Body:
     """Two mirrored arms, left first, each with `tip` as its hand. Joints: arm, tip, arm, tip."""
     arms = []
     for side in (-1, 1):
-        one = arm(
-            lengths,
-            base=(base[0] * side, base[1]),
-            heading=90 + (heading - 90) * side,
-            radius=radius,
-            swing=swing,
-            bend=bend,
-            taper=taper,
-        )
+        one = arm(lengths, base=(base[0] * side, base[1]), heading=90 + (heading - 90) * side, **shape)
         arms.append(one if tip is None else attach(one, tip))
     return join(*arms)

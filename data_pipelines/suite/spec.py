@@ -1,6 +1,6 @@
-"""The record type of the embodiment table: everything that defines one simulated dataset.
+"""The record types of the tables: everything that defines one simulated robot and its dataset.
 
-Facts only; `embodiments` holds the table, `world` simulates it, `render` draws it.
+Facts only; `families` holds the tables, `world` simulates, `render` draws.
 """
 
 from __future__ import annotations
@@ -16,76 +16,98 @@ from hma_jax.config import require
 
 RGB = tuple[int, int, int]
 
+IMAGE_KEY = "image"
+IMAGE_SIZE = 64
+"""Pixels along each side of a recorded frame. Studies on two cores see them at 32."""
+
+LONGEST_SECONDS = 60.0
+
 
 @dataclass(frozen=True)
 class Camera:
-    """A view. Without `follow` it is fixed in the world; with it, it rides on that link.
+    """A fixed view: pixel = rotate(point - centre) * zoom, in halves of the image's side.
 
-    Pixel = flip(rotate(point - centre)) * zoom, in units of half the shorter image side.
+    The floor spans [-1, 1] x [-1, 1]. `tilt` < 1 looks at it from the front, so that it is less
+    high than wide.
     """
 
-    key: str = "image"
     rotate: float = 0.0  # degrees
     zoom: float = 1.0
-    centre: tuple[float, float] = (0.0, 0.0)  # in the world, or in the followed link's frame
-    flip: bool = False  # mirror left-right
-    follow: int | None = None
-    height: int = 64
-    width: int = 64
+    centre: tuple[float, float] = (0.0, 0.0)
+    tilt: float = 1.0
 
 
 @dataclass(frozen=True)
-class Look:
-    """Colours (0..255). Every episode draws its own light, floor shade and object colours."""
+class Palette:
+    """Colours (0..255). Every episode draws its own light and object colours."""
 
-    floor: RGB = (176, 168, 156)
-    outside: RGB = (120, 116, 112)
-    robot: tuple[RGB, RGB, RGB] = ((70, 90, 160), (215, 120, 60), (60, 60, 70))
-    pattern: Literal["plain", "slope", "stripe", "table"] = "plain"
-    shade: float = 4.0  # standard deviation of the floor's colour between episodes
-    distractors: int = 0
-    distractor_speed: float = 0.35  # world units per second
-    distractor_size: float = 0.13
+    name: str
+    floor: RGB
+    outside: RGB
+    robot: tuple[RGB, RGB, RGB]
+    objects: tuple[RGB, RGB, RGB]
+    pattern: Literal["plain", "tiles", "stripe", "table", "rings"] = "plain"
+
+
+@dataclass(frozen=True)
+class Physics:
+    """How things move: the same for all robots of a family."""
+
+    inertia: float = 0.08  # seconds in which a joint takes up the velocity it is asked for
+    friction: float = 2.5  # deceleration of a sliding object, world units per second squared
+    bounce: float = 0.2  # restitution of contacts
 
 
 @dataclass(frozen=True)
 class EmbodimentSpec:
-    """One embodiment = one dataset of the suite."""
+    """One robot = one dataset of the suite."""
 
     name: str
-    kind: Literal["arm", "pusher", "gripper", "rover", "mobile_arm", "bimanual", "hand"]
+    family: str
     hz: int
-    episodes: int  # at scale 1
+    episodes: int  # to train on, at scale 1
     body: Body
     controls: tuple[Control, ...]
     task: Task
     instruction: str
-    look: Look = Look()
-    cameras: tuple[Camera, ...] = (Camera(),)
-    seconds: tuple[float, float] = (8.0, 12.0)  # shortest and longest episode
+    palette: Palette
+    physics: Physics = Physics()
+    camera: Camera = Camera()
+    seconds: tuple[float, float] = (4.0, 14.0)  # shortest and longest episode
     dict_actions: bool = False  # one tensor per control, instead of one tensor
-    purpose: float = 0.5  # mean share of the time spent on the task; the rest explores
-    restless: float = 0.8  # changes of mind per second
-    noise: float = 0.15  # of the wishes, in units of what a joint can do in 0.5 s
+    video_only: bool = False  # the dataset does not say what the actions were
+    delay: int = 0  # native steps until an action is executed
+    purpose: float = 0.4  # mean share of the time spent on the task; the rest explores
+    restless: float = 1.2  # changes of mind per second
+    noise: float = 0.2  # of the wishes, in units of what a joint can do in 0.5 s
 
     def __post_init__(self):
         name = self.name
         require(bool(re.fullmatch(r"[a-z][a-z0-9_]*", name)), f"embodiment name {name!r} is not snake_case")
         require(1 <= self.hz <= 60, f"{name}: hz must lie in 1..60, got {self.hz}")
-        require(self.cameras[0].key == "image", f"{name}: the first camera must be called 'image'")
         keys = [c.key for c in self.controls]
         require(len(set(keys)) == len(keys), f"{name}: control keys repeat: {keys}")
-        require(self.seconds[0] <= self.seconds[1], f"{name}: seconds must be (shortest, longest)")
+        joints = sorted(j for c in self.controls for j in c.joints)
+        require(joints == list(range(self.body.size)), f"{name}: controls must move every joint once, got {joints}")
+        require(
+            1.0 <= self.seconds[0] <= self.seconds[1] <= LONGEST_SECONDS,
+            f"{name}: seconds must be (shortest, longest) within 1..{LONGEST_SECONDS:g}, got {self.seconds}",
+        )
+        require(self.delay >= 0, f"{name}: delay must not be negative, got {self.delay}")
 
     @property
     def action_dim(self) -> int:
+        """A, also of a robot whose dataset is video alone."""
         return sum(c.dim for c in self.controls)
 
     @property
     def action_layout(self) -> tuple[tuple[str, int], ...]:
-        """Ordered (key, dim) of the action's tensors; ("action", A) when it is a single one."""
+        """Ordered (key, dim) of the recorded action's tensors: one called "action", one for each
+        control, or none at all."""
+        if self.video_only:
+            return ()
         if self.dict_actions:
-            return tuple((c.key, c.dim) for c in self.controls)
+            return tuple((f"action/{c.key}", c.dim) for c in self.controls)
         return (("action", self.action_dim),)
 
     @property
@@ -94,5 +116,7 @@ class EmbodimentSpec:
         return self.controls[0].convention
 
     @property
-    def image_keys(self) -> tuple[str, ...]:
-        return tuple(c.key for c in self.cameras)
+    def points(self) -> tuple[str, ...]:
+        """Names of the P points whose true position comes with every frame: tools, then objects."""
+        tools = [f"tool_{m}" for m in range(len(self.body.tools))]
+        return (*tools, *(f"object_{k}" for k in range(self.task.objects)))

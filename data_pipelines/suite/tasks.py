@@ -19,24 +19,20 @@ class Scene(Protocol):
     objects: np.ndarray  # [n, K, 2]
     held: np.ndarray  # [n, M]: the object in each tool's grip, or -1
     hand: np.ndarray  # [n]: the tool that does the task
+    tools: np.ndarray  # [n, M, 2]
     tool_radius: float
     grasp: float  # how near a gripper must be to an object to hold it
-
-    @property
-    def tools(self) -> np.ndarray:
-        """[n, M, 2]"""
-        ...
 
 
 @dataclass(frozen=True)
 class Reach:
-    """All tools at their goals at the same moment. Objects, if any, are in the way."""
+    """All tools at their goals at the same moment. Objects are in the way."""
 
-    radius: float = 0.2
-    objects: int = 0
-    size: float = 0.17
+    radius: float = 0.25
+    objects: int = 1
+    size: float = 0.26
     carries: bool = False
-    pushes: bool = True
+    marks_object: bool = False  # the mark is where a tool should be, not an object
 
     def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         """Where the tools should go [n, M, 2], and gripper openings [n, M] (nan: no opinion)."""
@@ -51,11 +47,11 @@ class Reach:
 class Push:
     """Object 0 pushed onto the mark by the tool that is nearest at the start."""
 
-    radius: float = 0.22
+    radius: float = 0.28
     objects: int = 1
-    size: float = 0.2
+    size: float = 0.26
     carries: bool = False
-    pushes: bool = True
+    marks_object: bool = True
 
     def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         target = scene.tools.copy()
@@ -84,11 +80,11 @@ class Push:
 class Carry:
     """Object 0 gripped by the tool that is nearest at the start, and brought to the mark."""
 
-    radius: float = 0.2
+    radius: float = 0.28
     objects: int = 1
-    size: float = 0.15
+    size: float = 0.22
     carries: bool = True
-    pushes: bool = False
+    marks_object: bool = True
 
     def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         target = scene.tools.copy()

@@ -1,135 +1,235 @@
-"""The simulator: many episodes of one embodiment at once, quasi-static, in numpy.
+"""The simulator: many episodes of one robot at once, in numpy.
 
-Owns the state, contact, grasping and distractors; it does what actions say and decides
-nothing. All episodes advance together.
+Owns the state, momentum, contact and grasping; it does what actions say and decides nothing.
+Joints take a moment to reach the velocity they are asked for; objects slide, slow down by
+friction, hit each other and the walls, and stay where they come to rest. All episodes advance
+together, and none sees another: each is a function of its seed and its actions alone.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
 import numpy as np
 
-from data_pipelines.suite.bodies import Pose
 from data_pipelines.suite.spec import EmbodimentSpec
 
 SUBSTEP_SECONDS = 1 / 15
 """Longest physics step: bodies move less than an object's radius in it."""
 
-WALL = 0.8
-"""Objects stay within [-WALL, WALL]."""
+EDGE = 1.0
+"""Objects stay on the floor, [-EDGE, EDGE] x [-EDGE, EDGE]."""
+
+START_GAP = 0.02
+"""Room between things at the start of an episode."""
+
+
+@dataclass
+class State:
+    """Everything that changes in n episodes, and what distinguishes them. Copies share nothing."""
+
+    q: np.ndarray  # [n, C] configuration
+    v: np.ndarray  # [n, C] its velocity
+    objects: np.ndarray  # [n, K, 2]
+    object_v: np.ndarray  # [n, K, 2]
+    held: np.ndarray  # int [n, M]: the object in each tool's grip, or -1
+    hold: np.ndarray  # [n, M, 2]: where it lies in the grip
+    pending: np.ndarray  # [n, delay, A]: actions that were given and not executed yet
+    goals: np.ndarray  # [n, M, 2]
+    hand: np.ndarray  # int [n]: the tool that does the task
+    seeds: np.ndarray  # int64 [n]
+
+    def take(self, rows: np.ndarray | slice | Sequence[int]) -> State:
+        """Some of the episodes, copied; rows may repeat."""
+        return State(**{f.name: np.array(getattr(self, f.name)[rows]) for f in fields(self)})
 
 
 class World:
-    """The state of n episodes and its physics."""
+    """n episodes of a robot from their seeds on. `state` may be read, kept and put back."""
 
-    def __init__(self, spec: EmbodimentSpec, n: int, rng: np.random.Generator):
+    def __init__(self, spec: EmbodimentSpec, seeds: Sequence[int]):
         body, task = spec.body, spec.task
         self.spec, self.body, self.dt = spec, body, 1.0 / spec.hz
         self.substeps = int(np.ceil(self.dt / SUBSTEP_SECONDS - 1e-9))
-        self.q = body.random(rng, n, 0.7)
-        self.goals = self._reachable(rng, n)
-        self.objects = np.stack([self._reachable(rng, n)[:, 0] for _ in range(task.objects)], 1) if (
-            task.objects
-        ) else np.zeros((n, 0, 2))
-        if task.objects:  # an object that starts on its mark would be an empty task
-            away = self.objects[:, 0] - self.goals[:, 0]
-            close = np.linalg.norm(away, axis=1) < 2.5 * task.radius
-            self.objects[close, 0] = -self.objects[close, 0]
-        look = spec.look
-        self.distractors = rng.uniform(-0.9, 0.9, (n, look.distractors, 2))
-        heading = rng.uniform(0, 2 * np.pi, (n, look.distractors))
-        self.drift = look.distractor_speed * np.stack([np.cos(heading), np.sin(heading)], -1)
-        self.held = np.full((n, len(body.tools)), -1)
-        self.hold = np.zeros((n, len(body.tools), 2))
-        self.done = np.zeros(n, bool)
-        self.pushers = [i for i, link in enumerate(body.links) if link.touches] if task.pushes else []
+        self.pushers = [i for i, link in enumerate(body.links) if link.touches]
         self.tool_radius = max((body.links[i].radius for i in self.pushers), default=0.1)
-        self.grasp = task.size + 0.1
-        self.pose: Pose = body.pose(self.q)
-        for _ in range(20):  # random places overlap; nothing may move by itself later
-            self._separate()
-        distance = (
-            np.linalg.norm(self.tools - self.objects[:, :1], axis=-1)
-            if task.objects
-            else np.zeros((n, len(body.tools)))
-        )
-        self.hand = distance.argmin(1)  # the tool that does the task
+        self.grasp = task.size + 0.08
+        self.state = self._start(np.asarray(seeds, np.int64))
+
+    # --- what there is, in n episodes ----------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """A copy."""
+        return self._state.take(slice(None))
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._state = state.take(slice(None))
+        self.pose = self.body.pose(self._state.q)
+
+    def __len__(self) -> int:
+        return len(self._state.q)
+
+    @property
+    def q(self) -> np.ndarray:
+        return self._state.q
+
+    @property
+    def objects(self) -> np.ndarray:
+        return self._state.objects
+
+    @property
+    def goals(self) -> np.ndarray:
+        return self._state.goals
+
+    @property
+    def held(self) -> np.ndarray:
+        return self._state.held
+
+    @property
+    def hand(self) -> np.ndarray:
+        return self._state.hand
 
     @property
     def tools(self) -> np.ndarray:
         """[n, M, 2]"""
         return self.body.tool_points(self.pose)
 
-    def _reachable(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """[n, M, 2] points that the tools of a random configuration have."""
-        points = self.body.tool_points(self.body.pose(self.body.random(rng, n, 0.85)))
-        return np.clip(points, -0.7, 0.7)
+    def success(self) -> np.ndarray:
+        """bool [n]: the goal is reached now."""
+        return self.spec.task.done(self)
+
+    # --- start -----------------------------------------------------------------------------------
+
+    def _start(self, seeds: np.ndarray) -> State:
+        body, task, n = self.body, self.spec.task, len(seeds)
+        tools, count, dim = len(body.tools), task.objects, self.spec.action_dim
+        # One generator per episode: what is drawn for it does not depend on the others.
+        unit = np.array([np.random.default_rng([seed, 1]).random((2 + count, body.size)) for seed in seeds])
+        draws = [body.low + (0.5 + spread * (unit[:, i] - 0.5)) * (body.high - body.low)
+                 for i, spread in enumerate([0.7] + [0.85] * (1 + count))]  # fmt: skip
+        points = [np.clip(body.tool_points(body.pose(q)), -0.7, 0.7) for q in draws[1:]]
+        goals = points[0]
+        objects = np.stack([p[:, 0] for p in points[1:]], 1)
+        away = np.linalg.norm(objects[:, 0] - goals[:, 0], axis=1)
+        close = away < 2.5 * task.radius  # an object that starts on its mark would be an empty task
+        objects[close, 0] = -objects[close, 0]
+        self._state = State(
+            q=draws[0], v=np.zeros((n, body.size)), objects=objects, object_v=np.zeros((n, count, 2)),
+            held=np.full((n, tools), -1), hold=np.zeros((n, tools, 2)), pending=np.zeros((n, 0, dim)),
+            goals=goals, hand=np.zeros(n, int), seeds=seeds,
+        )  # fmt: skip
+        self.pose = body.pose(draws[0])
+        for _ in range(60):  # random places overlap; apart, things do not move by themselves
+            self._separate(self.pose.origin, self.pose.tip, 1.0, START_GAP)
+        self._state.object_v[:] = 0
+        self._state.hand = np.linalg.norm(self.tools - objects[:, :1], axis=-1).argmin(1)
+        self._state.pending = np.repeat(self._idle()[:, None], self.spec.delay, 1)
+        return self._state
+
+    def _idle(self) -> np.ndarray:
+        """[n, A]: the action that asks to stay."""
+        q = self._state.q
+        return np.concatenate([c.encode(self.body, q, q, self.dt) for c in self.spec.controls], 1)
+
+    # --- one step --------------------------------------------------------------------------------
 
     def step(self, action: np.ndarray) -> None:
         """One native step under `action` [n, A]."""
-        h = self.dt / self.substeps
+        s, h = self._state, self.dt / self.substeps
+        if self.spec.delay:
+            queue = np.concatenate([s.pending, action[:, None]], 1)
+            action, s.pending = queue[:, 0], queue[:, 1:]
         for _ in range(self.substeps):
-            start = 0
-            for control in self.spec.controls:
-                control.advance(self.body, self.q, action[:, start : start + control.dim], h, self.dt)
-                start += control.dim
-            self.body.confine(self.q)
-            self.pose = self.body.pose(self.q)
+            before = self._move_body(action, h)
             if self.spec.task.carries:
-                self._grip()
-            self._separate()
-            self._wander(h)
+                self._grip(h)
+            self._slide(h)
+            self._separate(*before, h)
 
-    def _grip(self) -> None:
-        """Closed grippers hold what is between their fingers; open ones let go."""
-        rows = np.arange(len(self.q))
-        tools = self.tools
+    def _move_body(self, action: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
+        """Moves the joints for h seconds; returns where all links began and ended before, [n, L, 2] each."""
+        s, body, start = self._state, self.body, 0
+        wanted = np.zeros_like(s.v)
+        for control in self.spec.controls:
+            part = action[:, start : start + control.dim]
+            wanted[:, list(control.joints)] = control.rate(body, s.q, part, self.dt)
+            start += control.dim
+        # The mean over h of a velocity that approaches the wanted one exponentially.
+        fade = np.exp(-h / self.spec.physics.inertia)
+        gap = s.v - wanted
+        s.q += (wanted + gap * (1 - fade) * self.spec.physics.inertia / h) * h
+        s.v = wanted + gap * fade
+        s.v[body.beyond(s.q)] = 0.0  # joints stop at their limits
+        before = self.pose.origin, self.pose.tip
+        body.confine(s.q)
+        self.pose = body.pose(s.q)
+        return before
+
+    def _grip(self, h: float) -> None:
+        """Closed grippers hold what is between their fingers; open ones let go, or throw."""
+        s, tools = self._state, self.tools
+        rows = np.arange(len(s.q))
         for m, joint in enumerate(self.body.grips):
             if joint < 0:
                 continue
-            away = self.objects - tools[:, m, None]
+            away = s.objects - tools[:, m, None]
             distance = np.linalg.norm(away, axis=-1)
             nearest = distance.argmin(1)
-            closed = self.q[:, joint] < 0.35
-            free = self.held[:, m] < 0
-            grasp = closed & free & (distance[rows, nearest] < self.grasp)
-            grasp &= ~(self.held == nearest[:, None]).any(1)  # two hands do not share
-            self.held[grasp, m] = nearest[grasp]
-            self.hold[grasp, m] = away[rows, nearest][grasp]
-            self.held[self.q[:, joint] > 0.6, m] = -1
-            has = self.held[:, m] >= 0
-            self.hold[:, m] *= 0.8  # a held object settles between the fingers
-            self.objects[rows[has], self.held[has, m]] = (tools[:, m] + self.hold[:, m])[has]
+            free = s.held[:, m] < 0
+            grasp = (s.q[:, joint] < 0.35) & free & (distance[rows, nearest] < self.grasp)
+            grasp &= ~(s.held == nearest[:, None]).any(1)  # two hands do not share
+            s.held[grasp, m] = nearest[grasp]
+            s.hold[grasp, m] = away[rows, nearest][grasp]
+            s.held[s.q[:, joint] > 0.6, m] = -1
+            has = s.held[:, m] >= 0
+            s.hold[:, m] *= 0.8  # a held object settles between the fingers
+            there = (tools[:, m] + s.hold[:, m])[has]
+            s.object_v[rows[has], s.held[has, m]] = np.clip((there - s.objects[rows[has], s.held[has, m]]) / h, -2, 2)
+            s.objects[rows[has], s.held[has, m]] = there
 
-    def _separate(self) -> None:
-        """Quasi-static contact: links push objects, objects push each other, walls stop them."""
-        count, size = self.objects.shape[1], self.spec.task.size
+    def _slide(self, h: float) -> None:
+        """Objects that nobody holds go on as they went, slower by friction."""
+        s = self._state
+        held = (s.held[:, :, None] == np.arange(s.objects.shape[1])).any(1)[..., None]
+        speed = np.linalg.norm(s.object_v, axis=-1, keepdims=True)
+        slower = np.maximum(speed - self.spec.physics.friction * h, 0.0) / np.maximum(speed, 1e-9)
+        s.objects += np.where(held, 0.0, s.object_v * (1 + slower) / 2 * h)
+        s.object_v *= np.where(held, 1.0, slower)
+
+    def _separate(self, old_origin: np.ndarray, old_tip: np.ndarray, h: float, gap: float = 0.0) -> None:
+        """Contact: links push objects, objects push each other, walls stop them. The links were at
+        `old_origin` and `old_tip` [n, L, 2] h seconds ago. Things nearer than `gap` are in contact."""
+        s, size, bounce = self._state, self.spec.task.size, self.spec.physics.bounce
         for i in self.pushers:
             link = self.body.links[i]
-            a, b = self.pose.origin[:, i], self.pose.tip[:, i]
-            gap = size + link.radius + link.half_width
-            for k in range(count):
-                point = self.objects[:, k]
-                along = b - a
-                t = ((point - a) * along).sum(1) / max(link.length**2, 1e-9)
-                near = a + np.clip(t, 0.0, 1.0)[:, None] * along
-                self._push_out(point, near, gap)
-        for k in range(count):
+            a, b = self.pose.origin[:, i, None], self.pose.tip[:, i, None]
+            along = b - a
+            t = ((s.objects - a) * along).sum(-1, keepdims=True) / max(link.length**2, 1e-9)
+            t = np.clip(t, 0.0, 1.0)
+            near = a + t * along
+            before = old_origin[:, i, None] * (1 - t) + old_tip[:, i, None] * t
+            away = s.objects - near
+            distance = np.linalg.norm(away, axis=-1, keepdims=True)
+            normal = away / np.maximum(distance, 1e-6)
+            overlap = np.maximum(size + link.radius + link.half_width + gap - distance, 0.0)
+            s.objects += normal * overlap
+            closing = ((s.object_v - (near - before) / h) * normal).sum(-1, keepdims=True)
+            s.object_v -= np.where((overlap > 0) & (closing < 0), (1 + bounce) * closing, 0.0) * normal
+        for k in range(s.objects.shape[1]):
             for j in range(k):
-                away = self.objects[:, k] - self.objects[:, j]
-                distance = np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
-                shift = away / distance * np.maximum(2 * size - distance, 0.0) / 2
-                self.objects[:, k] += shift
-                self.objects[:, j] -= shift
-        np.clip(self.objects, -WALL, WALL, out=self.objects)
-
-    @staticmethod
-    def _push_out(point: np.ndarray, near: np.ndarray, gap: float) -> None:
-        away = point - near
-        distance = np.linalg.norm(away, axis=1, keepdims=True)
-        overlap = np.maximum(gap - distance, 0.0)
-        point += away / np.maximum(distance, 1e-6) * overlap
-
-    def _wander(self, h: float) -> None:
-        self.distractors += self.drift * h
-        outside = (np.abs(self.distractors) > 0.95) & (self.distractors * self.drift > 0)
-        self.drift[outside] *= -1.0
+                away = s.objects[:, k] - s.objects[:, j]
+                distance = np.linalg.norm(away, axis=1, keepdims=True)
+                normal = away / np.maximum(distance, 1e-6)
+                overlap = np.maximum(2 * size + gap - distance, 0.0)
+                closing = ((s.object_v[:, k] - s.object_v[:, j]) * normal).sum(-1, keepdims=True)
+                push = np.where((overlap > 0) & (closing < 0), -(1 + bounce) * closing / 2, 0.0)  # of equal mass
+                for which, sign in ((k, 0.5), (j, -0.5)):
+                    s.objects[:, which] += normal * overlap * sign
+                    s.object_v[:, which] += normal * push * 2 * sign
+        wall = EDGE - size
+        outward = (np.abs(s.objects) > wall) & (s.objects * s.object_v > 0)
+        s.object_v[outward] *= -bounce
+        np.clip(s.objects, -wall, wall, out=s.objects)

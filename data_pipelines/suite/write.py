@@ -6,7 +6,7 @@ from `rollout`, its pictures from `render`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +26,10 @@ from data_pipelines.sources.rlds.writer import (
     vector_field,
     write_info,
 )
-from data_pipelines.suite.appearance import Appearance, draw_appearance
-from data_pipelines.suite.render import frame_index, render_frames
-from data_pipelines.suite.rollout import Rollout, simulate
-from data_pipelines.suite.spec import EmbodimentSpec
+from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.render import positions_of, render_frames
+from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
+from data_pipelines.suite.spec import IMAGE_KEY, IMAGE_SIZE, EmbodimentSpec
 
 SHARD_FRAMES = 4000
 """About this many native frames go into one shard."""
@@ -39,76 +39,93 @@ BLOCK = 16
 
 
 def build_features(spec: EmbodimentSpec) -> Any:
-    """The tfds features of this embodiment's episodes."""
-    prefix = "action/" if spec.dict_actions else ""
-    step = {f"observation/{c.key}": image_field(c.height, c.width) for c in spec.cameras}
-    step["observation/state"] = vector_field(spec.body.size)
-    step |= {prefix + key: vector_field(dim) for key, dim in spec.action_layout}
+    """The tfds features of this robot's episodes."""
+    step = {
+        f"observation/{IMAGE_KEY}": image_field(IMAGE_SIZE, IMAGE_SIZE),
+        "observation/state": vector_field(spec.body.size),
+        "observation/position": Field("float32", (len(spec.points), 2)),
+    }
+    step |= {key: vector_field(dim) for key, dim in spec.action_layout}
     episode = {"file_path": Field(TEXT), "success": Field("bool"), "seed": Field("int64")}
     return rlds_writer.build_features(step | STEP_FIELDS, episode)
 
 
-def write_dataset(spec: EmbodimentSpec, directory: Path, *, episodes: int, seed: int, metadata: dict) -> int:
+def write_dataset(
+    spec: EmbodimentSpec, directory: Path, *, episodes: Mapping[str, int], seed: int, metadata: Mapping[str, Any]
+) -> int:
     """Simulates and writes a whole dataset into `directory`; returns its native frames.
 
-    `seed` is the dataset's own. Not atomic: `generate` gives a directory aside.
+    `episodes` counts them by split, "train" among them. Not atomic: `generate` gives a
+    directory aside.
     """
-    rollout, looks = simulate(spec, episodes, seed), draw_appearance(spec, episodes, seed)
-    frames = int(rollout.lengths.sum())
-    shards = max(1, min(episodes, round(frames / SHARD_FRAMES)))
-    bounds = np.linspace(0, episodes, shards + 1).astype(int)
-    lengths, size = [], 0
-    for k in range(shards):
-        path = directory / shard_name(spec.name, k, shards)
-        records = episode_records(spec, rollout, looks, bounds[k], bounds[k + 1], seed)
-        lengths.append(write_shard(path, records))
-        size += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
+    seeds = {split: episode_seeds(spec, count, seed, split) for split, count in episodes.items()}
+    rollout = simulate(spec, np.concatenate(list(seeds.values())))
+    written, first = {}, 0
+    for split, count in episodes.items():
+        written[split] = _write_split(spec, directory, split, rollout, first, first + count)
+        first += count
+    lengths, size = written.pop("train")
     write_info(
         directory,
         name=spec.name,
         features=build_features(spec),
         lengths=lengths,
         size=size,
-        description=f"Simulated embodiment ({spec.kind}, {spec.convention} actions, {spec.hz} Hz).",
-        metadata=metadata,
+        description=f"Simulated robot of the family {spec.family!r} ({spec.convention} actions, {spec.hz} Hz).",
+        metadata={**metadata, "positions": list(spec.points)},
+        more=written,
     )
-    return frames
+    return int(rollout.lengths.sum())
 
 
-def episode_records(
-    spec: EmbodimentSpec, rollout: Rollout, looks: Appearance, start: int, stop: int, seed: int
-) -> Iterator[bytes]:
+def _write_split(
+    spec: EmbodimentSpec, directory: Path, split: str, rollout: Rollout, start: int, stop: int
+) -> tuple[list[int], int]:
+    """The shards of episodes start..stop-1 of a rollout: records in each, and bytes of all payloads."""
+    frames = int(rollout.lengths[start:stop].sum())
+    shards = max(1, min(stop - start, round(frames / SHARD_FRAMES)))
+    bounds = np.linspace(start, stop, shards + 1).astype(int)
+    lengths, size = [], 0
+    for k in range(shards):
+        path = directory / shard_name(spec.name, k, shards, split)
+        lengths.append(write_shard(path, _records(spec, rollout, bounds[k], bounds[k + 1])))
+        size += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
+    return lengths, size
+
+
+def _records(spec: EmbodimentSpec, rollout: Rollout, start: int, stop: int) -> Iterator[bytes]:
     """Serialised examples of episodes start..stop-1."""
     for first in range(start, stop, BLOCK):
-        block = list(range(first, min(first + BLOCK, stop)))
-        which, step = frame_index(rollout, block)
-        views = {c.key: render_frames(spec, rollout, looks, c, which, step) for c in spec.cameras}
-        ends = np.cumsum(rollout.lengths[block])
-        for i, end in zip(block, ends, strict=True):
-            images = {key: frames[end - rollout.lengths[i] : end] for key, frames in views.items()}
-            yield encode_example(episode_features(spec, rollout, images, i, seed))
+        block = np.arange(first, min(first + BLOCK, stop))
+        looks = draw_appearance(spec, rollout.seeds[block])
+        episode = np.repeat(np.arange(len(block)), rollout.lengths[block])
+        q = np.concatenate([rollout.q[i, : rollout.lengths[i]] for i in block])
+        objects = np.concatenate([rollout.objects[i, : rollout.lengths[i]] for i in block])
+        frames = render_frames(spec, looks, rollout.goals[block], q, objects, episode)
+        positions = positions_of(spec, q, objects)
+        for k, i in enumerate(block):
+            yield encode_example(_features(spec, rollout, int(i), frames[episode == k], positions[episode == k]))
 
 
-def episode_features(
-    spec: EmbodimentSpec, rollout: Rollout, images: dict[str, np.ndarray], i: int, seed: int
+def _features(
+    spec: EmbodimentSpec, rollout: Rollout, i: int, frames: np.ndarray, positions: np.ndarray
 ) -> dict[str, np.ndarray | list[bytes]]:
-    """Flattened tf.Example features of episode i; `images[key]` is uint8 [T, H, W, 3]."""
+    """Flattened tf.Example features of episode i with its frames uint8 [T, H, W, 3] and positions [T, P, 2]."""
     steps = int(rollout.lengths[i])
     reward = np.zeros(steps, np.float32)
     if rollout.success[i]:
         reward[rollout.reached[i]] = 1.0
     features: dict[str, np.ndarray | list[bytes]] = {
         **step_features(reward, [spec.instruction] * steps),
+        f"steps/observation/{IMAGE_KEY}": [encode_jpeg(frame) for frame in frames],
         "steps/observation/state": rollout.q[i, :steps].astype(np.float32).ravel(),
-        "episode_metadata/file_path": [f"suite/{spec.name}/{i:06d}".encode()],
+        "steps/observation/position": positions.ravel(),
+        "episode_metadata/file_path": [f"suite/{spec.name}/{rollout.seeds[i]}".encode()],
         "episode_metadata/success": np.array([rollout.success[i]], np.int64),
-        "episode_metadata/seed": np.array([seed], np.int64),
+        "episode_metadata/seed": np.array([rollout.seeds[i]], np.int64),
     }
-    for key, frames in images.items():
-        features[f"steps/observation/{key}"] = [encode_jpeg(frame) for frame in frames]
     start = 0
     for key, dim in spec.action_layout:
-        name = f"steps/action/{key}" if spec.dict_actions else "steps/action"
-        features[name] = np.ascontiguousarray(rollout.actions[i, :steps, start : start + dim]).ravel()
+        features[f"steps/{key}"] = np.ascontiguousarray(rollout.actions[i, :steps, start : start + dim]).ravel()
         start += dim
     return features

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.loading.splits import held_out
+from data_pipelines.loading.splits import held_out_episodes
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
@@ -181,7 +181,7 @@ class _Work:
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
         self._numbers = source.numbers
-        is_val = held_out(plan.spec.name, source.ids, s.val_fraction, s.min_val, s.max_val)
+        is_val = held_out_episodes(plan.spec, source, s.val_fraction, s.min_val, s.max_val)
         self._is_val = is_val[self._numbers]
 
     def make(self, part: Part) -> Iterator[PartItem]:

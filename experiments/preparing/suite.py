@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,6 +48,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
             workspace.suite,
             scale=study.suite.scale,
             seed=study.suite.seed,
+            validation=study.suite.validation,
             names=[name for name in names if name not in kept],
             workers=_cores(),
             progress=lambda name, done, total: update(done, total, name),
@@ -66,21 +66,22 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
 def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | None:
     """How the inputs of a dataset that is there differ from `suite`; [] if only the simulator does; None if it
     is as it should be, is not there, or lacks shards and is to be made in any case."""
-    from data_pipelines.suite.generate import episode_count, fingerprint, is_complete, select
+    from data_pipelines.publishing.marks import FINGERPRINT, is_complete, read_metadata, shard_lengths
+    from data_pipelines.suite.generate import episode_count, fingerprint, select
 
     (spec,) = select([name])
-    mark = fingerprint(spec, suite.scale, suite.seed)
+    mark = fingerprint(spec, suite.scale, suite.seed, suite.validation)
     if not directory.exists() or is_complete(directory, mark):
         return None
-    try:
-        metadata = json.loads((directory / "metadata.json").read_text())
-        info = json.loads((directory / "dataset_info.json").read_text())
-        made_as, seed, lengths = metadata["fingerprint"], metadata["seed"], info["splits"][0]["shardLengths"]
-    except (OSError, ValueError, KeyError, TypeError, IndexError):
+    metadata = read_metadata(directory)
+    made_as, seed = metadata.get(FINGERPRINT), metadata.get("seed")
+    episodes, held_out = (sum(shard_lengths(directory, split)) for split in ("train", "val"))
+    if made_as is None or seed is None or not episodes or not held_out:
         return ["what is there says nothing of what it was made from"]
-    episodes, wanted = sum(map(int, lengths)), episode_count(spec, suite.scale)
+    wanted = episode_count(spec, suite.scale)
     lines = [f"suite.seed: {seed} -> {suite.seed}"] if seed != suite.seed else []
     lines += [f"suite.scale: {episodes} -> {wanted} episodes"] if episodes != wanted else []
+    lines += [f"suite.validation: {held_out} -> {suite.validation} episodes"] if held_out != suite.validation else []
     return lines if lines or is_complete(directory, made_as) else None
 
 

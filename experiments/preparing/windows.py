@@ -133,8 +133,12 @@ def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str,
 
 def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> None:
     """Names the datasets that lose many episodes to evaluation because they have few."""
+    from data_pipelines.registry import get_spec
+
     many = []
     for name, facts in summary.items():
+        if get_spec(name).val_split:
+            continue  # none of them was taken from what is trained on
         held_out, episodes = facts["held_out"], facts["held_out"] + facts["episodes"]
         if held_out > HELD_OUT * episodes and held_out > round(settings.val_fraction * episodes):
             many.append(f"{held_out} of {episodes} episodes of {name}")

@@ -28,9 +28,7 @@ from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
 from tests.data_pipelines.fakes import make_spec, write_rlds
 
-ARM, BASE, PUSHER = map(
-    get_spec, ("two_link_arm_joint_targets", "omni_base_world_velocity", "disc_pusher_delta_pixels")
-)
+ARM, BASE = map(get_spec, ("berkeley_gnm_cory_hall", "ucsd_pick_and_place_dataset_converted_externally_to_rlds"))
 LENGTHS = [10, 11, 12, 13, 14, 15]  # a window of the smoke study takes 8 native frames
 SMOKE = ("--preset", "smoke")
 
@@ -180,8 +178,8 @@ def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
         if episode in bad:
             features["steps/action"][0] = np.nan
 
-    rlds = write_rlds(tmp_path, ARM, [8] * 24, change=spoil)
-    skip = ("--set", "store.corrupt=skip")
+    rlds = write_rlds(tmp_path, ARM, [8] * 40, change=spoil)
+    skip = ("--set", "store.corrupt=skip", "--set", "store.min_val=8")  # some of those held out are whole
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
     assert "17 episodes are unusable, more than max_skipped=16" in message
     assert f"episode {bad[16]}" in message
@@ -191,16 +189,16 @@ def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
 
 
 def test_unknown_dataset_name(tmp_path, refused):
-    rlds = write_rlds(tmp_path, make_spec("two_link_arm_joint_target", (2,)), LENGTHS)
+    rlds = write_rlds(tmp_path, make_spec("berkeley_gnm_cory_hal", (2,)), LENGTHS)
     message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
-    assert "unknown dataset 'two_link_arm_joint_target'; did you mean two_link_arm_joint_targets" in message
+    assert "unknown dataset 'berkeley_gnm_cory_hal'; did you mean berkeley_gnm_cory_hall" in message
     assert "data_pipelines/registry/own.py" in message and "hma data inspect" in message
 
 
 def test_unknown_dataset_of_the_suite(tmp_path, refused):
-    names = "datasets=two_link_arm_joint_targets,omni_bass_world_velocity,disc_pusher_delta_pixels"
+    names = "datasets=rover_road,pushr_sand,arm_chalk"
     message = refused(2, "data", "suite", *SMOKE, "--out", tmp_path / "out", "--set", names)
-    assert "unknown dataset 'omni_bass_world_velocity'; did you mean omni_base_world_velocity" in message
+    assert "unknown dataset 'pushr_sand'; did you mean pusher_sand" in message
 
 
 def test_wrong_image_key(tmp_path, refused):

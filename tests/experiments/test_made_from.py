@@ -22,7 +22,7 @@ STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
 def made(tmp_path_factory) -> tuple[Path, list[str]]:
     """A directory in which `hma tokenize` ran with settings of its own."""
     root = tmp_path_factory.mktemp("made")
-    robots = (ARM, get_spec("disc_pusher_delta_pixels"))
+    robots = (ARM, get_spec("dlr_edan_shared_control_converted_externally_to_rlds"))
     data = ["--data", *(str(write_rlds(root / "rlds", spec, LENGTHS)) for spec in robots)]
     assert main(["tokenize", *SMOKE, "--out", str(root / "out"), *data, "--set", "tokenizer_train.steps=5"]) == 0
     return root / "out", data
@@ -94,7 +94,7 @@ def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
         (["--set", "tokenizer_train.steps=3"], "tokenizer", "tokenizer_train.steps: 5 -> 3"),
         (["--set", "tokenizer.channels=8"], "tokenizer", "tokenizer.channels: 16 -> 8"),
         (["--set", "store.min_val=1"], "tokenizer", "store.min_val: 2 -> 1"),
-        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 2 -> 1 (two_link_arm_joint_targets, "),
+        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 2 -> 1 (berkeley_gnm_cory_hall, "),
         (["--set", "eval.windows_per_dataset=1"], "windows", "eval.windows_per_dataset: 2 -> 1"),
         (["--set", "eval.seed=7"], "windows", "eval.seed: 0 -> 7"),
         (["--set", "model.frames=3"], "windows", "model.frames: 4 -> 3"),
@@ -122,7 +122,7 @@ def test_the_command_of_the_issue(hma, out):
 def test_other_data_is_refused(hma, out, made, tmp_path):
     before, (_, arm, pusher) = contents(out), made[1]
     code, said = hma("tokenize", data=["--data", arm])
-    assert code == 2 and "datasets: 2 -> 1, without disc_pusher_delta_pixels" in said and "--replace windows" in said
+    assert code == 2 and "datasets: 2 -> 1, without dlr_edan_shared_control_converted_externally_to_rlds" in said and "--replace windows" in said
     other = str(write_rlds(tmp_path, ARM, [20] * 6))
     code, said = hma("tokenize", data=["--data", other, pusher])
     assert code == 2 and f"data of {ARM.name}.shards: " in said and "--replace tokenizer" in said
@@ -210,16 +210,17 @@ def test_windows_that_were_edited_are_not_repaired_without_being_asked(hma, out)
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("suite")
-    assert main(["data", "suite", *SMOKE, "--out", str(root), "--set", "dataset_counts=1"]) == 0
+    assert main(["data", "suite", *SMOKE, "--out", str(root), "--set", "datasets=pusher_sand"]) == 0
     return root
 
 
 def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp_path, capsys):
     out = shutil.copytree(suite, tmp_path / "out")
-    before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "dataset_counts=1"]
-    assert main([*command, "--set", "suite.seed=3", "--set", "suite.scale=0.1"]) == 2
+    before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]
+    assert main([*command, "--set", "suite.seed=3", "--set", "suite.scale=0.1", "--set", "suite.validation=5"]) == 2
     said = capsys.readouterr().err
-    assert "suite.seed: 0 -> 3" in said and "suite.scale: 8 -> " in said and "--replace suite" in said
+    assert "suite.seed: 0 -> 3" in said and "suite.scale: 10 -> 50 episodes" in said and "--replace suite" in said
+    assert "suite.validation: 4 -> 5 episodes" in said
     assert contents(out) == before
     assert main([*command, "--set", "suite.seed=3", "--replace", "suite"]) == 0
     assert contents(out) != before
@@ -229,13 +230,13 @@ def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp
 
 def test_a_suite_of_an_earlier_simulator_stays_in_use_and_says_so(suite, tmp_path, capsys, monkeypatch):
     out = shutil.copytree(suite, tmp_path / "out")
-    before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "dataset_counts=1"]
+    before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]
     monkeypatch.setattr(suite_generator, "GENERATOR", suite_generator.GENERATOR + 1)
     assert main(command) == 0
     assert "made by an earlier version of the simulator" in " ".join(capsys.readouterr().out.split())
     assert contents(out) == before
     (out / "suite").joinpath("nothing").mkdir()  # a missing one is made
-    assert main([*command[:-1], "dataset_counts=2"]) == 0
+    assert main([*command[:-1], "datasets=pusher_sand,rover_road"]) == 0
     assert {k: v for k, v in contents(out).items() if k in before} == before
 
 
@@ -243,7 +244,7 @@ def test_a_dataset_that_lost_a_shard_is_made_again(suite, tmp_path):
     out = shutil.copytree(suite, tmp_path / "out")
     before = contents(out)
     next((out / "suite").rglob("*.tfrecord-*")).unlink()
-    assert main(["data", "suite", *SMOKE, "--out", str(out), "--set", "dataset_counts=1"]) == 0
+    assert main(["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]) == 0
     assert contents(out) == before
 
 
@@ -272,6 +273,6 @@ def test_to_replace_a_step_is_to_replace_what_is_made_of_it():
 def test_the_stamp_holds_the_inputs(made):
     stamp = json.loads((made[0] / "tokenizer" / STAMP).read_text())
     assert stamp["inputs"]["tokenizer_train"]["steps"] == 5
-    assert stamp["inputs"]["datasets"] == [ARM.name, "disc_pusher_delta_pixels"]
+    assert stamp["inputs"]["datasets"] == [ARM.name, "dlr_edan_shared_control_converted_externally_to_rlds"]
     assert set(stamp["recorded"]) == {"tau", "sources"}
     assert BASE.name not in stamp["inputs"]["data"]

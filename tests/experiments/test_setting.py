@@ -19,7 +19,7 @@ from experiments.setting import Setting, Where, make_setting
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.test_cli_errors import idle_training  # noqa: F401
 
-ARM = get_spec("two_link_arm_joint_targets")
+ARM = get_spec("berkeley_gnm_cory_hall")
 ENTRIES = """["my_robot"]
 image_key = "observation/image"
 action_keys = ["action"]
@@ -45,7 +45,7 @@ def world(tmp_path_factory) -> Path:
 SAMPLES = {
     "preset": ["smoke-continuous"],
     "out": [Path("runs/of mine"), Path("/tmp/x y/*"), Path("-out")],
-    "data": [("bridge/two_link_arm_joint_targets",), ("it's data/my_robot", "bridge/two_link_arm_joint_targets/1.0.0")],
+    "data": [("bridge/berkeley_gnm_cory_hall",), ("it's data/my_robot", "bridge/berkeley_gnm_cory_hall/1.0.0")],
     "registry": [Path("my entries.toml")],
     "mixture": ["dataset5"],
     "tokenizer": [Path("-tok")],

@@ -143,7 +143,7 @@ def test_the_widths_of_a_sweep_do_not_bound_a_single_model():
     study = override(CPU, ["model.width=128"])
     assert reference_trial(study, 0).model.width == 128
     points = {p.x: p.trial for p in scale_width.plan(study).points}
-    assert list(points) == [24, 32, 64, 96, 128]
+    assert list(points) == [16, 32, 48, 128]
     assert points[128].model == study.model
 
 

@@ -24,7 +24,7 @@ from tests.data_pipelines.fakes import write_rlds
 from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensors, write_checkpoint
 from tests.hma_jax.pretrained import write_published
 
-ARM = get_spec("two_link_arm_joint_targets")
+ARM = get_spec("berkeley_gnm_cory_hall")
 LENGTHS = [10, 11, 12, 13, 14, 15]
 
 

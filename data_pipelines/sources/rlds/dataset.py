@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 class RldsDataset(EpisodeSource):
-    """The episodes of one split of an RLDS directory; its shards are TFRecord or ArrayRecord files.
+    """The episodes of one split of an RLDS directory, or of several one after the other ("train+val"); its shards are TFRecord or ArrayRecord files.
 
     `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, then the
     newest version is taken. Shards are indexed once, for all later starts (see `index`).
@@ -73,6 +73,7 @@ class RldsDataset(EpisodeSource):
         self.runs = tuple(
             EpisodeRun(path.name, 0, count) for path, count in zip(meta.shards, meta.shard_lengths, strict=True)
         )
+        self._shard_splits = meta.shard_splits
         self.files = len(meta.shards)
         self._paths, self._in_array_records = meta.shards, meta.file_format == "array_record"
         scan = array_record.scan_shard if self._in_array_records else scan_shard
@@ -81,6 +82,9 @@ class RldsDataset(EpisodeSource):
 
     def __len__(self) -> int:
         return len(self._index)
+
+    def in_split(self, split: str) -> np.ndarray:
+        return np.repeat([s == split for s in self._shard_splits], [run.count for run in self.runs])
 
     @property
     def numbers(self) -> np.ndarray:

@@ -74,13 +74,14 @@ class DatasetInfo:
 
 @dataclass(frozen=True)
 class SplitMetadata:
-    """What tfds recorded about one split: flat schema, shard files and their record counts."""
+    """What tfds recorded about a split, or several: flat schema, shard files with their record counts and splits."""
 
     name: str
     version: str
     features: dict[str, FlatFeature]
     shards: list[Location]
     shard_lengths: list[int]
+    shard_splits: list[str]
     file_format: str = "tfrecord"
 
 
@@ -116,18 +117,23 @@ def dataset_name(directory: str | Location) -> str:
 
 
 def read_metadata(directory: Location, split: str) -> SplitMetadata:
-    """Metadata of one split. Raises DataError for damaged files, ConfigError for an unknown split."""
+    """Metadata of one split, or of several one after the other as in "train+val".
+
+    Raises DataError for damaged files, ConfigError for an unknown split.
+    """
     info = read_info(directory)
     features = read_features(directory)
     if info.file_format not in FILE_FORMATS:
         known = " and ".join(FILE_FORMATS)
         raise DataError(f"{directory / INFO}: fileFormat is {shown(info.file_format)}; only {known} can be read.")
-    require(
-        split in info.splits,
-        f"{info.name}: no split {split!r} in {directory}; splits there: {listing(sorted(info.splits))}",
-    )
+    parts = split.split("+")
+    for part in parts:
+        require(
+            part in info.splits,
+            f"{info.name}: no split {part!r} in {directory}; splits there: {listing(sorted(info.splits))}",
+        )
     try:
-        shards = info.shard_names(split)
+        shards = [name for part in parts for name in info.shard_names(part)]
     except ValueError as error:
         raise DataError(f"{directory / INFO}: {error}. {ADVICE}") from error
     return SplitMetadata(
@@ -135,7 +141,8 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
         version=info.version,
         features=features,
         shards=[directory / name for name in shards],
-        shard_lengths=list(info.splits[split].shard_lengths),
+        shard_lengths=[n for part in parts for n in info.splits[part].shard_lengths],
+        shard_splits=[part for part in parts for _ in info.splits[part].shard_lengths],
         file_format=info.file_format,
     )
 

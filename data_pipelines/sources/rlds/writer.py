@@ -69,8 +69,8 @@ def encode_jpeg(frame: np.ndarray) -> bytes:
     return simplejpeg.encode_jpeg(frame, quality=JPEG_QUALITY, colorsubsampling="444")
 
 
-def shard_name(dataset: str, index: int, count: int) -> str:
-    return f"{dataset}-train.tfrecord-{index:05d}-of-{count:05d}"
+def shard_name(dataset: str, index: int, count: int, split: str = "train") -> str:
+    return f"{dataset}-{split}.tfrecord-{index:05d}-of-{count:05d}"
 
 
 def build_features(step: Mapping[str, Field], episode: Mapping[str, Field]) -> Any:
@@ -107,11 +107,13 @@ def write_info(
     description: str,
     metadata: Mapping[str, Any],
     module: str = "data_pipelines.suite",
+    more: Mapping[str, tuple[Sequence[int], int]] = {},
 ) -> None:
     """features.json, dataset_info.json and metadata.json, by tfds itself.
 
     `lengths` are records per shard, `size` the bytes of all payloads, `metadata` what
-    metadata.json shall hold, `module` what made the dataset.
+    metadata.json shall hold, `module` what made the dataset. `more` are splits besides "train":
+    lengths and size of each.
     """
     import tensorflow_datasets as tfds
     from tensorflow_datasets.core.dataset_info import DatasetIdentity
@@ -119,12 +121,17 @@ def write_info(
     identity = DatasetIdentity(
         name=name, version=tfds.core.Version(VERSION), data_dir=str(directory), module_name=module
     )
-    template = tfds.core.ShardedFileTemplate(
-        data_dir=directory, dataset_name=name, split="train", filetype_suffix="tfrecord"
-    )
-    split = tfds.core.SplitInfo(
-        name="train", shard_lengths=list(lengths), num_bytes=size, filename_template=template
-    )
+    splits = [
+        tfds.core.SplitInfo(
+            name=split,
+            shard_lengths=list(records),
+            num_bytes=payload,
+            filename_template=tfds.core.ShardedFileTemplate(
+                data_dir=directory, dataset_name=name, split=split, filetype_suffix="tfrecord"
+            ),
+        )
+        for split, (records, payload) in {"train": (lengths, size), **more}.items()
+    ]
     info = tfds.core.DatasetInfo(
         builder=identity,
         description=description,
@@ -132,6 +139,6 @@ def write_info(
         metadata=tfds.core.MetadataDict(metadata),
     )
     info.set_file_format("tfrecord")
-    info.set_splits(tfds.core.splits.SplitDict([split]))
+    info.set_splits(tfds.core.splits.SplitDict(splits))
     info.write_to_directory(directory)
     features.save_config(str(directory))

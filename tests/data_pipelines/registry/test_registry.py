@@ -45,9 +45,15 @@ def test_real_dataset_matches_its_entry():
 def test_every_embodiment_of_the_suite_is_registered():
     for e in EMBODIMENTS:
         spec = get_spec(e.name)
-        assert (spec.hz, spec.action_dim) == (e.hz, e.action_dim)
-        assert spec.image_key == f"observation/{e.cameras[0].key}"
-        assert all(key.startswith("action/") for key in spec.action_keys) == e.dict_actions
+        assert (spec.hz, spec.action_dim) == (e.hz, 0 if e.video_only else e.action_dim)
+        assert (spec.image_key, spec.split, spec.val_split) == ("observation/image", "train+val", "val")
+        assert all(key.startswith("action/") for key in spec.action_keys) == (e.dict_actions or e.video_only)
+
+
+@pytest.mark.parametrize("split", ["train", "val", "val+train"])
+def test_a_split_that_is_held_out_must_follow_another(split):
+    with pytest.raises(ConfigError, match="val_split 'val' is held out, so it must follow another in split"):
+        replace(get_spec("bridge_dataset"), split=split, val_split="val")
 
 
 def test_every_name_is_registered_once():

@@ -15,21 +15,22 @@ from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 from data_pipelines.suite import generate
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
-from data_pipelines.suite.generate import MIN_EPISODES, fingerprint, generate_suite
-from data_pipelines.suite.render import frame_index, render_frames
-from data_pipelines.suite.rollout import simulate
+from data_pipelines.suite.environment import Environment
+from data_pipelines.suite.generate import FEWEST, fingerprint, generate_suite
+from data_pipelines.suite.render import positions_of, render_frames
+from data_pipelines.suite.rollout import episode_seeds, simulate
 from hma_jax.config import ConfigError
 
-NAMES = ("plate_pusher_pose_metres", "round_robot_twist", "two_arms_tool_delta")
-"""Small ones: a single tensor of actions; two cameras; dict-valued actions, three cameras."""
+NAMES = ("pusher_mint", "rover_slate", "mobile_sky")
+"""Short ones: a single tensor of actions; video alone; dict-valued actions."""
 
-TINY = 1e-3
+TINY = {"scale": 1e-3, "validation": 3}
 
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("suite")
-    generate_suite(root, scale=TINY, names=NAMES)
+    generate_suite(root, **TINY, names=NAMES)
     return root
 
 
@@ -45,35 +46,95 @@ def test_tfds_decodes_exactly_what_was_simulated(suite, name):
     directory = suite / name / "1.0.0"
     builder = tfds.builder_from_directory(str(directory))
     assert builder.name == name
-    assert builder.info.splits["train"].num_examples == MIN_EPISODES
+    assert {k: v.num_examples for k, v in builder.info.splits.items()} == {"train": FEWEST, "val": 3}
+    assert list(builder.info.metadata["positions"]) == list(spec.points)
 
-    shards = [index_shard(directory / f) for f in builder.info.splits["train"].filenames]
-    records = [
-        read_record(s.path, o, n) for s in shards for o, n in zip(s.offsets, s.lengths, strict=True)
-    ]
-    assert sum(map(len, records)) == builder.info.splits["train"].num_bytes
-    example = builder.info.features.deserialize_example_np(records[3])
-    seed = int(example["episode_metadata"]["seed"])
-    rollout, looks = simulate(spec, MIN_EPISODES, seed), draw_appearance(spec, MIN_EPISODES, seed)
-    steps = list(example["steps"])
-    assert len(steps) == rollout.lengths[3]
-    assert bool(example["episode_metadata"]["success"]) == bool(rollout.success[3])
-    assert sum(float(s["reward"]) for s in steps) == float(rollout.success[3])
+    seeds = np.concatenate([episode_seeds(spec, FEWEST, 0), episode_seeds(spec, 3, 0, "val")])
+    rollout = simulate(spec, seeds)
+    for split, i in (("train", 3), ("val", 1)):
+        shards = [index_shard(directory / f) for f in builder.info.splits[split].filenames]
+        records = [
+            read_record(s.path, o, n) for s in shards for o, n in zip(s.offsets, s.lengths, strict=True)
+        ]
+        assert sum(map(len, records)) == builder.info.splits[split].num_bytes
+        example = builder.info.features.deserialize_example_np(records[i])
+        check_episode(spec, example, rollout, i if split == "train" else FEWEST + i)
+
+
+def check_episode(spec, example, rollout, i):
+    steps, length = list(example["steps"]), rollout.lengths[i]
+    assert len(steps) == length
+    assert int(example["episode_metadata"]["seed"]) == rollout.seeds[i]
+    assert bool(example["episode_metadata"]["success"]) == bool(rollout.success[i])
+    assert sum(float(s["reward"]) for s in steps) == float(rollout.success[i])
     assert [bool(s["is_first"]) for s in steps] == [True] + [False] * (len(steps) - 1)
     assert [bool(s["is_last"]) for s in steps] == [False] * (len(steps) - 1) + [True]
     assert steps[0]["language_instruction"].decode() == spec.instruction
+    assert ("action" in steps[0]) != spec.video_only
 
-    frames = {c.key: render_frames(spec, rollout, looks, c, *frame_index(rollout, [3])) for c in spec.cameras}
+    q, objects = rollout.q[i, :length], rollout.objects[i, :length]
+    looks = draw_appearance(spec, rollout.seeds[i : i + 1])
+    images = render_frames(spec, looks, rollout.goals[i : i + 1], q, objects, np.zeros(length, int))
+    positions = positions_of(spec, q, objects)
     for t, step in enumerate(steps):
-        action = step["action"]
-        if spec.dict_actions:
-            action = np.concatenate([action[key] for key, _ in spec.action_layout])
-        np.testing.assert_array_equal(action, rollout.actions[3, t])
-        np.testing.assert_array_equal(step["observation"]["state"], rollout.q[3, t].astype(np.float32))
-        for key, images in frames.items():
-            assert step["observation"][key].shape == images[t].shape
-            error = step["observation"][key].astype(int) - images[t]
-            assert np.abs(error).mean() < 2.5, "the JPEG is of another frame"
+        if not spec.video_only:
+            action = step["action"]
+            if spec.dict_actions:
+                action = np.concatenate([action[c.key] for c in spec.controls])
+            np.testing.assert_array_equal(action, rollout.actions[i, t])
+        np.testing.assert_array_equal(step["observation"]["state"], q[t].astype(np.float32))
+        np.testing.assert_array_equal(step["observation"]["position"], positions[t])
+        error = step["observation"]["image"].astype(int) - images[t]
+        assert np.abs(error).mean() < 2.5, "the JPEG is of another frame"
+
+
+def test_a_recorded_episode_replays_in_the_true_environment(suite):
+    """From the file alone: its seed and its actions give its positions."""
+    from data_pipelines.sources.rlds.dataset import RldsDataset
+
+    name = "pusher_mint"
+    record = RldsDataset(suite / name).record(2)
+    env = Environment(name)
+    env.reset(int(record["episode_metadata/seed"][0]))
+    positions = np.asarray(record["steps/observation/position"]).reshape(-1, len(env.spec.points), 2)
+    for t, action in enumerate(np.asarray(record["steps/action"]).reshape(-1, 2)):
+        np.testing.assert_array_equal(env.positions(), positions[t])
+        env.step(action)
+
+
+def test_the_validation_split_is_what_is_held_out(suite):
+    """Whatever fraction is asked for: the store and the frame loader both take it as it is."""
+    from data_pipelines.loading.splits import held_out_episodes
+    from data_pipelines.registry import get_spec
+    from data_pipelines.sources.rlds.dataset import RldsDataset
+
+    spec = get_spec("pusher_mint")
+    source = RldsDataset(suite / spec.name, spec.split)
+    mask = held_out_episodes(spec, source, 0.5, 1, 1)
+    assert mask.tolist() == [False] * FEWEST + [True] * 3
+    seeds = [int(source.record(i)["episode_metadata/seed"][0]) for i in range(len(source))]
+    robot = next(s for s in EMBODIMENTS if s.name == spec.name)
+    assert seeds[FEWEST:] == episode_seeds(robot, 3, 0, "val").tolist()
+    with pytest.raises(ConfigError, match="no split 'test'.*splits there: train, val"):
+        RldsDataset(suite / spec.name, "train+test")
+
+
+def test_the_token_store_and_the_frame_loader_hold_out_the_validation_split(suite, tmp_path):
+    from data_pipelines.loading.frames import make_frame_loader
+    from data_pipelines.registry import get_spec
+    from data_pipelines.sources.rlds.dataset import RldsDataset
+    from data_pipelines.tokens.tokenize_job import tokenize_dataset
+    from tests.data_pipelines.fakes import FakeTokenizer
+
+    spec = get_spec("pusher_mint")
+    manifest = tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path, min_val=1, max_val=1)
+    assert (len(manifest.train.episodes), len(manifest.val.episodes)) == (FEWEST, 3)
+
+    source = RldsDataset(suite / spec.name, "val")
+    recorded = np.concatenate([source.episode(i, spec.image_key, ()).images for i in range(3)])
+    batches = make_frame_loader([(spec, suite / spec.name)], 64, 8, 0, min_val=1, max_val=1, split="val")
+    for frame in next(batches):
+        assert (frame == recorded).all((1, 2, 3)).any(), "a frame of no validation episode"
 
 
 def test_images_are_jpegs_without_chroma_subsampling(suite):
@@ -88,7 +149,7 @@ def test_images_are_jpegs_without_chroma_subsampling(suite):
 def test_bytes_do_not_depend_on_the_number_of_workers(suite, tmp_path):
     seen = []
     paths = generate_suite(
-        tmp_path, scale=TINY, names=NAMES, workers=2, progress=lambda name, k, n: seen.append((k, n))
+        tmp_path, **TINY, names=NAMES, workers=2, progress=lambda name, k, n: seen.append((k, n))
     )
     assert [p.parent.name for p in paths] == list(NAMES)
     assert seen == [(1, 3), (2, 3), (3, 3)]
@@ -96,7 +157,7 @@ def test_bytes_do_not_depend_on_the_number_of_workers(suite, tmp_path):
 
 
 def test_another_seed_gives_other_episodes(suite, tmp_path):
-    generate_suite(tmp_path, scale=TINY, names=NAMES[:1], seed=1)
+    generate_suite(tmp_path, **TINY, names=NAMES[:1], seed=1)
     key = f"{NAMES[0]}/1.0.0/{NAMES[0]}-train.tfrecord-00000-of-00001"
     assert contents(tmp_path)[key] != contents(suite)[key]
 
@@ -113,7 +174,7 @@ def test_only_what_is_missing_stale_or_damaged_is_made(tmp_path, monkeypatch):
 
     def run(**kwargs) -> list[str]:
         made.clear()
-        generate_suite(tmp_path, names=NAMES[:2], **{"scale": TINY, **kwargs})
+        generate_suite(tmp_path, names=NAMES[:2], **{**TINY, **kwargs})
         return sorted(made)
 
     assert run() == sorted(NAMES[:2])
@@ -135,14 +196,14 @@ def test_a_dataset_appears_only_when_it_is_complete(tmp_path, monkeypatch):
     write = generate.write_dataset
     monkeypatch.setattr(generate, "write_dataset", fail)
     with pytest.raises(OSError, match="disk full"):
-        generate_suite(tmp_path, scale=TINY, names=NAMES[:1])
+        generate_suite(tmp_path, **TINY, names=NAMES[:1])
     assert contents(tmp_path) == {}
 
     stale = tmp_path / NAMES[0] / ".1.0.0.scratch.12345678"  # as kill -9 leaves it
     stale.mkdir(parents=True)
     (tmp_path / NAMES[0] / ".1.0.0.lock").touch()
     monkeypatch.setattr(generate, "write_dataset", write)
-    generate_suite(tmp_path, scale=TINY, names=NAMES[:1])
+    generate_suite(tmp_path, **TINY, names=NAMES[:1])
     assert [p.name for p in (tmp_path / NAMES[0]).iterdir()] == ["1.0.0"]
 
 
@@ -167,18 +228,20 @@ def test_what_another_process_is_making_is_waited_for_and_not_made_again(tmp_pat
 
 
 def test_the_fingerprint_follows_everything_the_bytes_depend_on():
-    first, second = EMBODIMENTS[:2]
-    marks = [fingerprint(first, 1.0, 0), fingerprint(second, 1.0, 0), fingerprint(first, 0.5, 0)]
-    marks.append(fingerprint(first, 1.0, 1))
-    assert len(set(marks)) == 4
+    large, small = (next(s for s in EMBODIMENTS if s.episodes == n) for n in (500, FEWEST))
+    marks = [fingerprint(large, 1.0, 0), fingerprint(small, 1.0, 0), fingerprint(large, 0.5, 0)]
+    marks += [fingerprint(large, 1.0, 1), fingerprint(large, 1.0, 0, validation=5)]
+    assert len(set(marks)) == 5
+    assert fingerprint(small, 1.0, 0) == fingerprint(small, 8.0, 0)  # it keeps its size
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        ({"names": ["no_such_robot"]}, "unknown embodiment.*no_such_robot.*two_link_arm_joint_targets"),
+        ({"names": ["no_such_robot"]}, "unknown embodiment.*no_such_robot.*pusher_sand"),
         ({"scale": 0.0}, "scale must be positive"),
         ({"workers": 0}, "workers must be at least 1"),
+        ({"validation": 0}, "validation must be at least 1"),
     ],
 )
 def test_bad_arguments_are_named(tmp_path, arguments, message):
@@ -189,4 +252,4 @@ def test_bad_arguments_are_named(tmp_path, arguments, message):
 def test_a_root_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "file").write_text("not a directory")
     with pytest.raises(ConfigError, match="cannot make the suite's directory"):
-        generate_suite(tmp_path / "file" / "suite", scale=TINY, names=NAMES[:1])
+        generate_suite(tmp_path / "file" / "suite", **TINY, names=NAMES[:1])

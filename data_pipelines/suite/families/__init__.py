@@ -1,0 +1,18 @@
+"""The ten families of five siblings: a family is one table of five rows.
+
+Siblings share body plan, action convention, task and contact physics; they differ in geometry,
+camera, unit, rate, size of the dataset and palette. Every number of action values is that of two
+families, so that each robot has siblings and strangers with equally many.
+"""
+
+from data_pipelines.suite.families.carrying import BIMANUAL, GRIPPER, MOBILE, PICKER
+from data_pipelines.suite.families.many_joints import HUMANOID, TENTACLES
+from data_pipelines.suite.families.pushing import ARM, OMNI, PUSHER, ROVER
+
+FAMILIES = (PUSHER, ROVER, ARM, GRIPPER, PICKER, BIMANUAL, HUMANOID, TENTACLES)
+"""Those that are trained on by default."""
+
+NEWCOMERS = (OMNI, MOBILE)
+"""Those that never are: the new robots of `hma adapt`."""
+
+__all__ = ["FAMILIES", "NEWCOMERS"]

@@ -1,0 +1,73 @@
+"""Question: how well does a tokenizer give back the suite, and what moves in it?
+Command: python -m experiments.suite.tokenizer RUN [--out experiments/results/suite/tokenizer.csv]
+Cost: about half a minute of one core, after `hma tokenizer train --preset cpu --out RUN`.
+
+Pairs of frames half a second apart, from the validation split of every robot in RUN/suite: PSNR of
+the later one, and of those of its pixels that changed by more than a little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.registry import DatasetSpec, get_spec
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.rlds.images import fit_image
+from hma_jax.tokenizers.io import load_tokenizer
+
+OUT = Path("experiments/results/suite/tokenizer.csv")
+PAIRS = 48
+"""Per robot, spread evenly over its validation episodes."""
+
+CHANGED = 12
+"""Grey levels in any channel from which on a pixel counts as changed."""
+
+
+def frame_pairs(spec: DatasetSpec, directory: Path, size: int) -> np.ndarray:
+    """uint8 [N, 2, size, size, 3]: an earlier frame and the next at the model's rate."""
+    source, pairs = RldsDataset(directory, spec.val_split), []
+    for i in range(len(source)):
+        count = max(PAIRS // len(source), 1)
+
+        def choose(steps: int, count: int = count) -> list[int]:
+            starts = np.linspace(0, max(steps - 1 - spec.stride, 0), count).astype(int)
+            return [int(min(t, steps - 1)) for start in starts for t in (start, start + spec.stride)]
+
+        frames = [fit_image(f, size) for f in source.frames(i, spec.image_key, choose)]
+        pairs.append(np.stack(frames).reshape(-1, 2, size, size, 3))
+    return np.concatenate(pairs)
+
+
+def quality(decoded: np.ndarray, pairs: np.ndarray) -> tuple[float, float, float]:
+    """(mean PSNR of frames, PSNR of all changed pixels together, their share) of later frames decoded [N, H, W, 3]."""
+    error = (decoded.astype(np.float64) - pairs[:, 1]) ** 2
+    changed = np.abs(pairs[:, 1].astype(int) - pairs[:, 0]).max(-1) > CHANGED
+    frames = 10 * np.log10(255**2 / np.maximum(error.mean((1, 2, 3)), 1e-6))
+    return float(frames.mean()), float(10 * np.log10(255**2 / error[changed].mean())), float(changed.mean())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=OUT)
+    arguments = parser.parse_args()
+    tokenizer, rows = load_tokenizer(arguments.run / "tokenizer"), []
+    for directory in sorted((arguments.run / "suite").iterdir()):
+        pairs = frame_pairs(get_spec(directory.name), directory, tokenizer.image_size)
+        decoded = np.asarray(tokenizer.decode(tokenizer.encode(pairs[:, 1])))
+        rows.append([directory.name, *quality(decoded, pairs)])
+    rows.append(["mean", *np.mean([row[1:] for row in rows], 0)])
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    with arguments.out.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["robot", "psnr", "psnr_changed", "changed"])
+        writer.writerows([name, *(f"{value:.3f}" for value in values)] for name, *values in rows)
+    print(f"{rows[-1][1]:.2f} dB on held-out frames, {rows[-1][2]:.2f} dB on the {rows[-1][3]:.0%} of pixels that change")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The committed measurements of the suite: what they say, and that the simulator still gives them."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
+from experiments.suite import explained as explained_module
+from experiments.suite.clips import animation, clip
+from experiments.suite.explained import explained, read_table
+from experiments.suite.siblings import OUT, Samples, judge, predictor, sample
+from experiments.suite.tokenizer import quality
+
+BY_NAME = {s.name: s for s in EMBODIMENTS}
+
+
+def sibling_rows() -> dict[str, dict[str, str]]:
+    with OUT.open(newline="") as file:
+        return {row["family"]: row for row in csv.DictReader(file)}
+
+
+def test_actions_explain_enough_of_what_changes():
+    table = read_table()
+    assert list(table) == list(BY_NAME)
+    assert sum(row.share >= 0.3 for row in table.values()) >= 40
+    assert all(row.sem < 0.05 and row.moved > 3 for row in table.values())
+
+
+@pytest.mark.parametrize("name", ["pusher_sand", "picker_slate"])
+def test_the_simulator_still_gives_the_committed_shares(name):
+    now, then = explained(BY_NAME[name]), read_table()[name]
+    assert now.share == pytest.approx(then.share, abs=2e-3)
+    assert now.moved == pytest.approx(then.moved, abs=0.05)
+
+
+def test_actions_that_do_nothing_explain_nothing(monkeypatch):
+    spec = BY_NAME["pusher_sand"]
+    own = explained_module.simulate
+
+    def idle(*arguments):
+        rollout = own(*arguments)
+        rollout.actions[:] = 0
+        return rollout
+
+    monkeypatch.setattr(explained_module, "simulate", idle)
+    monkeypatch.setattr(explained_module, "frames_of", _moved_by_itself(explained_module.frames_of))
+    assert explained(spec, states=12).share < 0.02
+
+
+def _moved_by_itself(frames_of):
+    """Frames to which something is added that no action has a part in."""
+    calls = []
+
+    def frames(spec, state):
+        calls.append(len(state.q))
+        return frames_of(spec, state) + 40.0 * (len(calls) - 1)
+
+    return frames
+
+
+def test_siblings_share_dynamics_in_every_family():
+    rows = sibling_rows()
+    assert set(rows) == {s.family for s in EMBODIMENTS}
+    for family, row in rows.items():
+        assert float(row["over_strangers_low"]) > 0, family
+        assert float(row["over_shuffled_low"]) > 0, family
+        assert float(row["siblings"]) < 0.5, f"{family}: half of the motion is not predicted"
+
+
+def test_a_prediction_from_siblings_uses_the_actions():
+    """Small: one robot of one family; with other actions the prediction is another, and worse."""
+    spec = BY_NAME["pusher_sand"]
+    samples = {s.name: sample(s, 2, episodes=12) for s in (spec, *siblings(spec))}
+    target = samples.pop(spec.name)
+    predict = predictor(list(samples.values()))
+    shuffled = Samples(target.features, np.random.default_rng(0).permutation(target.actions), target.moves, target.episode)
+    right, wrong = (((predict(s) - target.moves) ** 2).sum(1).mean() for s in (target, shuffled))
+    assert right < 0.4 * wrong
+
+
+@pytest.mark.slow
+def test_the_simulator_still_gives_the_committed_sibling_figures():
+    family = [s for s in EMBODIMENTS if s.family in ("pusher", "rover")]
+    result, row = judge("pusher", {s.name: sample(s, 3) for s in family}), sibling_rows()["pusher"]
+    for name in ("siblings", "strangers", "shuffled"):
+        assert getattr(result, name) == pytest.approx(float(row[name]), abs=5e-3)
+
+
+def test_a_clip_plays():
+    spec = BY_NAME["rover_sky"]
+    frames = clip(spec, seconds=1.0)
+    assert frames.shape == (10, 64, 64, 3) and (frames[0] != frames[-1]).any()
+    assert animation(frames, spec.hz).startswith('<img alt="" src="data:image/webp;base64,')
+
+
+def test_pixels_that_change_are_judged_by_themselves():
+    pairs = np.zeros((1, 2, 4, 4, 3), np.uint8)
+    pairs[0, 1, 0] = 200  # one row of four changes
+    decoded = pairs[:, 1].astype(float)
+    decoded[0, 0] += 25.5  # and is wrong by a tenth of the range
+    mean, changed, share = quality(decoded, pairs)
+    assert share == pytest.approx(0.25)
+    assert changed == pytest.approx(20.0) and mean == pytest.approx(20 + 10 * np.log10(4))
