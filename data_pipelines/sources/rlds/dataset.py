@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 
 
 class RldsDataset(EpisodeSource):
-    """The episodes of one split of an RLDS directory, or of several one after the other ("train+val"); its shards are TFRecord or ArrayRecord files.
+    """The episodes of one split of an RLDS directory, or of several one after the other ("train+val"); its shards
+    are TFRecord or ArrayRecord files.
 
     `directory`, a path or URL, is a version directory (`<name>/1.0.0`) or its parent, then the
     newest version is taken. Shards are indexed once, for all later starts (see `index`).

@@ -220,9 +220,9 @@ def test_what_another_process_is_making_is_waited_for_and_not_made_again(tmp_pat
 
     monkeypatch.setattr(generate, "write_dataset", slowly)
     with ThreadPoolExecutor(2) as pool:
-        first = pool.submit(generate_suite, tmp_path, scale=TINY, names=[name])
+        first = pool.submit(generate_suite, tmp_path, **TINY, names=[name])
         assert began.wait(30)
-        second = pool.submit(generate_suite, tmp_path, scale=TINY, names=[name])
+        second = pool.submit(generate_suite, tmp_path, **TINY, names=[name])
         assert first.result() == second.result()
     assert len(made) == 1 and [p.name for p in (tmp_path / name).iterdir()] == ["1.0.0"]
 
