@@ -32,7 +32,7 @@ COLUMNS_FILE = "episodes.columns"
 LISTS = ("episodes", "steps")
 """Columns with an entry per episode: up to millions, so no code looks at them one by one."""
 
-LATER = ("angles", "angle_form", "angle_unit", "episodes", "median_steps", "mean_steps")
+LATER = ("angles", "angle_form", "angle_unit", "episodes", "median_steps", "mean_steps", "val_split")
 """Fields of a spec that manifests of earlier versions lack: where they say nothing, the hash stays what it was."""
 
 FORMAT, READ = 3, (2, 3)
