@@ -26,9 +26,9 @@ from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, Tr
 from hma_jax.config.json import stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.loading.loader import LoaderConfig
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.evaluation.evaluate import Evaluation
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
@@ -80,8 +80,8 @@ class Materials:
 
 def open_materials(workspace: Workspace) -> Materials:
     """Raises ConfigError or DataError for what is missing or damaged."""
-    from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.tokenizers.io import load_tokenizer
 
     return Materials(
@@ -177,7 +177,7 @@ def validation_batches(trial: Trial, materials: Materials, table: EmbodimentTabl
     """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
     import jax
 
-    from data_pipelines.loading.evalset import eval_batches
+    from data_pipelines.windows.evalset import eval_batches
 
     rows = trial.train.batch // jax.process_count()
     own = slice(jax.process_index() * rows, (jax.process_index() + 1) * rows)
@@ -201,7 +201,7 @@ def evaluate_on(
     progress: Progress = lambda *_: None,
 ) -> Evaluation:
     """The protocol over the frozen windows of `names`, or over the `first` ones of each."""
-    from data_pipelines.loading.evalset import eval_batches
+    from data_pipelines.windows.evalset import eval_batches
     from hma_jax.evaluation.evaluate import evaluate
 
     manifest = materials.manifest

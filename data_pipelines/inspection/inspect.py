@@ -16,10 +16,10 @@ import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
-from data_pipelines.loading.splits import smallest_hashes
 from data_pipelines.rlds.dataset import SUCCESS_KEY, RldsDataset
 from data_pipelines.rlds.images import decode_image
 from data_pipelines.rlds.schema import resolve_version, step_key
+from data_pipelines.sampling.splits import smallest_hashes
 from hma_jax.config import require
 
 INSTRUCTION_KEYS = ("steps/language_instruction", "steps/observation/natural_language_instruction")

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.inspection.inspect import CameraFacts, Facts
-from data_pipelines.loading.windows import count_windows
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.windows.windows import count_windows
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)

@@ -16,13 +16,13 @@ import grain
 import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
-from data_pipelines.loading.mixture import make_mixture
-from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
 from data_pipelines.rlds.location import OpenFiles
+from data_pipelines.sampling.mixture import make_mixture
+from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
+from data_pipelines.sampling.splits import held_out
 from hma_jax.config import require
 
 FRAMES_PER_READ = 4

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import grain
 import numpy as np
 
-from data_pipelines.loading.mixture import Mixture, make_mixture
-from data_pipelines.loading.order import ENDLESS, endless_shuffle, random_below, stream_seed
-from data_pipelines.loading.windows import WindowSet, cut_actions, cut_tokens, require_windows, train_windows
+from data_pipelines.sampling.mixture import Mixture, make_mixture
+from data_pipelines.sampling.order import ENDLESS, endless_shuffle, random_below, stream_seed
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.windows import WindowSet, cut_actions, cut_tokens, require_windows, train_windows
 from hma_jax.config import require
 from hma_jax.model.embodiments import EmbodimentTable
 

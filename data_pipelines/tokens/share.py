@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from data_pipelines.loading.order import stream_seed
+from data_pipelines.sampling.order import stream_seed
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.dataset import MAX_SKIPPED, RldsDataset
 from data_pipelines.rlds.images import fit_image
+from data_pipelines.sampling.splits import held_out
 from data_pipelines.tokens.dataset_writer import MOST_PARTS, PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import JobSettings, Loss, Manifest, SplitFacts, TokenizerFacts

@@ -15,8 +15,8 @@ from experiments.workspace import Workspace
 from hma_jax.config import require
 
 if TYPE_CHECKING:
-    from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
 
 HELD_OUT = 0.25
 """Share of a dataset's episodes: if more are held out, it is said how many and why."""
@@ -35,8 +35,8 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
 
     Raises ConfigError if others are there, unless `replace` allows it.
     """
-    from data_pipelines.loading.evalset import freeze_manifest
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import freeze_manifest
 
     store = TokenStore(workspace.store)
     names, frames = study.dataset_names(), study.model.frames
@@ -64,7 +64,7 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
 
 def require_judged(study: Study, workspace: Workspace) -> None:
     """Raises ConfigError if no dataset by which the datasets axis is judged has an evaluation window."""
-    from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.windows.evalset import EvalManifest
 
     judged = study.dataset_names()[: study.dataset_counts[0]]
     manifest = EvalManifest.load(workspace.manifest)
@@ -78,7 +78,7 @@ def require_judged(study: Study, workspace: Workspace) -> None:
 def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
     """The windows that are there. ConfigError if they cannot be read, unless they may be replaced."""
     from data_pipelines.errors import DataError
-    from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.windows.evalset import EvalManifest
 
     if not workspace.manifest.exists():
         return None
@@ -108,7 +108,7 @@ def _differences(there: EvalManifest, wanted: EvalManifest) -> list[str]:
 
 def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str, dict[str, int]]:
     """Per dataset: training episodes, those too short for a window, windows, episodes held out and skipped."""
-    from data_pipelines.loading.windows import train_windows
+    from data_pipelines.windows.windows import train_windows
 
     summary = {}
     for name in names:

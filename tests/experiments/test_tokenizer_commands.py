@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_pipelines.loading.evalset import eval_batches
 from data_pipelines.registry import get_spec
+from data_pipelines.windows.evalset import eval_batches
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.study import on_tokenizer, override

@@ -11,11 +11,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipelines.loading.windows import cut_actions, cut_frames, train_windows
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.import_tokens import LATENT_SCALE
 from data_pipelines.tokens.moments import Moments, merge_all
 from data_pipelines.tokens.release_folder import open_folder
+from data_pipelines.windows.windows import cut_actions, cut_frames, train_windows
 from hma_jax.config import MaskingConfig, ModelConfig
 from hma_jax.convert.official import official_shapes
 from hma_jax.convert.official_config import read_model

@@ -10,9 +10,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipelines.loading.mixture import mixture_weights
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.rlds.images import fit_image
+from data_pipelines.sampling.mixture import mixture_weights
 from hma_jax.config import DiffusionConfig, ModelConfig, OptimizerConfig
 from hma_jax.convert.table import official_parts
 from hma_jax.generation.decoding import cosine_schedule, masked_counts

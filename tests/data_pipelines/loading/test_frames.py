@@ -8,9 +8,9 @@ import pytest
 
 from data_pipelines.errors import EpisodeError
 from data_pipelines.loading.frames import make_frame_loader
-from data_pipelines.loading.splits import held_out
 from data_pipelines.registry import get_spec
 from data_pipelines.rlds.location import OpenFiles
+from data_pipelines.sampling.splits import held_out
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, count_open, make_spec, write_rlds
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.windows import cut_actions, cut_tokens, train_windows
 from data_pipelines.tokens.import_tokens import LATENT_SCALE, import_tokens, pair_folders
 from data_pipelines.tokens.release_folder import open_folder
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.windows import cut_actions, cut_tokens, train_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import GOLDEN
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
-from data_pipelines.loading.splits import held_out
+from data_pipelines.sampling.splits import held_out
 from data_pipelines.tokens.manifest import load_manifest
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_pipelines.loading.order import hash64, stream_seed
+from data_pipelines.sampling.order import hash64, stream_seed
 
 
 def held_out(

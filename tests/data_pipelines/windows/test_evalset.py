@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.evalset import EvalManifest, eval_batches, freeze_manifest
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from data_pipelines.windows.evalset import EvalManifest, eval_batches, freeze_manifest
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.windows import (
+from data_pipelines.tokens.episode_record import StoredEpisode
+from data_pipelines.windows.windows import (
     count_windows,
     cut_actions,
     cut_frames,
@@ -12,7 +13,6 @@ from data_pipelines.loading.windows import (
     train_windows,
     val_windows,
 )
-from data_pipelines.tokens.episode_record import StoredEpisode
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import OneDataset
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from data_pipelines.loading.order import endless_shuffle, hash64, random_below, stream_seed
-from data_pipelines.loading.splits import held_out, smallest_hashes
+from data_pipelines.sampling.order import endless_shuffle, hash64, random_below, stream_seed
+from data_pipelines.sampling.splits import held_out, smallest_hashes
 
 
 @pytest.mark.parametrize("n", [1, 2, 10, 1000, 65535, 65536])

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.order import hash64, stream_seed
-from data_pipelines.loading.windows import cut_actions, cut_frames, cut_tokens, require_windows, val_windows
+from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.windows import cut_actions, cut_frames, cut_tokens, require_windows, val_windows
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.model.embodiments import EmbodimentTable

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.splits import smallest_hashes
+from data_pipelines.sampling.splits import smallest_hashes
 from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import Manifest
 from data_pipelines.tokens.store import TokenStore
