@@ -13,18 +13,31 @@ from data_pipelines.sampling.order import hash64, stream_seed
 
 
 def held_out(
-    dataset: str, episodes: int, fraction: float = 0.05, min_val: int = 2, max_val: int = 200
+    dataset: str,
+    episodes: int,
+    fraction: float = 0.05,
+    min_val: int = 2,
+    max_val: int = 200,
+    max_fraction: float = 0.25,
 ) -> np.ndarray:
-    """bool [episodes], True for validation.
+    """bool [episodes], True for validation; see `count_held_out` for their number.
 
-    Their number is `fraction` of all, at least `min_val`, at most `max_val` and never more
-    than half of the dataset.
     DIFFERS: the release takes the first max(20, 5 %) episodes (reference section 5.1).
     """
-    count = min(max(round(fraction * episodes), min_val), max_val, episodes // 2)
+    count = count_held_out(episodes, fraction, min_val, max_val, max_fraction)
     mask = np.zeros(episodes, bool)
     mask[smallest_hashes(dataset, np.arange(episodes), count, "held-out")] = True
     return mask
+
+
+def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, max_fraction: float) -> int:
+    """`fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_fraction` of a dataset.
+
+    Of a small dataset the last decides: with min_val 8, two of nine episodes are held out, not four. One is, of
+    two episodes or more, unless `max_val` is 0.
+    """
+    most = max(int(max_fraction * episodes), 1)
+    return min(max(round(fraction * episodes), min_val), max_val, most, episodes // 2)
 
 
 def smallest_hashes(dataset: str, episodes: np.ndarray, count: int | None, salt: str) -> np.ndarray:
