@@ -33,6 +33,7 @@ class Embodiment:
     std: tuple[float, ...]
     # False: its video is of no use as a target (a policy dataset with blank cameras, say).
     video_targets: bool = True
+    layout: str = ""  # a hash of which values its actions are, in what order; "": not known
 
     def __post_init__(self):
         require(
@@ -109,8 +110,7 @@ class EmbodimentTable:
         which turns rounding noise on a constant dimension into values of order 100 (reference
         section 5.6).
         """
-        mean, std = self._of(embodiment_B, actions.ndim)
-        return (actions - mean) * jnp.where(std > 0, 1 / jnp.where(std > 0, std, 1), 0)
+        return normalise(actions, *self._of(embodiment_B, actions.ndim))
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """The inverse of `normalise`: raw units; dead dimensions take their mean."""
@@ -121,3 +121,8 @@ class EmbodimentTable:
         """(mean, std) of each example's robot, shaped to meet [B, ..., U]."""
         shape = (-1, *(1,) * (ndim - 2), self.action_width)
         return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.statistics())
+
+
+def normalise(actions: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
+    """Raw values in units of `std` from `mean`, which broadcast; 0 where `std` is 0."""
+    return (actions - mean) * jnp.where(std > 0, 1 / jnp.where(std > 0, std, 1), 0)
