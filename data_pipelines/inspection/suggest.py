@@ -10,7 +10,8 @@ import numpy as np
 
 from data_pipelines.inspection.inspect import CameraFacts, Facts
 from data_pipelines.registry import DatasetSpec
-from data_pipelines.windows.windows import count_windows
+from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.windows import TO_TRAIN
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)
@@ -67,7 +68,7 @@ class WindowFacts:
 
     frames: int
     stride: int
-    needed: int  # native frames of a window
+    needed: int  # native frames of the shortest window
     long_enough: int  # sampled episodes with a window
     per_episode: float  # windows, over the sampled episodes
     total: float  # windows of the split, estimated
@@ -134,9 +135,10 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
 
 def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:
     """Windows of `frames` at `stride`, counted over the sampled episodes."""
-    counts = count_windows(np.array(facts.steps), frames, stride, stride)
+    cut, least = Cut(frames, stride, stride), min(TO_TRAIN, frames)
+    counts = cut.count(np.array(facts.steps), least)
     mean = float(counts.mean())
-    return WindowFacts(frames, stride, frames * stride, int((counts > 0).sum()), mean, mean * facts.episodes)
+    return WindowFacts(frames, stride, least * stride, int((counts > 0).sum()), mean, mean * facts.episodes)
 
 
 def _text(value: str) -> str:

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry import FRAME_RATE, DatasetSpec
+from data_pipelines.tokens.moments import Moments
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.model.embodiments import Embodiment
@@ -23,6 +24,9 @@ FILE = "manifest.json"
 SPLITS = ("train", "val")
 LISTS = ("episodes", "steps")
 """Lists with an entry per episode: up to millions, so no code looks at them one by one."""
+
+LATER = (("spec", "rate", None), ("settings", "max_val_fraction", 0.5))
+"""Fields that stores of earlier versions lack, and what holds for those: their hash stays what it was."""
 
 FORMAT = 2
 """Of the store's layout; 1 had one file per split."""
@@ -51,10 +55,15 @@ class JobSettings:
     max_val: int = 200
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
+    max_val_fraction: float = 0.5  # of a dataset, whatever min_val says
 
     def __post_init__(self):
         require(0 <= self.val_fraction < 1, f"val_fraction must lie in [0, 1), got {self.val_fraction}")
         require(0 <= self.min_val <= self.max_val, f"min_val {self.min_val} exceeds max_val {self.max_val}")
+        require(
+            0 < self.max_val_fraction <= 0.5,
+            f"max_val_fraction must lie in (0, 0.5], got {self.max_val_fraction}",
+        )
         require(
             self.keep_frames in ("none", "val", "all"),
             f"keep_frames must be none, val or all, got {self.keep_frames!r}",
@@ -103,10 +112,17 @@ class Manifest:
     skipped: tuple[Loss, ...] = ()  # what was left out
     format: int = FORMAT
 
-    @property
-    def stride(self) -> int:
-        """Native frames per model frame."""
-        return self.spec.stride
+    def stride_at(self, rate: float | None = FRAME_RATE) -> int:
+        """Native frames per model frame at `rate` Hz (None: native). ConfigError if such frames are not stored."""
+        stride = self.spec.stride_at(rate)
+        own = rate if self.spec.rate is None else self.spec.rate
+        require(
+            stride % self.frame_step == 0,
+            f"{self.spec.name}: {rate_in_words(own)} is every {ordinal(stride)} recorded frame, the "
+            f"token store keeps every {ordinal(self.frame_step)}. Tokenise it again with frames for any rate, "
+            "`hma tokenize ... --set store.frame_step=1 --replace tokens`, or choose another rate.",
+        )
+        return stride
 
     @property
     def frame_step(self) -> int:
@@ -127,21 +143,27 @@ class Manifest:
         empty = dict.fromkeys(LISTS, ())
         return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
-    def embodiment(self) -> Embodiment:
-        """The model's view of this dataset's actions."""
+    def embodiment(self, rate: float | None = FRAME_RATE, moments: Moments | None = None) -> Embodiment:
+        """The model's view of this dataset's actions at `rate`; `moments` are of the actions that count, if
+        those are not all of the train split's."""
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
-            self.stride,
-            self.action_mean,
-            self.action_std,
+            self.stride_at(rate),
+            self.action_mean if moments is None else moments.mean,
+            self.action_std if moments is None else moments.std,
             self.spec.video_targets,
+            self.spec.action_layout(),
         )
 
     def hash(self) -> str:
         lists = (getattr(self.split(s), name) for s in SPLITS for name in LISTS)
         digests = [hashlib.sha256(np.asarray(x, "<i8").tobytes()).hexdigest() for x in lists]
-        return stable_hash([self._without_lists(), digests])
+        facts = to_dict(self._without_lists())
+        for group, field, as_before in LATER:
+            if facts[group][field] == as_before:
+                del facts[group][field]
+        return stable_hash([facts, digests])
 
     def to_text(self) -> str:
         """Deterministic JSON, long lists on one line."""
@@ -150,6 +172,16 @@ class Manifest:
             values[split] |= {name: getattr(self.split(split), name) for name in LISTS}
         lines = [f" {json.dumps(k)}: {json.dumps(v, sort_keys=True)}" for k, v in sorted(values.items())]
         return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def rate_in_words(rate: float | None) -> str:
+    return "the native rate" if rate is None else f"{rate:g} Hz"
+
+
+def ordinal(number: int) -> str:
+    """'1st', '2nd', ..."""
+    ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{ending}"
 
 
 def part_name(split: str, part: int, parts: int) -> str:

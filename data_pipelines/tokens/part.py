@@ -5,6 +5,7 @@ the source; which ranges there are depends on the source alone, so that any numb
 processes, killed and started again, make the same files.
 
     <dataset>/train-00003-of-00120.array_record   its training episodes, if any
+    <dataset>/train-00003-of-00120.moments.npy    statistics of the actions of each of these
     <dataset>/val-00003-of-00120.array_record     its held-out episodes, if any
     <dataset>/parts/00003.json                    its facts, in place only after the others
 """
@@ -19,11 +20,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from array_record.python import array_record_module
 
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
-from data_pipelines.tokens.moments import Moments, merge_all
+from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 
@@ -80,7 +82,7 @@ def write_part(
         for split in SPLITS
     }
     lost: list[Loss] = []
-    moments = []
+    moments, rows = [], []
     for item in made:
         if isinstance(item, Loss):
             lost.append(item)
@@ -88,7 +90,14 @@ def write_part(
         split, episode = item
         if split == "train" and len(episode.actions):
             moments.append(Moments.of(episode.actions))
+        if split == "train":
+            rows.append(moments_row(episode.actions))
         writers[split].add(episode)
+    if rows:
+        beside = aside / moments_path(Path(part_name("train", part.number, part.count))).name
+        np.save(beside, np.stack(rows))
+        sync(beside)
+        os.replace(beside, directory / beside.name)
     splits = [writers[split].close() for split in SPLITS]
     facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost))
     facts_aside = aside / "facts.json"

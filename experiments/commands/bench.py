@@ -110,7 +110,10 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     if frames < trained.model.frames:
         raise ConfigError(f"--frames must be at least the model's window of {trained.model.frames}, got {frames}")
     names = [d.dataset for d in materials.manifest.datasets if d.dataset in trained.table.names]
-    frozen = freeze_manifest(materials.store, names, frames, windows, materials.manifest.seed)
+    # Whole windows: what is timed are frames, all of them.
+    frozen = freeze_manifest(
+        materials.store, names, frames, windows, materials.manifest.seed, rate=materials.manifest.rate
+    )
     settings = decodings(trained.model, config, frames)
 
     def batches():

@@ -105,9 +105,9 @@ def inspect(
         windows = window_facts(facts, stride, frames)
         console.print(
             f"[bold]rate[/] {rate:g} Hz{'' if hz else ' (registry)'}: stride {stride}, "
-            f"{rate / stride:.2f} Hz; a window of {frames} frames takes {windows.needed} steps, which "
-            f"{windows.long_enough} of {facts.sampled} sampled episodes have; about {windows.total:,.0f} "
-            "windows in the split"
+            f"{rate / stride:.2f} Hz; a whole window of {frames} frames takes {frames * stride} steps, the shortest "
+            f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
+            f"{windows.total:,.0f} windows in the split"
         )
     _print_entry(facts, known, suggestion)
     folder = out or Path("runs") / "inspect" / facts.name
@@ -213,11 +213,9 @@ def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -
     if windows is None:
         return
     if not windows.total:
-        fits = facts.lengths.longest // windows.stride
-        advice = f"frames={fits} would fit" if fits > 1 else "they are too short for any window"
         console.print(
-            f"next: nothing yet. No episode that was read is as long as a window of {windows.frames} frames; {advice}. "
-            "Is the rate another one (--hz)?",
+            f"next: nothing yet. No episode that was read has the {windows.needed} steps that the shortest window "
+            f"takes at stride {windows.stride}; the longest has {facts.lengths.longest}. Is the rate another one (--hz)?",
             soft_wrap=True,
         )
         return

@@ -56,7 +56,7 @@ def make_store(
         for i, (spec, path) in enumerate(sources):
             pace, note = Pace(), f"{spec.name} ({i + 1} of {len(sources)})"
             manifest = tokenize_dataset(
-                spec, path, made_with, workspace.store, **settings, **how,
+                spec, path, made_with, workspace.store, **settings, **how, rate=study.rate,
                 share=share, overwrite=may_replace("tokens", replace),
                 progress=lambda done, total, note=note, pace=pace: update(
                     done, total, f"{note}{pace(done, total)}"
@@ -82,8 +82,9 @@ def _differences(
             continue
         source = open_source((spec, path), s)
         plan = plan_dataset(
-            spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val, frame_step=s.frame_step
-        )
+            spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val,
+            max_val_fraction=s.max_val_fraction, frame_step=s.frame_step, rate=study.rate,
+        )  # fmt: skip
         try:
             lines = differences(workspace.store, plan)
         except DataError as error:  # damaged, or of an older format
