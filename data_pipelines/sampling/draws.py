@@ -6,6 +6,7 @@ block holds, in an order that a hash of (seed, block) shuffles. So the i-th draw
 numbered i: its order visits every window once per epoch, which independent draws of every position would
 not, and counts never stray from their shares by more than a few, which matters for datasets of small weight.
 Any position costs one block, whatever came before it.
+DIFFERS: the release draws datasets and windows with replacement, the same in every epoch (reference section 4.3).
 """
 
 from __future__ import annotations

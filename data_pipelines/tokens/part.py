@@ -23,9 +23,10 @@ from pathlib import Path
 import numpy as np
 from array_record.python import array_record_module
 
+from data_pipelines.errors import DataError
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, Loss, part_name
-from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row
+from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row, read_moments
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 
@@ -128,7 +129,16 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
         size = place.stat().st_size if place.is_file() else 0
         if size != getattr(facts, split).size:
             return None
+    if facts.train.episodes and not _has_moments(directory, part, len(facts.train.episodes)):
+        return None
     return facts if facts.part == part else None
+
+
+def _has_moments(directory: Path, part: Part, episodes: int) -> bool:
+    try:
+        return read_moments(directory / part_name("train", part.number, part.count), episodes) is not None
+    except DataError:
+        return False
 
 
 def sync(path: Path) -> None:

@@ -15,7 +15,7 @@ from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
 
 SPEC = make_spec(hz=4)  # stride 2
-FILES = ["train-00000-of-00001.array_record", "val-00000-of-00001.array_record"]
+FILES = ["train-00000-of-00001.array_record", "train-00000-of-00001.moments.npy", "val-00000-of-00001.array_record"]
 
 
 @pytest.fixture
