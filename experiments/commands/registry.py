@@ -223,8 +223,10 @@ def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -
     changes = {}
     if windows.frames != preset.model.frames:
         changes["model.frames"] = windows.frames
-    if windows.frames <= preset.eval.prompt_frames:
-        changes["eval.prompt_frames"] = max(windows.frames // 2, 1)
+    prompt = preset.eval.prompt_frames if windows.frames > preset.eval.prompt_frames else windows.frames // 2
+    prompt = max(min(prompt, facts.lengths.longest // windows.stride - 1), 1)  # one more frame is to be judged
+    if prompt != preset.eval.prompt_frames:
+        changes["eval.prompt_frames"] = prompt
     settings = tuple(f"{name}={value}" for name, value in changes.items())
     asked = Where(data=(facts.directory,), registry=entries, set=settings).anywhere()
     console.print(Text(f"next: {command('tokenize', *asked.words())}"), soft_wrap=True)

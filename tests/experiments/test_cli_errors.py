@@ -174,7 +174,7 @@ def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
         if episode >= 2:
             features["steps/action"][0] = np.nan
 
-    rlds = write_rlds(tmp_path, ARM, [8] * 24, change=spoil)
+    rlds = write_rlds(tmp_path, ARM, [12] * 24, change=spoil)
     skip = ("--set", "store.corrupt=skip")
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
     assert "17 episodes are unusable, more than max_skipped=16" in message and "episode 18" in message
@@ -238,7 +238,7 @@ def test_no_window_at_all(arm, tmp_path, refused):
     long = ("--set", "model.frames=8", "--set", "eval.prompt_frames=7")
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, *long)
     assert "no val episode is long enough for a window" in message and ARM.name in message
-    assert "8 frames, the least there may be, need 16 native frames" in message and "a shorter prompt" in message
+    assert "8 frames, the least there may be, need 24 native frames" in message and "a shorter prompt" in message
 
 
 def test_a_judged_dataset_without_windows_stops_the_study(study, refused):

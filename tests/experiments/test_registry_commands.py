@@ -80,11 +80,20 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
 
 
 def test_inspection_of_episodes_without_a_window_suggests_no_command(robot, tmp_path, capsys):
-    arguments = ["--hz", "4", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
+    arguments = ["--hz", "40", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
     assert main(["data", "inspect", str(robot), *arguments]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "about 0 windows" in said and "hma tokenize" not in said
-    assert "next: nothing yet. No episode that was read is as long as a window of 9 frames; frames=7 would fit." in said
+    assert "next: nothing yet. No episode that was read has the 40 steps that the shortest window takes" in said
+
+
+def test_inspection_of_short_episodes_suggests_a_prompt_that_leaves_a_frame_to_judge(robot, tmp_path, capsys):
+    """About fifteen steps at 10 Hz are three frames at 2 Hz, of which the cpu preset's prompt would take four."""
+    arguments = ["--hz", "10", "--entry", str(tmp_path / "my.toml"), "--out", str(tmp_path)]
+    assert main(["data", "inspect", str(robot), *arguments]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a whole window of 12 frames takes 60 steps, the shortest 10" in said
+    assert "next: hma tokenize" in said and said.endswith("--set eval.prompt_frames=2")
 
 
 def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsys):
@@ -92,7 +101,7 @@ def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsy
     arguments = [str(REAL_DATA), "--out", str(tmp_path), "--json", str(json_file)]
     assert main(["data", "inspect", *arguments]) == 0
     said = capsys.readouterr().out
-    assert "rate 5 Hz (registry): stride 2" in said and "as its contents suggest" in said
+    assert "rate 5 Hz (registry): stride 3" in said and "as its contents suggest" in said
     facts = json.loads(json_file.read_text())
     assert facts["episodes"] == 3 and len(facts["actions"][0]["dimensions"]) == 7
 
