@@ -251,7 +251,7 @@ def run_trial(
     materials = open_materials(workspace)
     table = training_table(materials.store, loader_of(trial))
     declared = declare_model(trial.model, table)
-    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress)
+    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress, table=table)
 
     subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
     evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)
