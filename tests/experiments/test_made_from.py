@@ -94,7 +94,7 @@ def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
         (["--set", "tokenizer_train.steps=3"], "tokenizer", "tokenizer_train.steps: 5 -> 3"),
         (["--set", "tokenizer.channels=8"], "tokenizer", "tokenizer.channels: 16 -> 8"),
         (["--set", "store.min_val=1"], "tokenizer", "store.min_val: 2 -> 1"),
-        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 3 -> 1 (two_link_arm_joint_targets, "),
+        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 3 -> 1 (two_link_arm_joint_targets)"),
         (["--set", "eval.windows_per_dataset=1"], "windows", "eval.windows_per_dataset: 2 -> 1"),
         (["--set", "eval.seed=7"], "windows", "eval.seed: 0 -> 7"),
         (["--set", "model.frames=3"], "windows", "model.frames: 4 -> 3"),
