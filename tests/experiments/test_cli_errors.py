@@ -29,7 +29,7 @@ from tests.data_pipelines.fakes import make_spec, write_rlds
 ARM, BASE, PUSHER = map(
     get_spec, ("two_link_arm_joint_targets", "omni_base_world_velocity", "disc_pusher_delta_pixels")
 )
-LENGTHS = [12, 13, 14, 15, 12, 13, 14, 15]  # a whole window of the smoke study takes 12 native frames
+LENGTHS = [12, 13, 14, 15, 12, 13]  # a whole window of the smoke study takes 12 native frames
 SMOKE = ("--preset", "smoke")
 
 

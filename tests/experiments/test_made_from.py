@@ -13,9 +13,12 @@ from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
 from tests.data_pipelines.fakes import write_rlds
-from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
+from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
 STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
+
+
+LENGTHS = [12, 12, 13, 13, 14, 14, 15, 15]  # of eight episodes two are held out, with a whole window each
 
 
 @pytest.fixture(scope="module")

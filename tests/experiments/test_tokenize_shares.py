@@ -61,7 +61,7 @@ def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
         assert spec == ARM and directory == root
         assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), "--data", str(root)]) == 0
         assert f"--data memory://bucket/{ARM.name}" in capsys.readouterr().out.replace("\n", " ")
-        assert json.loads((tmp_path / "out/data.json").read_text())[ARM.name]["episodes"] == 4
+        assert json.loads((tmp_path / "out/data.json").read_text())[ARM.name]["episodes"] == 5
     finally:
         root.fs.rm("/bucket", recursive=True)
 
@@ -86,7 +86,7 @@ def test_processes_that_share_the_work_replace_nothing(data, tmp_path, capsys):
     shared = [*arguments, "--process", "0", "--processes", "2", "--set", "store.frame_step=1"]
     before = contents(tmp_path / "tokens")
     assert main(shared) == 2
-    assert "store.frame_step: 2 -> 1" in capsys.readouterr().err
+    assert "store.frame_step: 3 -> 1" in capsys.readouterr().err
     assert main([*shared, "--replace", "tokens"]) == 2
     assert "replace nothing" in capsys.readouterr().err
     assert contents(tmp_path / "tokens") == before

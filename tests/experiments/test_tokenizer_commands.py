@@ -25,7 +25,7 @@ from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensor
 from tests.hma_jax.pretrained import write_published
 
 ARM = get_spec("two_link_arm_joint_targets")
-LENGTHS = [10, 11, 12, 13, 14, 15]
+LENGTHS = [12, 12, 13, 13, 14, 15]
 
 
 @pytest.fixture(scope="module")
