@@ -10,22 +10,36 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_pipelines.loading.order import hash64, stream_seed
+from data_pipelines.sampling.order import hash64, stream_seed
 
 
 def held_out(
-    dataset: str, ids: np.ndarray, fraction: float = 0.05, min_val: int = 2, max_val: int = 200
+    dataset: str,
+    ids: np.ndarray,
+    fraction: float = 0.05,
+    min_val: int = 2,
+    max_val: int = 200,
+    max_fraction: float = 0.25,
 ) -> np.ndarray:
     """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 
-    Their number is `fraction` of all, at least `min_val`, at most `max_val` and never more
-    than half of the dataset.
+    How many they are says `count_held_out`.
     DIFFERS: the release takes the first max(20, 5 %) episodes (reference section 5.1).
     """
-    count = min(max(round(fraction * len(ids)), min_val), max_val, len(ids) // 2)
+    count = count_held_out(len(ids), fraction, min_val, max_val, max_fraction)
     mask = np.zeros(len(ids), bool)
     mask[smallest_hashes(dataset, ids, count, "held-out")] = True
     return mask
+
+
+def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, max_fraction: float) -> int:
+    """`fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_fraction` of a dataset.
+
+    Of a small dataset the last decides: with min_val 8, two of nine episodes are held out, not four. One is, of
+    two episodes or more, unless `max_val` is 0.
+    """
+    most = max(int(max_fraction * episodes), 1)
+    return min(max(round(fraction * episodes), min_val), max_val, most, episodes // 2)
 
 
 def subset(
