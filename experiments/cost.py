@@ -39,7 +39,7 @@ class Cost:
         return self.train_flops + self.evaluation_flops
 
 
-def declared_table(names: Sequence[str]) -> EmbodimentTable:
+def declared_table(names: Sequence[str], rate: float | None = 2.0) -> EmbodimentTable:
     """Embodiments with the right action sizes and no statistics.
 
     Raises ConfigError for a name that the registry does not know.
@@ -48,7 +48,7 @@ def declared_table(names: Sequence[str]) -> EmbodimentTable:
 
     def entry(spec: DatasetSpec) -> Embodiment:
         dim = spec.action_dim
-        return Embodiment(spec.name, dim, spec.stride, mean=(0.0,) * dim, std=(1.0,) * dim)
+        return Embodiment(spec.name, dim, spec.stride_at(rate), mean=(0.0,) * dim, std=(1.0,) * dim)
 
     return EmbodimentTable(tuple(entry(get_spec(name)) for name in names))
 
@@ -61,7 +61,7 @@ def estimate(trial: Trial) -> Cost:
     from hma_jax.model.flops import train_flops_per_window
     from hma_jax.model.hma import declare_model
 
-    table, config = declared_table(trial.datasets), trial.eval
+    table, config = declared_table(trial.datasets, trial.rate), trial.eval
     windows = len(trial.evaluated) * config.windows_per_dataset
     batches = -(-windows // config.batch)  # the last one is filled up
     if trial.measure_untrained:

@@ -44,7 +44,8 @@ class StoreConfig:
     val_fraction: float = 0.05
     min_val: int = 2  # held-out episodes per dataset, at least
     max_val: int = 200  # and at most
-    frame_step: int | None = None  # None: only the 2 Hz frames
+    max_val_fraction: float = 0.25  # of a dataset, at most, whatever min_val says
+    frame_step: int | None = None  # None: only the frames of the study's rate; 1: those of any rate
     corrupt: Literal["raise", "skip"] = "raise"  # damaged records: stop, or leave out and count
     max_skipped: float = 16.0  # damaged episodes per dataset that may be left out; below 1: this share of them
 
@@ -104,6 +105,12 @@ class Study:
     store: StoreConfig = field(default_factory=StoreConfig)
     datasets: tuple[str, ...] = ()  # in the order they are added; () takes the suite's own order
     tau: float = 3.0  # temperature of the mixture
+    # Hz at which frames are seen: 2 in the paper's pre-training; null, the native rate, in its post-training. An
+    # entry of the registry may have its own.
+    rate: float | None = 2.0
+    # Whose windows weigh in the mixture: those of the trajectories that are used, as in the release's sampler, or
+    # all, so that on the trajectories axis nothing but the trajectories changes.
+    weighed: Literal["used", "all"] = "used"
     seeds: tuple[int, ...] = (0,)
     ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
     transfer: TransferConfig = field(default_factory=TransferConfig)
@@ -117,6 +124,10 @@ class Study:
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
             require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
         self._check_tokens()
+        require(
+            self.rate is None or self.rate > 0,
+            f"rate, in frames per second, must be positive, or null for the native rate, got {self.rate}",
+        )
         require(
             self.eval.prompt_frames < self.model.frames,
             f"eval.prompt_frames {self.eval.prompt_frames} leaves nothing to predict in a window of "

@@ -68,6 +68,8 @@ def reference_trial(study: Study, seed: int) -> Trial:
         train=replace(study.train, seed=seed),
         eval=study.eval,
         tau=study.tau,
+        rate=study.rate,
+        weighed=study.weighed,
         measure_untrained=True,
     )
 

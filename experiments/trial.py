@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from experiments.atomic import write_atomically
 from experiments.provenance import Provenance
@@ -26,9 +26,9 @@ from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, Tr
 from hma_jax.config.json import stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from data_pipelines.loading.evalset import EvalManifest
-    from data_pipelines.loading.loader import LoaderConfig
+    from data_pipelines.loading.selection import LoaderConfig
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.evaluation.evaluate import Evaluation
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
@@ -50,6 +50,8 @@ class Trial:
     train: TrainConfig
     eval: EvalConfig
     tau: float = 3.0
+    rate: float | None = 2.0  # of frames, in Hz; None: native
+    weighed: Literal["used", "all"] = "used"  # whose windows weigh in the mixture
     shuffle_actions: bool = False  # the control: actions from another episode
     measure_untrained: bool = False  # also evaluate the model before its first step
 
@@ -80,8 +82,8 @@ class Materials:
 
 def open_materials(workspace: Workspace) -> Materials:
     """Raises ConfigError or DataError for what is missing or damaged."""
-    from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
     from hma_jax.tokenizers.io import load_tokenizer
 
     return Materials(
@@ -93,7 +95,7 @@ def open_materials(workspace: Workspace) -> Materials:
 
 def loader_of(trial: Trial) -> LoaderConfig:
     """Which windows a trial draws, and in what order."""
-    from data_pipelines.loading.loader import LoaderConfig
+    from data_pipelines.loading.selection import LoaderConfig
 
     return LoaderConfig(
         frames=trial.model.frames,
@@ -103,6 +105,8 @@ def loader_of(trial: Trial) -> LoaderConfig:
         max_trajectories=trial.max_trajectories,
         datasets=trial.datasets,
         shuffle_actions=trial.shuffle_actions,
+        rate=trial.rate,
+        weighed=trial.weighed,
     )
 
 
@@ -125,18 +129,20 @@ def train_trial(
     """
     import jax
 
-    from data_pipelines.loading.loader import LoaderConfig, make_loader
+    from data_pipelines.loading.loader import make_loader
+    from data_pipelines.loading.selection import LoaderConfig, training_table
     from hma_jax.config.json import from_dict
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
     from hma_jax.training.validation import Validation
 
     store, loader = materials.store, loader_of(trial)
-    table = table or store.embodiment_table(trial.datasets, trial.train.action_scale)
+    table = table or training_table(store, loader, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
 
     def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
-        return provenance | {"loader": to_dict(from_dict(LoaderConfig, provenance["loader"]))}
+        before = {"order": 1} | provenance["loader"]  # of versions that did not say in which order they drew
+        return provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
 
     def report(step: int, steps: int, values: dict[str, float]) -> None:
         held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
@@ -177,13 +183,13 @@ def validation_batches(trial: Trial, materials: Materials, table: EmbodimentTabl
     """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
     import jax
 
-    from data_pipelines.loading.evalset import eval_batches
+    from data_pipelines.windows.evalset import eval_batches
 
     rows = trial.train.batch // jax.process_count()
     own = slice(jax.process_index() * rows, (jax.process_index() + 1) * rows)
     for name in trial.evaluated:
         for whole in eval_batches(materials.store, table, materials.manifest, trial.train.batch, (name,)):
-            yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid")}
+            yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
             break  # the next dataset; one without windows has no batch
 
 
@@ -201,7 +207,7 @@ def evaluate_on(
     progress: Progress = lambda *_: None,
 ) -> Evaluation:
     """The protocol over the frozen windows of `names`, or over the `first` ones of each."""
-    from data_pipelines.loading.evalset import eval_batches
+    from data_pipelines.windows.evalset import eval_batches
     from hma_jax.evaluation.evaluate import evaluate
 
     manifest = materials.manifest
@@ -236,15 +242,16 @@ def run_trial(
     """
     import jax
 
+    from data_pipelines.loading.selection import training_table
     from experiments.machine import describe_machine
     from hma_jax.model.flops import train_flops_per_window
     from hma_jax.model.hma import declare_model
 
     started = time.perf_counter()
     materials = open_materials(workspace)
-    table = materials.store.embodiment_table(trial.datasets, trial.train.action_scale)
+    table = training_table(materials.store, loader_of(trial), trial.train.action_scale)
     declared = declare_model(trial.model, table)
-    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress)
+    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress, table=table)
 
     subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
     evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)

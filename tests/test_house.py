@@ -85,14 +85,29 @@ def test_no_files_of_the_core_import_each_other_in_a_circle():
     assert not circle, " -> ".join(circle)
 
 
-def test_no_folders_of_the_core_import_each_other_in_a_circle():
+def folders_of(graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """The same between folders: 'hma_jax.model' -> those that its files import."""
+
     def folder(name: str) -> str:
         return ".".join(name.split(".")[:2])
 
     folders: dict[str, set[str]] = {}
-    for name, imported in CORE.items():
+    for name, imported in graph.items():
         folders.setdefault(folder(name), set()).update({folder(other) for other in imported} - {folder(name)})
-    circle = find_circle(folders)
+    return folders
+
+
+def test_no_folders_of_the_core_import_each_other_in_a_circle():
+    circle = find_circle(folders_of(CORE))
+    assert not circle, " -> ".join(circle)
+
+
+def test_the_way_of_data_into_batches_has_no_circle_of_folders():
+    """tokens -> windows -> loading, all of them above sampling."""
+    way = {f"data_pipelines.{name}" for name in ("sampling", "tokens", "windows", "loading")}
+    imports = {folder: below & way for folder, below in folders_of(GRAPH).items() if folder in way}
+    assert set(imports) == way and not imports["data_pipelines.sampling"]
+    circle = find_circle(imports)
     assert not circle, " -> ".join(circle)
 
 

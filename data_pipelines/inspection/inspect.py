@@ -18,18 +18,13 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.inspection.action_stats import DimensionFacts, dimension_facts
 from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
 from data_pipelines.inspection.sample import Shown, shrink
-from data_pipelines.loading.splits import smallest_hashes
+from data_pipelines.sampling.splits import smallest_hashes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.schema import read_features, read_info, step_key
-from data_pipelines.sources.source import (
-    INSTRUCTION_KEY,
-    SUCCESS_KEY,
-    EpisodeSource,
-    Fetched,
-)
+from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched
 from hma_jax.config import require
 
 if TYPE_CHECKING:

@@ -88,7 +88,7 @@ def _windows(facts: Facts, windows: WindowFacts | None) -> list[Remark]:
     short = facts.sampled - windows.long_enough
     if not short:
         return []
-    needs = f"a window of {windows.frames} frames at stride {windows.stride} takes {windows.needed} steps"
+    needs = f"the shortest window at stride {windows.stride} takes {windows.needed} steps"
     if not windows.long_enough:
         return [
             Remark(

@@ -10,10 +10,11 @@ import numpy as np
 
 from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.inspect import CameraFacts, Facts
-from data_pipelines.loading.windows import count_windows
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.sources.rlds.schema import field_slice
+from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.windows import TO_TRAIN
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
 OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)
@@ -82,8 +83,10 @@ class WindowFacts:
 
     frames: int
     stride: int
-    needed: int  # native frames of a window
-    long_enough: int  # sampled episodes with a window
+    native: int  # native frames of a whole window
+    needed: int  # and of the shortest
+    whole: int  # sampled episodes with a whole window
+    long_enough: int  # with any
     per_episode: float  # windows, over the sampled episodes
     total: float  # windows of the split, estimated
 
@@ -170,9 +173,11 @@ def _choose_angles(
 
 def window_facts(facts: Facts, stride: int, frames: int) -> WindowFacts:
     """Windows of `frames` at `stride`, counted over the sampled episodes."""
-    counts = count_windows(np.array(facts.steps), frames, stride, stride)
-    mean = float(counts.mean())
-    return WindowFacts(frames, stride, frames * stride, int((counts > 0).sum()), mean, mean * facts.episodes)
+    cut, least = Cut(frames, stride, stride), min(TO_TRAIN, frames)
+    steps = np.array(facts.steps)
+    counts = cut.count(steps, least)
+    whole, some, mean = int((steps >= cut.native).sum()), int((counts > 0).sum()), float(counts.mean())
+    return WindowFacts(frames, stride, cut.native, least * stride, whole, some, mean, mean * facts.episodes)
 
 
 def _text(value: str) -> str:

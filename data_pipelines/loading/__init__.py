@@ -1,1 +1,1 @@
-"""From episodes to batches: splits, windows, mixture, order, and the frozen evaluation windows."""
+"""Batches for training: windows of a token store, or frames for a tokenizer."""

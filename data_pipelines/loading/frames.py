@@ -16,10 +16,11 @@ import grain
 import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
-from data_pipelines.loading.mixture import make_mixture
-from data_pipelines.loading.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.loading.splits import held_out_episodes
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sampling.draws import Draws
+from data_pipelines.sampling.mixture import make_mixture
+from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
+from data_pipelines.sampling.splits import held_out_episodes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
@@ -43,6 +44,7 @@ def make_frame_loader(
     val_fraction: float = 0.05,
     min_val: int = 2,
     max_val: int = 200,
+    max_val_fraction: float = 0.25,
     split: Literal["train", "val"] = "train",
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: float = MAX_SKIPPED,
@@ -61,7 +63,8 @@ def make_frame_loader(
     for spec, directory in datasets:
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-        mask = held_out_episodes(spec, source, val_fraction, min_val, max_val)[source.numbers]
+        bounds = (val_fraction, min_val, max_val, max_val_fraction)
+        mask = held_out_episodes(spec, source.runs, *bounds)[source.numbers]
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):
@@ -70,12 +73,10 @@ def make_frame_loader(
         streams[spec.name] = _Stream(source, spec.image_key, episodes, order)
     mixture = make_mixture(counts, tau, dict.fromkeys(counts, f"it has no {split} episode"))
     group = math.gcd(batch, FRAMES_PER_READ)
-    # What is mixed are numbers: a batch of them is cheap, and then read as a whole.
-    ranges = [grain.MapDataset.range(d * ENDLESS, (d + 1) * ENDLESS) for d in range(len(mixture.names))]
-    groups = grain.MapDataset.mix(ranges, mixture.weights).batch(batch // group)
-    batches = groups.map(_Reader(tuple(streams[n] for n in mixture.names), group, image_size))
+    draws = Draws(mixture.weights, f"frames/{split}/{seed}")
+    batches = _Batches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, AHEAD))
-    iterator = iter(batches.to_iter_dataset(options))
+    iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
     return iterator
 
@@ -91,7 +92,7 @@ class _Stream:
 
     def read(self, i: int, draws: np.ndarray, size: int) -> list[np.ndarray]:
         """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `EpisodeSource.frames`."""
-        at = endless_shuffle(i, len(self.episodes), self.seed)
+        at = int(endless_shuffle(i, len(self.episodes), self.seed))
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
             try:
@@ -102,19 +103,25 @@ class _Stream:
 
 
 @dataclass(frozen=True)
-class _Reader:
-    """Numbers of groups to frames: d * ENDLESS + i is the i-th of stream d, `count` frames of an episode."""
+class _Batches:
+    """Element s: the frames of batch s, in groups of `group` frames of one episode."""
 
     streams: tuple[_Stream, ...]
-    count: int
+    draws: Draws
+    batch: int
+    group: int
     size: int
 
-    def __call__(self, numbers: np.ndarray) -> np.ndarray:
-        """uint8 [groups * count, H, W, 3] from int64 [groups]."""
-        streams, positions = np.divmod(numbers, ENDLESS)
+    def __len__(self) -> int:
+        return ENDLESS // self.batch
+
+    def __getitem__(self, step: int) -> np.ndarray:
+        """uint8 [batch, H, W, 3]."""
+        groups = self.batch // self.group
+        streams, positions = self.draws.at(step * groups + np.arange(groups))
         seeds = np.asarray([self.streams[d].seed for d in streams], np.uint64)
-        draws = hash64(positions[:, None] * self.count + np.arange(self.count), seeds[:, None])
-        frames = np.empty((draws.size, self.size, self.size, 3), np.uint8)
+        draws = hash64(positions[:, None] * self.group + np.arange(self.group), seeds[:, None])
+        frames = np.empty((self.batch, self.size, self.size, 3), np.uint8)
         row = 0
         for d, i, drawn in zip(streams.tolist(), positions.tolist(), draws, strict=True):
             for image in self.streams[d].read(i, drawn, self.size):

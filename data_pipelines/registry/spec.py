@@ -17,18 +17,34 @@ from data_pipelines.registry.angles import (
 )
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import require
+from hma_jax.config.json import stable_hash
 
 FRAME_RATE = 2.0
-"""Hz at which the model sees frames (paper section 4)."""
+"""Hz at which the model sees frames unless a study says otherwise (paper section 4)."""
 
 
-def stride_of(hz: float) -> int:
-    """Native frames per model frame: the integer that comes nearest to 2 Hz, at least 1.
+NOT_OF_ACTIONS = (
+    "name", "image_key", "hz", "rate", "camera", "split", "note", "video_targets", "version", "unverified",
+    "episodes", "median_steps", "mean_steps",
+)  # fmt: skip
+"""Fields of an entry that say nothing of what an action's values are."""
 
+
+def stride_of(hz: float, rate: float | None = FRAME_RATE) -> int:
+    """Native frames per model frame, at least 1: of the two integers around hz / rate the one nearer in ratio.
+
+    Frames are then as near to `rate` Hz as they can be: 5 Hz for 2 has stride 3 (1.67 Hz, off by a factor of
+    1.2), not 2 (2.5 Hz, 1.25). The two are equally near at sqrt(n (n + 1)), which no fraction equals, so there is
+    no tie to decide. `rate` None is the native one, stride 1.
     DIFFERS: the release floors the ratio and knows a rate for 28 of its 40 datasets only;
     the others run at their native rate (reference sections 5.3 and 5.4).
     """
-    return max(round(hz / FRAME_RATE), 1)
+    if rate is None:
+        return 1
+    require(rate > 0, f"the rate of a window's frames must be positive, in Hz, got {rate}")
+    ratio = hz / rate
+    below = max(int(ratio), 1)
+    return below if ratio * ratio <= below * (below + 1) else below + 1
 
 
 @dataclass(frozen=True)
@@ -56,6 +72,7 @@ class DatasetSpec:
     video_targets: bool = True
     version: str = ""  # of tfds, for which the keys were written
     unverified: str = ""  # which of this entry's facts no public source confirms
+    rate: float | None = None  # Hz at which its frames are shown, whatever the study's rate; None: the study's
     angles: tuple[int, ...] = ()  # values that wrap; data, as the next two
     angle_form: AngleForm = "as_recorded"
     angle_unit: AngleUnit = "radian"
@@ -75,6 +92,10 @@ class DatasetSpec:
         require(
             0 < self.hz < math.inf,
             f"dataset {name!r}: hz, the native rate, must be positive and finite, got {self.hz}",
+        )
+        require(
+            self.rate is None or self.rate > 0,
+            f"dataset {name!r}: rate, of its frames in Hz, must be positive, got {self.rate}",
         )
         require(
             all(d >= 1 for d in self.action_dims),
@@ -105,8 +126,21 @@ class DatasetSpec:
 
     @property
     def stride(self) -> int:
-        """Native frames per model frame."""
-        return stride_of(self.hz)
+        """Native frames per model frame at the rate of pre-training."""
+        return self.stride_at(FRAME_RATE)
+
+    def stride_at(self, rate: float | None) -> int:
+        """Native frames per model frame in a study at `rate` Hz (None: native), unless this entry has its own."""
+        return stride_of(self.hz, rate if self.rate is None else self.rate)
+
+    def action_layout(self) -> str:
+        """A hash of what the values of an action mean and where they stand; of equal layouts it is equal.
+
+        Covers every fact of the entry but what `NOT_OF_ACTIONS` names, as far as it is not the default.
+        """
+        own = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in NOT_OF_ACTIONS}
+        defaults = {f.name: f.default for f in dataclasses.fields(self)}
+        return stable_hash({name: value for name, value in own.items() if value != defaults[name]})
 
     @property
     def action_dim(self) -> int:

@@ -22,6 +22,7 @@ class EpisodeRun:
     file: str  # its name, without a directory
     first: int
     count: int
+    split: str = ""  # of the files', where several are read together ("train+val")
 
 
 def episode_ids(runs: Sequence[EpisodeRun]) -> np.ndarray:

@@ -124,10 +124,6 @@ class EpisodeSource(ABC):
     def numbers(self) -> np.ndarray:
         """int64 [episodes]: which of the episodes named by `runs` each one is."""
 
-    def in_split(self, split: str) -> np.ndarray:
-        """bool [episodes named by `runs`]: those of this one of the splits that are read ("train+val")."""
-        raise ConfigError(f"{self.location}: only RLDS directories have a split {split!r} of their own")
-
     @abstractmethod
     def fingerprint(self) -> str:
         """Hash that tells other contents apart, not another place."""

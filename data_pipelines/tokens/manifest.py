@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,9 @@ import numpy as np
 from data_pipelines.columns import Column, Columns, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.names import brief
-from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sources.identity import EpisodeRun
+from data_pipelines.tokens.moments import Moments
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.config.training import ActionScale
@@ -32,8 +33,18 @@ COLUMNS_FILE = "episodes.columns"
 LISTS = ("episodes", "steps")
 """Columns with an entry per episode: up to millions, so no code looks at them one by one."""
 
-LATER = ("angles", "angle_form", "angle_unit", "episodes", "median_steps", "mean_steps", "val_split")
-"""Fields of a spec that manifests of earlier versions lack: where they say nothing, the hash stays what it was."""
+LATER = (
+    ("spec", "rate", None),
+    ("spec", "angles", []),
+    ("spec", "angle_form", "as_recorded"),
+    ("spec", "angle_unit", "radian"),
+    ("spec", "episodes", 0),
+    ("spec", "median_steps", 0.0),
+    ("spec", "mean_steps", 0.0),
+    ("spec", "val_split", ""),
+    ("settings", "max_val_fraction", 0.5),
+)
+"""Fields that stores of earlier versions lack, and what holds for those: their hash stays what it was."""
 
 FORMAT, READ = 3, (2, 3)
 """Of the store's layout, and those that are read. 1 had one file per split, 2 the columns as JSON."""
@@ -62,10 +73,16 @@ class JobSettings:
     max_val: int = 200
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
+    max_val_fraction: float = 0.5  # of a dataset, whatever min_val says
 
     def __post_init__(self):
         require(0 <= self.val_fraction < 1, f"val_fraction must lie in [0, 1), got {self.val_fraction}")
+        require(self.frame_step >= 1, f"frame_step must be at least 1, got {self.frame_step}")
         require(0 <= self.min_val <= self.max_val, f"min_val {self.min_val} exceeds max_val {self.max_val}")
+        require(
+            0 < self.max_val_fraction <= 0.5,
+            f"max_val_fraction must lie in (0, 0.5], got {self.max_val_fraction}",
+        )
         require(
             self.keep_frames in ("none", "val", "all"),
             f"keep_frames must be none, val or all, got {self.keep_frames!r}",
@@ -122,10 +139,17 @@ class Manifest:
     runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
     format: int = FORMAT
 
-    @property
-    def stride(self) -> int:
-        """Native frames per model frame."""
-        return self.spec.stride
+    def stride_at(self, rate: float | None = FRAME_RATE) -> int:
+        """Native frames per model frame at `rate` Hz (None: native). ConfigError if such frames are not stored."""
+        stride = self.spec.stride_at(rate)
+        own = rate if self.spec.rate is None else self.spec.rate
+        require(
+            stride % self.frame_step == 0,
+            f"{self.spec.name}: {rate_in_words(own)} is every {ordinal(stride)} recorded frame, the "
+            f"token store keeps every {ordinal(self.frame_step)}. Tokenise it again with frames for any rate, "
+            "`hma tokenize ... --set store.frame_step=1 --replace tokens`, or choose another rate.",
+        )
+        return stride
 
     @property
     def frame_step(self) -> int:
@@ -147,24 +171,42 @@ class Manifest:
         return replace(self, train=replace(self.train, **empty), val=replace(self.val, **empty))
 
     def embodiment(
-        self, scale: ActionScale = "deviation", quantiles: Sequence[Sequence[float]] | None = None
+        self,
+        rate: float | None = FRAME_RATE,
+        moments: Moments | None = None,
+        scale: ActionScale = "deviation",
+        quantiles: Sequence[Sequence[float]] | None = None,
     ) -> Embodiment:
-        """The model's view of this dataset's actions. `quantiles`, as `row_sample.QUANTILES` lists them, are of the
-        actions that count, if those are not all of the train split's.
+        """The model's view of this dataset's actions at `rate`. `moments`, and `quantiles` as
+        `row_sample.QUANTILES` lists them, are of the actions that count, if those are not all of the train split's.
 
         By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
         extremes. Raises DataError for a manifest of a version that kept no quantiles.
         """
+        return self._embodiment(self.stride_at(rate), moments, scale, quantiles)
+
+    def check(self) -> None:
+        """Raises ConfigError unless its parts fit each other."""
+        self._embodiment(self.frame_step, None, "deviation", None)
+
+    def _embodiment(
+        self,
+        stride: int,
+        moments: Moments | None,
+        scale: ActionScale,
+        quantiles: Sequence[Sequence[float]] | None,
+    ) -> Embodiment:
         low, high = self._quantile_scale(quantiles or self.action_quantiles) if scale == "quantiles" else ((), ())
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
-            self.stride,
-            self.action_mean,
-            self.action_std,
+            stride,
+            self.action_mean if moments is None else moments.mean,
+            self.action_std if moments is None else moments.std,
             self.spec.video_targets,
-            low,
-            high,
+            low=low,
+            high=high,
+            layout=self.spec.action_layout(),
         )
 
     def _quantile_scale(
@@ -191,9 +233,9 @@ class Manifest:
         for name in ("runs", "action_quantiles"):
             if not values[name]:
                 del values[name]
-        for later in fields(DatasetSpec):
-            if later.name in LATER and values["spec"][later.name] == to_dict(later.default):
-                del values["spec"][later.name]
+        for group, field, as_before in LATER:
+            if values[group][field] == as_before:
+                del values[group][field]
         return values
 
     def _columns(self) -> dict[str, Column]:
@@ -221,6 +263,16 @@ class Manifest:
         os.replace(aside / FILE, directory / FILE)
 
 
+def rate_in_words(rate: float | None) -> str:
+    return "the native rate" if rate is None else f"{rate:g} Hz"
+
+
+def ordinal(number: int) -> str:
+    """'1st', '2nd', ..."""
+    ending = "th" if number % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(number % 10, "th")
+    return f"{number}{ending}"
+
+
 def part_name(split: str, part: int, parts: int) -> str:
     """The file with a part's episodes of one split."""
     return f"{split}-{part:05d}-of-{parts:05d}.array_record"
@@ -242,7 +294,7 @@ def load_manifest(path: Path) -> Manifest:
         take = _from_json if values["format"] == 2 else _from_file
         lists = take(path, values)
         manifest = from_dict(Manifest, values)
-        manifest.embodiment()  # its parts fit each other
+        manifest.check()
         return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
     except OSError as error:
         raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error

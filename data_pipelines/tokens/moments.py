@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+
+from data_pipelines.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -63,3 +67,51 @@ def merge_all(pieces: Iterable[Moments], dim: int) -> Moments:
     for piece in pieces:
         merged = merged.merge(piece)
     return merged
+
+
+# --- Of single episodes, so that any choice of them has its own statistics ----------------------
+
+
+def moments_row(actions: np.ndarray) -> np.ndarray:
+    """float64 [1 + 2 A]: count, means and squares of one episode's `actions` [N, A]."""
+    one = Moments.of(actions) if len(actions) else Moments.none(actions.shape[1])
+    return np.asarray([one.count, *one.mean, *one.square], np.float64)
+
+
+def moments_path(part: Path) -> Path:
+    """Where the rows of a part's episodes stand, in their order; `part` is its file of records."""
+    return part.with_suffix(".moments.npy")
+
+
+def read_moments(part: Path, episodes: int) -> np.ndarray | None:
+    """float64 [episodes, 1 + 2 A], not loaded before it is used; None if none were written beside `part`."""
+    path = moments_path(part)
+    try:
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(
+            f"{path}: statistics of actions cannot be read ({error}). Remove the file: they are then computed again."
+        ) from error
+    if rows.ndim != 2 or len(rows) != episodes:
+        raise DataError(
+            f"{path}: statistics of {len(rows)} episodes beside a part of {episodes}. Remove the file: they are then "
+            "computed again."
+        )
+    return rows
+
+
+def merge_exactly(rows: np.ndarray, dim: int) -> Moments:
+    """Of the actions behind `rows` [N, 1 + 2 A]. Sums are rounded once, so that no order matters.
+
+    Smallest and largest values are not kept: they are 0.
+    """
+    count, mean, square = rows[:, :1], rows[:, 1 : 1 + dim], rows[:, 1 + dim :]
+    total = int(count.sum())
+    if not total:
+        return Moments.none(dim)
+    overall = np.asarray([math.fsum(column) / total for column in (count * mean).T])
+    apart = count * (mean - overall) ** 2
+    squares = [math.fsum((*a, *b)) for a, b in zip(square.T, apart.T, strict=True)]
+    return Moments(total, tuple(overall.tolist()), tuple(squares), (0.0,) * dim, (0.0,) * dim)

@@ -5,6 +5,7 @@ the source; which ranges there are depends on the source alone, so that any numb
 processes, killed and started again, make the same files.
 
     <dataset>/train-00003-of-00120.array_record   its training episodes, if any
+    <dataset>/train-00003-of-00120.moments.npy    statistics of the actions of each of these
     <dataset>/val-00003-of-00120.array_record     its held-out episodes, if any
     <dataset>/parts/00003.json                    its facts, in place only after the others
 """
@@ -19,12 +20,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from array_record.python import array_record_module
 
+from data_pipelines.errors import DataError
 from data_pipelines.publishing.files import sync
 from data_pipelines.tokens.episode_record import StoredEpisode, encode_episode
 from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, part_name
-from data_pipelines.tokens.moments import Moments, merge_all
+from data_pipelines.tokens.moments import Moments, merge_all, moments_path, moments_row, read_moments
 from data_pipelines.tokens.row_sample import RowSample, RowSampler, rows_of_part
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
@@ -83,7 +86,7 @@ def write_part(
         for split in SPLITS
     }
     lost: list[LostEpisodes] = []
-    moments, sampler = [], RowSampler(rows_of_part(part.count))
+    moments, rows, sampler = [], [], RowSampler(rows_of_part(part.count))
     for item in items:
         if isinstance(item, LostEpisodes):
             lost.append(item)
@@ -92,7 +95,14 @@ def write_part(
         if split == "train" and len(episode.actions):
             moments.append(Moments.of(episode.actions))
             sampler.add(episode.actions, episode.episode)
+        if split == "train":
+            rows.append(moments_row(episode.actions))
         writers[split].add(episode)
+    if rows:
+        beside = scratch / moments_path(Path(part_name("train", part.number, part.count))).name
+        np.save(beside, np.stack(rows))
+        sync(beside)
+        os.replace(beside, directory / beside.name)
     splits = [writers[split].close() for split in SPLITS]
     facts = PartFacts(part, *splits, merge_all(moments, action_dim), tuple(lost), sampler.sample())
     new_facts = scratch / "facts.json"
@@ -124,7 +134,16 @@ def read_part(directory: Path, part: Part) -> PartFacts | None:
         size = place.stat().st_size if place.is_file() else 0
         if size != getattr(facts, split).size:
             return None
+    if facts.train.episodes and not _has_moments(directory, part, len(facts.train.episodes)):
+        return None
     return facts if facts.part == part else None
+
+
+def _has_moments(directory: Path, part: Part, episodes: int) -> bool:
+    try:
+        return read_moments(directory / part_name("train", part.number, part.count), episodes) is not None
+    except DataError:
+        return False
 
 
 def _facts_path(directory: Path, part: Part) -> Path:

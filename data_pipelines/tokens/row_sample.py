@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_pipelines.loading.order import hash64, stream_seed
+from data_pipelines.sampling.order import hash64, stream_seed
 
 ROWS = 4096
 """Rows that a dataset's quantiles are taken of, at most."""

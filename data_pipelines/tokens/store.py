@@ -14,8 +14,10 @@ import numpy as np
 from array_record.python import array_record_module
 
 from data_pipelines.errors import DataError
+from data_pipelines.registry import FRAME_RATE
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, load_manifest, part_name
+from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
 from data_pipelines.tokens.row_sample import RowSampler
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
@@ -66,9 +68,12 @@ class TokenStore:
         chosen = sorted(self.names if names is None else names)
         return stable_hash({name: self.manifest(name).hash() for name in chosen})
 
-    def embodiment_table(self, names: Sequence[str], scale: ActionScale = "deviation") -> EmbodimentTable:
-        """The table of `names`, in that order. Raises what `Manifest.embodiment` raises."""
-        return EmbodimentTable(tuple(self.manifest(name).embodiment(scale) for name in names))
+    def embodiment_table(
+        self, names: Sequence[str], rate: float | None = FRAME_RATE, scale: ActionScale = "deviation"
+    ) -> EmbodimentTable:
+        """The table of `names`, in that order, with statistics of all training actions. Raises what
+        `Manifest.embodiment` raises."""
+        return EmbodimentTable(tuple(self.manifest(name).embodiment(rate, scale=scale) for name in names))
 
     def episode(self, name: str, split: str, i: int) -> StoredEpisode:
         """Episode `i` of a split, in store order. Raises DataError for a damaged record."""
@@ -94,15 +99,42 @@ class TokenStore:
             sampler.add(item.actions, item.episode)
         return sampler.sample().quantiles()
 
-    def check_table(self, table: EmbodimentTable, names: Sequence[str]) -> None:
-        """Raises ConfigError unless `table` has each of `names` with the action layout stored here."""
+    def action_moments(self, name: str, episodes: np.ndarray) -> Moments:
+        """Statistics of the actions of these training episodes alone (int [N], positions in the store).
+
+        Reads what stands beside each part, and the episodes themselves in a store of earlier versions, which
+        gives the same bits. Raises DataError for what is damaged.
+        """
+        rows, ends = [], self._ends[name, "train"]
+        episodes = np.sort(episodes)
+        of_episode = np.searchsorted(ends, episodes, side="right")
+        for part in np.unique(of_episode).tolist():
+            own = episodes[of_episode == part]
+            kept = read_moments(self._path(name, "train", part), self.manifest(name).train.parts[part])
+            if kept is None:
+                rows += [moments_row(self.episode(name, "train", int(i)).actions) for i in own]
+            else:
+                rows.append(kept[own - (ends[part - 1] if part else 0)])
+        return merge_exactly(np.concatenate([np.atleast_2d(x) for x in rows]), self.manifest(name).spec.action_dim)
+
+    def check_table(
+        self, table: EmbodimentTable, names: Sequence[str], rate: float | None = FRAME_RATE
+    ) -> None:
+        """Raises ConfigError unless `table` has each of `names` with the action layout stored here, at `rate`."""
         for name in names:
-            here, there = self.manifest(name).embodiment(), table.entries[table.index(name)]
+            here, there = self.manifest(name).embodiment(rate), table.entries[table.index(name)]
             if (here.action_dim, here.stride) != (there.action_dim, there.stride):
                 raise ConfigError(
                     f"{name}: the token store has {here.action_dim} action values at stride {here.stride}, "
                     f"the embodiment table {there.action_dim} at stride {there.stride}. "
                     "Use the store the table was made from."
+                )
+            if there.layout and here.layout != there.layout:  # tables of earlier versions do not say
+                spec = self.manifest(name).spec
+                raise ConfigError(
+                    f"{name}: the values of an action are others, or stand in another order, than when the embodiment "
+                    f"table was made: the token store has {', '.join(spec.action_keys)} of "
+                    f"{', '.join(map(str, spec.action_dims))} values. Use the store the table was made from."
                 )
 
     def _start(self) -> None:

@@ -22,17 +22,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.loading.splits import held_out_episodes
-from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry import FRAME_RATE, DatasetSpec
+from data_pipelines.sampling.splits import held_out_episodes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
-from data_pipelines.tokens.dataset_writer import (
-    PART_SIZE,
-    Progress,
-    cut_parts,
-    write_dataset,
-)
+from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
     JobSettings,
@@ -40,6 +35,7 @@ from data_pipelines.tokens.manifest import (
     Manifest,
     SplitFacts,
     TokenizerFacts,
+    rate_in_words,
 )
 from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
@@ -48,6 +44,7 @@ from hma_jax.config import require
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
     from hma_jax.tokenizers.base import Tokenizer
+
 
 def tokenize_dataset(
     spec: DatasetSpec,
@@ -58,8 +55,10 @@ def tokenize_dataset(
     val_fraction: float = 0.05,
     min_val: int = 2,
     max_val: int = 200,
+    max_val_fraction: float = 0.25,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
+    rate: float | None = FRAME_RATE,
     batch: int = 256,
     threads: int | None = None,
     part_size: int = PART_SIZE,
@@ -71,8 +70,8 @@ def tokenize_dataset(
 ) -> Manifest | None:
     """Tokenises one dataset into `<store_root>/<spec.name>` and returns its manifest.
 
-    `frame_step`: every how many native frames one is stored; default the stride (the 2 Hz
-    frames), 1 stores all phases; it must divide the stride. `batch` images are encoded at a
+    `frame_step`: every how many native frames one is stored; default the stride at `rate` Hz (None: native),
+    1 stores all phases and serves every rate; it must divide that stride. `batch` images are encoded at a
     time, `threads` (default: as many as cores, up to 8) decode. If the store already has this
     dataset made from the same shards in the same way, nothing is done. Any number of processes
     may do the same at a time, start and be killed: each makes parts that no other one makes.
@@ -88,8 +87,9 @@ def tokenize_dataset(
     source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped)
     source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
     plan = plan_dataset(
-        spec, source, tokenizer, val_fraction, min_val, max_val, keep_frames=keep_frames, frame_step=frame_step
-    )
+        spec, source, tokenizer, val_fraction, min_val, max_val,
+        max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
+    )  # fmt: skip
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
         LostEpisodes(reason.replace(f"{source.location}/", ""), episodes=count)
@@ -118,19 +118,23 @@ def plan_dataset(
     min_val: int,
     max_val: int,
     *,
+    max_val_fraction: float = 0.25,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
+    rate: float | None = FRAME_RATE,
 ) -> Manifest:
     """The manifest of a dataset before it is made. Raises ConfigError for settings that cannot work."""
-    frame_step = spec.stride if frame_step is None else frame_step
+    stride = spec.stride_at(rate)
+    frame_step = stride if frame_step is None else frame_step
     require(
-        frame_step >= 1 and spec.stride % frame_step == 0,
-        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {spec.stride}",
+        frame_step >= 1 and stride % frame_step == 0,
+        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {stride} of "
+        f"{rate_in_words(rate if spec.rate is None else spec.rate)}",
     )
     return Manifest(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
-        settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step),
+        settings=JobSettings(val_fraction, min_val, max_val, keep_frames, frame_step, max_val_fraction),
         source=source.fingerprint(),
         source_version=source.version,
         action_mean=(),
@@ -181,8 +185,8 @@ class _Work:
         self._tokenizer, self._batch = tokenizer, batch
         self._dtype = token_dtype(plan.tokenizer.vocab_size, plan.tokenizer.channels)
         self._numbers = source.numbers
-        is_val = held_out_episodes(plan.spec, source, s.val_fraction, s.min_val, s.max_val)
-        self._is_val = is_val[self._numbers]
+        bounds = (s.val_fraction, s.min_val, s.max_val, s.max_val_fraction)
+        self._is_val = held_out_episodes(plan.spec, source.runs, *bounds)[self._numbers]
 
     def make(self, part: Part) -> Iterator[PartItem]:
         """The episodes of a part, in order. An unusable one is lost or raised, as the source says."""

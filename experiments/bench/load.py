@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.loading.frames import make_frame_loader
-from data_pipelines.loading.loader import LoaderConfig, make_loader
+from data_pipelines.loading.loader import make_loader
+from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.tokens.dataset_writer import cut_parts, write_dataset
 from data_pipelines.tokens.episode_record import StoredEpisode

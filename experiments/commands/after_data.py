@@ -13,28 +13,36 @@ if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts
 
 
-def tokenize_command(directories: Sequence[str], frames: int, registry: Path | None) -> str:
-    """The command that tokenises datasets for windows of `frames`, by the preset that is the default."""
+def tokenize_command(
+    directories: Sequence[str], frames: int, registry: Path | None, longest: int, rate: float | None = None
+) -> str:
+    """The command that tokenises datasets for windows of `frames`, by the preset that is the default.
+
+    `longest`: frames of the longest episode at that rate; the prompt leaves one of them to judge. `rate`: of
+    frames in Hz, if it is not the preset's.
+    """
     preset = get_preset(Where.preset)
-    changes = {}
+    changes: dict[str, object] = {}
     if frames != preset.model.frames:
         changes["model.frames"] = frames
-    if frames <= preset.eval.prompt_frames:
-        changes["eval.prompt_frames"] = max(frames // 2, 1)
+    prompt = preset.eval.prompt_frames if frames > preset.eval.prompt_frames else frames // 2
+    prompt = max(min(prompt, longest - 1), 1)
+    if prompt != preset.eval.prompt_frames:
+        changes["eval.prompt_frames"] = prompt
+    if rate is not None:
+        changes["rate"] = f"{rate:g}"
     settings = tuple(f"{name}={value}" for name, value in changes.items())
     asked = Where(data=tuple(directories), registry=registry, set=settings).anywhere()
     return command("tokenize", *asked.words())
 
 
 def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
-    """What to run instead for a dataset of which no episode is long enough, and why."""
+    """What to run instead for a dataset of which no episode has two frames at `stride`, and why."""
     longest, known = facts.lengths.longest, (("--registry", registry) if registry else ())
     if longest < 2:
         return "leave it out: its longest episode has one step, so there is no motion to learn"
-    if longest // stride >= 2:
-        fits = longest // stride
-        words = command("data view", facts.directory, "--frames", f"{fits}", *known)
-        why = f"so many frames fit its longest episode, {longest} steps; train with --set model.frames={fits}"
-        return f"{words}  ({why})"
-    words = command("data view", facts.directory, "--stride", "1", "--frames", f"{min(longest, 12)}", *known)
-    return f"{words}  (its longest episode has {longest} steps: too short at stride {stride}, every frame is needed)"
+    words = command("data view", facts.directory, "--stride", "1", *known)
+    return (
+        f"{words}  (no episode that was read has the {2 * stride} steps that the shortest window takes at stride "
+        f"{stride}; the longest has {longest}: every frame is needed, or the rate is another one, --hz)"
+    )

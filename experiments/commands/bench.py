@@ -93,14 +93,8 @@ def evaluate(bench: Bench, context: Literal["recorded", "generated"], draws: int
 def quality(setting: Setting, run: Path, frames: int | None, windows: int, repeats: int) -> None:
     from dataclasses import replace
 
-    from data_pipelines.loading.evalset import eval_batches, freeze_manifest
-    from experiments.bench.quality import (
-        Judged,
-        decodings,
-        judge,
-        plot_quality,
-        subject_of,
-    )
+    from data_pipelines.windows.evalset import eval_batches, freeze_manifest
+    from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
     from experiments.commands.model import check_fits, require_prepared
     from experiments.rows import write_csv
     from experiments.trial import open_materials
@@ -116,7 +110,10 @@ def quality(setting: Setting, run: Path, frames: int | None, windows: int, repea
     if frames < trained.model.frames:
         raise ConfigError(f"--frames must be at least the model's window of {trained.model.frames}, got {frames}")
     names = [d.dataset for d in materials.manifest.datasets if d.dataset in trained.table.names]
-    frozen = freeze_manifest(materials.store, names, frames, windows, materials.manifest.seed)
+    # Whole windows: what is timed are frames, all of them.
+    frozen = freeze_manifest(
+        materials.store, names, frames, windows, materials.manifest.seed, rate=materials.manifest.rate
+    )
     settings = decodings(trained.model, config, frames)
 
     def batches():

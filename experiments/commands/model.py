@@ -14,6 +14,7 @@ from experiments.progress import console, step, tidy_table
 from experiments.setting import Setting, short
 from experiments.sweep import reference_trial
 from hma_jax.config import ConfigError, Weights, require
+from hma_jax.config.json import from_dict
 
 if TYPE_CHECKING:
     from experiments.run_options import RunOptions
@@ -55,7 +56,8 @@ def adapt(
     replace: Step | None = None,
 ) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
-    from experiments.trial import open_materials
+    from data_pipelines.loading.selection import training_embodiment
+    from experiments.trial import loader_of, open_materials
     from hma_jax.training.adapt import add_embodiments
     from hma_jax.training.runs import load_run
 
@@ -67,15 +69,15 @@ def adapt(
     seed = study.seeds[0]
     new = [name for name in study.dataset_names() if name not in trained.table.names]
     require(bool(new), f"{source} already knows {', '.join(study.dataset_names())}: there is nothing to add")
-    scale = study.train.action_scale
-    robots = [materials.store.manifest(name).embodiment(scale) for name in new]
-    params, table = add_embodiments(trained.params, trained.model, trained.table, robots, seed)
     only = () if everything else tuple(new)
     trial = dataclasses.replace(
         _single_trial(setting, trajectories),
         model=trained.model,
         train=dataclasses.replace(study.train, seed=seed, only=only),
     )
+    scale = study.train.action_scale
+    robots = [training_embodiment(materials.store, name, loader_of(trial), scale) for name in new]
+    params, table = add_embodiments(trained.params, trained.model, trained.table, robots, seed)
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     origin = {"step": trained.step, "provenance": trained.provenance}
     del trained  # its arrays are not needed while the new model trains
@@ -122,7 +124,7 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
 
 def say_data(trial: Trial, materials: Materials) -> None:
     """What a model is trained on. Raises DataError if it is nothing."""
-    from data_pipelines.loading.loader import select_windows
+    from data_pipelines.loading.selection import select_windows
     from experiments.trial import loader_of
 
     chosen = select_windows(materials.store, loader_of(trial))
@@ -147,13 +149,15 @@ def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
     require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)
-    frozen = {d.dataset for d in materials.manifest.datasets}
+    frozen, untrained = set(materials.manifest.names), _not_trained_on(trained, materials)
     left_out = [name for name in trained.table.names if name not in frozen]
     if left_out:
         console.print(f"note: not evaluated, for want of windows here: {', '.join(left_out)}", soft_wrap=True)
+    if untrained:
+        console.print(f"note: not evaluated, for it was not trained on: {', '.join(untrained)}", soft_wrap=True)
     with step(f"evaluate {short(run)}") as update:
         evaluation = evaluate_on(
-            tuple(name for name in trained.table.names if name in frozen),
+            tuple(name for name in trained.table.names if name in frozen - set(untrained)),
             trained.params,
             trained.model,
             trained.table,
@@ -173,6 +177,19 @@ def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
     write_evaluation(run, evaluation)
     write_atomically(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
     wrote(run / "evaluation.json", run / FILE, run / "samples.npz")
+
+
+def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
+    """Datasets that a model was meant to be trained on and that gave it no window."""
+    from data_pipelines.loading.selection import LoaderConfig, select_windows
+
+    loader = trained.provenance.get("loader")
+    if loader is None:  # it was converted
+        return []
+    config = from_dict(LoaderConfig, loader)
+    if not set(config.datasets) <= set(materials.store.names):
+        return []
+    return list(select_windows(materials.store, config).mixture.dropped)
 
 
 def require_prepared(setting: Setting) -> None:

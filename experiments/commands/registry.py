@@ -110,9 +110,9 @@ def inspect(
         windows = window_facts(facts, stride, frames)
         console.print(
             f"[bold]rate[/] {rate:g} Hz{'' if hz else ' (registry)'}: stride {stride}, "
-            f"{rate / stride:.2f} Hz; a window of {frames} frames takes {windows.needed} steps, which "
-            f"{windows.long_enough} of {facts.sampled} sampled episodes have; about {windows.total:,.0f} "
-            "windows in the split"
+            f"{rate / stride:.2f} Hz; a whole window of {frames} frames takes {windows.native} steps, the shortest "
+            f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
+            f"{windows.total:,.0f} windows in the split"
         )
     _print_entry(facts, known, suggestion)
     folder = out or Path("runs") / "inspect" / facts.name
@@ -219,7 +219,8 @@ def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -
     if windows is None:
         return
     if windows.total:
-        words = tokenize_command((facts.directory,), windows.frames, entries)
+        spans = facts.lengths.longest // windows.stride
+        words = tokenize_command((facts.directory,), windows.frames, entries, spans)
     else:
         words = no_window(facts, windows.stride, entries)
     console.print(Text(f"next: {words}"), soft_wrap=True)

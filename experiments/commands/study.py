@@ -72,8 +72,7 @@ def run_study(
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
         provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
-        if "datasets" in axes:
-            require_judged(study, workspace)
+        require_judged(study, workspace, {name for sweep in sweeps for name in sweep.scope})
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
             what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
             console.print(what, markup=False, soft_wrap=True)

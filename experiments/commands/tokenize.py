@@ -112,7 +112,7 @@ def show_store(workspace: Workspace) -> None:
             f"{np.median(steps):g}",
             f"{max(steps)}",
             f"{manifest.spec.hz:g}",
-            f"{manifest.stride}",
+            f"{manifest.spec.stride}",
         )
     console.print(table)
     for name in store.names:

@@ -19,6 +19,7 @@ from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.duplicates import Fingerprint
+    from data_pipelines.inspection.inspect import Facts
     from experiments.report.data_page import Viewed
 
 ENTRIES = "my_robots.toml"
@@ -85,7 +86,8 @@ def _view_one(
     if known is None and rate is not None:
         suggestion = suggest_entry(facts, rate)
         entry = suggestion.spec() if suggestion else None
-    stride = (stride or stride_of(rate)) if rate else None
+    usual = entry.stride if entry else stride_of(rate) if rate else None
+    stride = (stride or usual) if rate else None
     others = [s.name for s in facts.splits if s.name != split and s.episodes][:OTHER_SPLITS]
     prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes))]
     windows = window_facts(facts, stride, frames) if stride else None
@@ -116,12 +118,12 @@ def _say_remarks(viewed: Viewed) -> None:
 
 
 def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> None:
-    """The command that reads what can be read, or the one that leads there."""
+    """The commands that read what can be read, one per rate of frames, or those that lead there."""
     from data_pipelines.inspection.remarks import MISFIT
     from data_pipelines.inspection.suggest import window_facts
-    from data_pipelines.registry.spec import stride_of
 
-    usable = []
+    usable: dict[float | None, list[Facts]] = {}
+    longest: dict[float | None, int] = {}
     for v in viewed:
         f = v.facts
         if not v.registered:
@@ -131,11 +133,17 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
             after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
         elif not window_facts(f, v.stride, frames).total:
             after = no_window(f, v.stride, registry)
-        elif not window_facts(f, stride_of(v.hz), frames).total:
-            after = f"nothing yet: a study takes it at stride {stride_of(v.hz)}, where no window of {frames} frames fits"
+        elif v.stride != v.entry.stride and v.entry.rate is not None:
+            after = (
+                f"nothing yet: its entry has a rate of its own, {v.entry.rate:g} Hz: a study takes it at stride "
+                f"{v.entry.stride}, whatever the study's rate"
+            )
         else:
-            usable.append(f.directory)
+            rate = None if v.stride == v.entry.stride else v.entry.hz / v.stride
+            usable.setdefault(rate, []).append(f)
+            longest[rate] = min(longest.get(rate, frames), f.lengths.longest // v.stride)
             continue
         console.print(Text(f"next for {f.name}: {after}"), soft_wrap=True)
-    if usable:
-        console.print(Text(f"next: {tokenize_command(usable, frames, registry)}"), soft_wrap=True)
+    for rate, facts in usable.items():
+        words = tokenize_command([f.directory for f in facts], frames, registry, longest[rate], rate)
+        console.print(Text(f"next: {words}"), soft_wrap=True)

@@ -45,7 +45,7 @@ def make_store(
         (spec, path), pace = sources[i], Pace()
         note = f"{spec.name} ({i + 1} of {len(sources)}{', the rest of it by other processes' if wait else ''})"
         manifest = tokenize_dataset(
-            spec, path, made_with, workspace.store, **settings, **how,
+            spec, path, made_with, workspace.store, **settings, **how, rate=study.rate,
             overwrite=may_replace("tokens", replace), wait=wait,
             progress=lambda done, total: update(done, total, f"{note}{pace(done, total)}"),
         )  # fmt: skip
@@ -71,8 +71,9 @@ def _differences(
             continue
         source = open_source((spec, path), s)
         plan = plan_dataset(
-            spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val, frame_step=s.frame_step
-        )
+            spec, source, tokenizer, s.val_fraction, s.min_val, s.max_val,
+            max_val_fraction=s.max_val_fraction, frame_step=s.frame_step, rate=study.rate,
+        )  # fmt: skip
         try:
             lines = differences(workspace.store, plan)
         except DataError as error:  # damaged, or of an older format

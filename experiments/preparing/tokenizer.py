@@ -39,6 +39,9 @@ QUALITY = "quality.json"
 QUALITY_FRAMES = 1024
 """Held-out frames by which a tokenizer is judged; drawn at random from all datasets."""
 
+HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
+"""Settings of the store that say which episodes no tokenizer is trained on."""
+
 TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
 
 
@@ -48,6 +51,8 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     Steps, batch or objective of the model are no part of it. Of the mixture's temperature, which is set for the
     model's sake, the frames depend a little: it is recorded only.
     """
+    from data_pipelines.sampling.order import ORDER
+
     settings = study.store
     data = {
         spec.name: {
@@ -61,11 +66,11 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
         ORIGIN: TRAINED,
         "tokenizer": to_dict(study.tokenizer),
         "tokenizer_train": to_dict(study.tokenizer_train),
-        "store": {name: getattr(settings, name) for name in ("val_fraction", "min_val", "max_val")},
+        "store": {name: getattr(settings, name) for name in HELD_OUT},
         "datasets": list(data),
         "data": data,
     }
-    return MadeFrom(inputs, {"tau": study.tau, "sources": source_hash(("hma_jax/tokenizers",))})
+    return MadeFrom(inputs, {"tau": study.tau, "order": ORDER, "sources": source_hash(("hma_jax/tokenizers",))})
 
 
 def make_tokenizer(
@@ -92,7 +97,7 @@ def make_tokenizer(
     def frames(start: int, split: str = "train") -> Iterator[np.ndarray]:
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
-            val_fraction=settings.val_fraction, min_val=settings.min_val, max_val=settings.max_val,
+            **{name: getattr(settings, name) for name in HELD_OUT},
             corrupt=settings.corrupt, max_skipped=settings.max_skipped,
         )  # fmt: skip
 

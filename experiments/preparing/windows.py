@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from experiments.atomic import write_atomically
@@ -15,8 +15,8 @@ from experiments.workspace import Workspace
 from hma_jax.config import require
 
 if TYPE_CHECKING:
-    from data_pipelines.loading.evalset import EvalManifest
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
 
 HELD_OUT = 0.25
 """Share of a dataset's episodes: if more are held out, it is said how many and why."""
@@ -26,7 +26,7 @@ def require_same_windows(study: Study, workspace: Workspace, replace: Step | Non
     """Raises ConfigError, before anything is made, if what is known by then differs from the frozen windows."""
     there = _frozen(workspace, replace)
     if there is not None:
-        lines = _setting_differences(there, study.model.frames, study.eval.seed, study.dataset_names())
+        lines = _setting_differences(there, study.model.frames, study.rate, study.eval.seed, study.dataset_names())
         require_same("windows", workspace.manifest, lines, replace)
 
 
@@ -35,18 +35,21 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
 
     Raises ConfigError if others are there, unless `replace` allows it.
     """
-    from data_pipelines.loading.evalset import freeze_manifest
     from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import freeze_manifest
 
     store = TokenStore(workspace.store)
     names, frames = study.dataset_names(), study.model.frames
-    manifest = freeze_manifest(store, names, frames, study.eval.windows_per_dataset, study.eval.seed)
+    manifest = freeze_manifest(
+        store, names, frames, study.eval.windows_per_dataset, study.eval.seed,
+        prompt=study.eval.prompt_frames, rate=study.rate,
+    )  # fmt: skip
     there = _frozen(workspace, replace)
     if there is None or there.hash() != manifest.hash():
         if there is not None:
             require_same("windows", workspace.manifest, _differences(there, manifest), replace)
         manifest.save(workspace.manifest)
-    summary = summarise(store, names, frames)
+    summary = summarise(store, names, frames, study.rate)
     write_atomically(workspace.data_summary, json.dumps(summary, indent=1))
     for name, facts in summary.items():
         _remark(name, facts, manifest.empty.get(name, ""), frames)
@@ -70,23 +73,28 @@ def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
     return there is not None and there.store == TokenStore(workspace.store).hash(study.dataset_names())
 
 
-def require_judged(study: Study, workspace: Workspace) -> None:
-    """Raises ConfigError if no dataset by which the datasets axis is judged has an evaluation window."""
-    from data_pipelines.loading.evalset import EvalManifest
+def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) -> None:
+    """Raises ConfigError if a dataset that is `judged` has no evaluation window, or any of the study no training
+    window: a point of an axis would say of more datasets than it was made with."""
+    from data_pipelines.windows.evalset import EvalManifest
 
-    judged = study.dataset_names()[: study.dataset_counts[0]]
-    manifest = EvalManifest.load(workspace.manifest)
+    empty = EvalManifest.load(workspace.manifest).empty
+    summary = json.loads(workspace.data_summary.read_text())
+    names = study.dataset_names()
+    lines = [f"{name} is judged and has no held-out window: {empty[name]}" for name in names if name in empty and name in judged]
+    lines += [f"{name} has no training window" for name in names if not summary[name]["windows"]]
     require(
-        bool(set(judged) & set(manifest.names)),
-        f"none of {', '.join(judged)}, by which the datasets axis is judged, has a held-out window of "
-        f"{manifest.frames} frames; choose fewer with --set model.frames=... or put other datasets first",
+        not lines,
+        f"{'; '.join(lines)}. Leave it out of the study (of --data, or with --set datasets=...), or change what a window "
+        f"is: rate={study.rate}, eval.prompt_frames={study.eval.prompt_frames} and one more, "
+        f"store.min_val={study.store.min_val}",
     )
 
 
 def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
     """The windows that are there. ConfigError if they cannot be read, unless they may be replaced."""
     from data_pipelines.errors import DataError
-    from data_pipelines.loading.evalset import EvalManifest
+    from data_pipelines.windows.evalset import EvalManifest
 
     if not workspace.manifest.exists():
         return None
@@ -97,33 +105,44 @@ def _frozen(workspace: Workspace, replace: Step | None) -> EvalManifest | None:
         return None
 
 
-def _setting_differences(there: EvalManifest, frames: int, seed: int, names: Sequence[str]) -> list[str]:
+def _setting_differences(
+    there: EvalManifest, frames: int, rate: float | None, seed: int, names: Sequence[str]
+) -> list[str]:
     lines = [f"model.frames: {there.frames} -> {frames}"] if there.frames != frames else []
+    lines += [f"rate: {there.rate} -> {rate}"] if there.rate != rate else []
     lines += [f"eval.seed: {there.seed} -> {seed}"] if there.seed != seed else []
     return lines + dataset_differences([d.dataset for d in there.datasets], sorted(names))
 
 
 def _differences(there: EvalManifest, wanted: EvalManifest) -> list[str]:
     """In the words of --set."""
-    lines = _setting_differences(there, wanted.frames, wanted.seed, [d.dataset for d in wanted.datasets])
+    names = [d.dataset for d in wanted.datasets]
+    lines = _setting_differences(there, wanted.frames, wanted.rate, wanted.seed, names)
     if there.store != wanted.store and not lines:
         lines.append(f"tokens: {there.store} -> {wanted.store}")
     old, new = (max(len(d.windows) for d in m.datasets) for m in (there, wanted))
     if old != new:
         lines.append(f"eval.windows_per_dataset: {old} -> {new} in the dataset with the most")
-    return lines or [f"windows: {there.hash()} -> {wanted.hash()}"]
+    return lines or [
+        f"windows: {there.hash()} -> {wanted.hash()}, as of another eval.prompt_frames or an earlier version, which had "
+        "none of short episodes"
+    ]
 
 
-def summarise(store: TokenStore, names: Sequence[str], frames: int) -> dict[str, dict[str, int]]:
-    """Per dataset: training episodes, those too short for a window, windows, episodes held out and skipped."""
-    from data_pipelines.loading.windows import train_windows
+def summarise(
+    store: TokenStore, names: Sequence[str], frames: int, rate: float | None
+) -> dict[str, dict[str, int]]:
+    """Per dataset: training episodes, those too short for a window or for a whole one, windows, episodes held out
+    and skipped."""
+    from data_pipelines.windows.windows import train_windows
 
     summary = {}
     for name in names:
-        manifest, windows = store.manifest(name), train_windows(store, name, frames)
+        manifest, windows = store.manifest(name), train_windows(store, name, frames, rate=rate)
         summary[name] = {
             "episodes": len(manifest.train.episodes),
             "too_short": windows.too_short,
+            "padded": windows.padded,
             "windows": len(windows),
             "held_out": len(manifest.val.episodes),
             "skipped": manifest.lost,
@@ -145,7 +164,7 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
     if many:
         console.print(
             f"note: held out, not trained on: {few(many)}. At least store.min_val={settings.min_val} are, but no more "
-            "than half of a dataset",
+            f"than store.max_val_fraction={settings.max_val_fraction:g} of a dataset",
             markup=False,
             soft_wrap=True,
         )
@@ -155,8 +174,11 @@ def _remark(name: str, facts: dict[str, int], no_evaluation: str, frames: int) -
     """Says what of a dataset is not used."""
     remarks = []
     if facts["too_short"]:
+        remarks.append(f"{facts['too_short']} of {facts['episodes']} training episodes are too short for any window")
+    if facts["padded"]:
         remarks.append(
-            f"{facts['too_short']} of {facts['episodes']} training episodes are too short for {frames} frames"
+            f"{facts['padded']} of {facts['episodes']} training episodes are too short for {frames} frames: their "
+            "windows end with padding"
         )
     if facts["skipped"]:
         remarks.append(f"{facts['skipped']} damaged episodes are left out")

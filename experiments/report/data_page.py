@@ -198,7 +198,7 @@ def _lengths(d: Viewed, frames: int) -> str:
         + (f"; the median is {n.median / d.hz:.1f} s at {d.hz:g} Hz" if d.hz else "")
         + ".</p>"
     )
-    drawn = lengths(f.steps, asked.needed if asked else None)
+    drawn = lengths(f.steps, asked.native if asked else None)
     if asked is None:
         return words + drawn
     lines = []
@@ -207,11 +207,14 @@ def _lengths(d: Viewed, frames: int) -> str:
         w = window_facts(f, stride, t)
         mark = ("<b>", "</b>") if (t, stride) == (frames, d.stride) else ("", "")
         cells = (
-            f"{t}", f"{stride}", f"{d.hz / stride:.3g}", f"{w.needed}", f"{w.needed / d.hz:.3g}",
-            f"{w.long_enough / f.sampled:.0%}", f"{w.total:,.0f}",
+            f"{t}", f"{stride}", f"{d.hz / stride:.3g}", f"{w.native}", f"{w.native / d.hz:.3g}",
+            f"{w.whole / f.sampled:.0%}", f"{w.long_enough / f.sampled:.0%}", f"{w.total:,.0f}",
         )  # fmt: skip
         lines.append([f"{mark[0]}{cell}{mark[1]}" for cell in cells])
-    head = ["frames T", "stride", "Hz of frames", "steps", "seconds", "episodes long enough", "windows in the split"]
+    head = [
+        "frames T", "stride", "Hz of frames", "steps", "seconds", "episodes with a whole one", "with any",
+        "windows in the split",
+    ]  # fmt: skip
     return words + drawn + table(head, lines, text=0)
 
 

@@ -44,9 +44,17 @@ def window_keys(
 
 
 def random_actions(
-    key_B: jax.Array, embodiment_B: jax.Array, table: EmbodimentTable, draws: int, frames: int
+    key_B: jax.Array,
+    embodiment_B: jax.Array,
+    table: EmbodimentTable,
+    draws: int,
+    frames: int,
+    statistics: tuple[jax.Array, jax.Array] | None = None,
 ) -> jax.Array:
     """[B, draws, T = frames, U]: N(mean, std) of each robot's own actions; 0 in the padding.
+
+    `statistics`, float32 [B, U] each, are to be of all recorded actions, for a table may be of those only that a
+    model was trained on; without, they are the table's.
 
     Every value of a chunk has a key of its own: a wider robot in the table adds keys and changes none.
     Bit for bit the same in batches of any shape.
@@ -57,10 +65,16 @@ def random_actions(
 
     of_window = jax.vmap(one, (None, 0), -1)
     noise = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
-    mean_BU, std_BU = (jnp.asarray(x)[embodiment_B] for x in table.statistics())
+    mean_BU, std_BU = statistics or own_statistics(embodiment_B, table)
     # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
     from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)
     return mean_BU[:, None, None] + from_mean
+
+
+def own_statistics(embodiment_B: jax.Array, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
+    """(mean, std), [B, U] each, of the table."""
+    mean_EU, std_EU = table.statistics()
+    return jnp.asarray(mean_EU)[embodiment_B], jnp.asarray(std_EU)[embodiment_B]
 
 
 QUANTILES = 2**16

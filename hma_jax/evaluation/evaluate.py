@@ -31,6 +31,9 @@ T = TypeVar("T")
 ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
 """What of a batch goes to the devices."""
 
+PERHAPS = ("real", "action_mean", "action_std")
+"""And this, where a batch has it."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -57,7 +60,7 @@ def evaluate(
     """Applies the protocol to `batches`, equal in shape.
 
     A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
-    and valid (bool [B]: rows that are not padding). `setting` is what the model was trained for.
+    and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the model was trained for.
     `progress` is told the windows done so far. Raises ConfigError if there is no window, or for a
     model whose predictions are not finite.
     """
@@ -70,7 +73,9 @@ def evaluate(
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted]]]:
         for batch in batches:
             groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, batch_ways(mesh))
-            on_devices = _put({name: batch[name] for name in ARRAYS}, groups * rows, mesh)
+            _check_lengths(batch, config)
+            arrays = (*ARRAYS, *(name for name in PERHAPS if name in batch))
+            on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
             with jax.set_mesh(mesh):
                 found = evaluator(weights, decoder_weights, on_devices)
             yield batch, found
@@ -83,8 +88,10 @@ def evaluate(
             own = samples.setdefault(batch["dataset"][row], [])
             if len(own) < samples_per_dataset:
                 # Read whole: rows picked on the devices would wait for the next batch.
-                random = None if predicted.random is None else np.asarray(predicted.random)[row]
-                own.append(Sample(batch["images"][row], np.asarray(predicted.tokens)[row], random))
+                real = batch["real"][row] if "real" in batch else np.ones(len(batch["images"][row]), bool)
+                clips = (batch["images"][row], np.asarray(predicted.tokens)[row])
+                random = None if predicted.random is None else held(np.asarray(predicted.random)[row], real)
+                own.append(Sample(*(held(clip, real) for clip in clips), random))
         if progress is not None:
             progress(sum(map(len, tables)))
     windows = join(tables)
@@ -109,13 +116,17 @@ def make_evaluator(
     mesh = make_mesh(execution.mesh)
     predict = make_predictor(model, table, config, setting, execution)
 
-    def compare(params: Params, predicted: Predicted, images: jax.Array) -> dict[str, jax.Array]:
-        return image_metrics(decode, piece, params, predicted, images, config)
+    def compare(
+        params: Params, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None]
+    ) -> dict[str, jax.Array]:
+        images, real = recorded
+        return image_metrics(decode, piece, params, predicted, images, config, real)
 
     def evaluate_group(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
         metrics, predicted = predict(params, batch)
-        compared = _on_each_device(compare, mesh)(decoder_params, predicted, batch["images"])
+        recorded = batch["images"], batch.get("real")
+        compared = _on_each_device(compare, mesh)(decoder_params, predicted, recorded)
         return metrics | compared, predicted
 
     def evaluate_batch(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
@@ -123,6 +134,25 @@ def make_evaluator(
         return in_groups(lambda rows: evaluate_group(params, decoder_params, rows), batch, groups)
 
     return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
+
+
+def _check_lengths(batch: dict[str, Any], config: EvalConfig) -> None:
+    """Raises ConfigError for a window without a frame to compare."""
+    if "real" not in batch:
+        return
+    real = np.where(batch["valid"], np.sum(batch["real"], axis=1), config.first_predicted + 1)
+    row = int(np.argmin(real))
+    require(
+        real[row] > config.first_predicted,
+        f"a window of {batch['dataset'][row]} has {real[row]} frames, of which eval.prompt_frames "
+        f"{config.prompt_frames} leaves none to predict; freeze windows for this prompt, or use a shorter one",
+    )
+
+
+def held(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """The last frames of a window of len(real), [n, ...], its last real one in place of what follows it."""
+    first = len(real) - len(clip)
+    return clip[np.minimum(np.arange(len(clip)), int(real.sum()) - 1 - first)]
 
 
 def batch_ways(mesh: Mesh) -> int:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import EvalConfig, require
-from hma_jax.evaluation.metrics import psnr, ssim
+from hma_jax.evaluation.metrics import last_frames, mean_over_frames, psnr, ssim
 from hma_jax.evaluation.protocol import Predicted
 from hma_jax.model.params import Params
 
@@ -38,9 +38,16 @@ class Decoder(Protocol):
 
 
 def image_metrics(
-    decode: Decode, piece: int, params: Params, predicted: Predicted, images: jax.Array, config: EvalConfig
+    decode: Decode,
+    piece: int,
+    params: Params,
+    predicted: Predicted,
+    images: jax.Array,
+    config: EvalConfig,
+    real_BT: jax.Array | None = None,
 ) -> dict[str, jax.Array]:
-    """Per window [B]; `images` are those recorded, uint8 [B, T, height, width, 3].
+    """Per window [B], over the frames that are `real_BT` (None: all are); `images` are those recorded, uint8
+    [B, T, height, width, 3].
 
     `finite`, bool [B], says whether the tokens are numbers at all: images of latents that are not mean
     nothing.
@@ -56,22 +63,30 @@ def image_metrics(
     )
     shown, random_last = decoded[:, :made], decoded[:, made:]
     first = config.first_predicted
-    future, last = images[:, first:], images[:, -1]
+    future, last = images[:, first:], last_frames(images, real_BT)
+    real = None if real_BT is None else real_BT[:, first:]
     # The image that a model has before it which repeats the last one it is given.
     before = images[:, first - 1 : -1] if config.context == "recorded" else images[:, first - 1 : first]
     # Under recorded actions and random ones in one array: equal images get equal numbers, to the last bit.
-    of_last = psnr(jnp.concatenate([shown[:, -1:], random_last], axis=1), _beside(last, 1 + random_last.shape[1]))
+    shown_last = last_frames(shown, real)[:, None]
+    of_last = psnr(jnp.concatenate([shown_last, random_last], axis=1), _beside(last, 1 + random_last.shape[1]))
     of_last = jax.lax.optimization_barrier(of_last)
     psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
     return {
-        "psnr": psnr(shown, future).mean(1),
+        "psnr": mean_over_frames(psnr(shown, future), real),
         "psnr_last": psnr_last,
         "psnr_random": psnr_random.mean(1),
         "delta_psnr": (psnr_last[:, None] - psnr_random).mean(1),
-        "psnr_copy": psnr(jnp.broadcast_to(before, future.shape), future).mean(1),
-        "ssim": ssim(shown, future).mean(1),
-        "finite": jnp.isfinite(tokens).all(tuple(range(1, tokens.ndim))),
+        "psnr_copy": mean_over_frames(psnr(jnp.broadcast_to(before, future.shape), future), real),
+        "ssim": mean_over_frames(ssim(shown, future), real),
+        "finite": _finite(tokens[:, :made], real) & _finite(predicted.random_last, None),
     }
+
+
+def _finite(tokens: jax.Array, real_BT: jax.Array | None) -> jax.Array:
+    """bool [B]: whether all of them are numbers, in real frames."""
+    finite = jnp.isfinite(tokens).all(tuple(range(2, tokens.ndim)))
+    return (finite if real_BT is None else finite | ~real_BT).all(1)
 
 
 def _beside(images: jax.Array, count: int) -> jax.Array:

@@ -102,6 +102,22 @@ def _window_sum(x: Any) -> Any:
     return sum(rows[..., :, i : i + w, :] for i in range(SSIM_WINDOW))
 
 
+def mean_over_frames(x: jax.Array, real_BT: jax.Array | None) -> jax.Array:
+    """[B, T, ...] -> [B], of the frames that are `real_BT` (None: all are)."""
+    if real_BT is None:
+        return x.mean(tuple(range(1, x.ndim)))
+    per_frame = x.mean(tuple(range(2, x.ndim)))
+    return jnp.sum(jnp.where(real_BT, per_frame, 0), axis=1) / jnp.maximum(jnp.sum(real_BT, axis=1), 1)
+
+
+def last_frames(x: jax.Array, real_BT: jax.Array | None, axis: int = 1) -> jax.Array:
+    """[B, T, ...] -> [B, ...], each window's last frame that is `real_BT`; `axis` is that of the frames."""
+    if real_BT is None:
+        return jnp.take(x, x.shape[axis] - 1, axis=axis)
+    last_B = jnp.sum(real_BT, axis=1) - 1  # padding stands at the end
+    return jax.vmap(lambda one, last: jnp.take(one, last, axis=axis - 1))(x, last_B)
+
+
 # --- Tokens ----------------------------------------------------------------------------------
 
 

@@ -32,10 +32,10 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
-from hma_jax.evaluation.draws import random_actions, window_keys
-from hma_jax.evaluation.metrics import factored_cross_entropy
+from hma_jax.evaluation.draws import own_statistics, random_actions, window_keys
+from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import EmbodimentTable, normalise
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
@@ -43,14 +43,17 @@ from hma_jax.objective.losses import frame_diffusion_loss
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
-embodiment int32 [B], and episode and start, int32 [B], which with the robot's name say what window it is."""
+embodiment int32 [B], and episode and start, int32 [B], which with the robot's name say what window it is.
+Perhaps real, bool [B, T], False for frames at the end that only fill up a short window: they are neither
+predicted from nor counted, and its last frame is the last real one. Perhaps action_mean and action_std,
+float32 [B, U], of all recorded actions, to draw random ones and judge errors by; otherwise the table's are."""
 
 
 class Predicted(NamedTuple):
     """Tokens of the frames that are compared, from `EvalConfig.first_predicted` on."""
 
     tokens: jax.Array  # under the recorded actions [B, n, S (, C)]
-    random_last: jax.Array  # of the last frame, under each random sequence [B, draws, S (, C)]
+    random_last: jax.Array  # of the last (real) frame, under each random sequence [B, draws, S (, C)]
     random: jax.Array | None  # under the first random one [B, n, S (, C)]; None where only the last frame was made
 
 
@@ -65,10 +68,18 @@ def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) 
     actions, window = batch["actions"], (batch["embodiment"], batch["episode"], batch["start"])
     frames, first_free = actions.shape[1], config.first_predicted - 1
     key_B = window_keys(config.seed, "actions", table, *window)
-    other = random_actions(key_B, batch["embodiment"], table, config.random_actions, frames)
+    statistics = judged_by(batch, table)
+    other = random_actions(key_B, batch["embodiment"], table, config.random_actions, frames, statistics)
     other = other.at[:, :, :first_free].set(actions[:, None, :first_free])
     decoding_B = window_keys(config.seed, "decoding", table, *window)
     return jnp.concatenate([actions[:, None], other], axis=1), decoding_B
+
+
+def judged_by(batch: Batch, table: EmbodimentTable) -> tuple[jax.Array, jax.Array]:
+    """(mean, std) of each window's actions, [B, U] each, the same for every model."""
+    if "action_mean" in batch:
+        return batch["action_mean"], batch["action_std"]
+    return own_statistics(batch["embodiment"], table)
 
 
 def make_predictor(
@@ -99,21 +110,26 @@ def make_predictor(
         }
         sequences, decoding = evaluation_inputs(batch, table, config)
         window = tokens[:, : model.frames], actions[:, : model.frames], robots
+        real = batch.get("real")
+        seen = None if real is None else real[:, : model.frames]
         shown = None if hidden is None else hidden[:, : model.frames]
         if config.context == "recorded":
             require(
                 tokens.shape[1] == model.frames,
                 f"with eval.context 'recorded' windows have the model's {model.frames} frames, got {tokens.shape[1]}",
             )
-            out, predicted = _after_recorded(hma, window, sequences, decoding, config, hidden)
+            out, predicted = _after_recorded(hma, window, sequences, decoding, config, hidden, real)
         else:
             out = next_frame_outputs(hma, *window, shown)
             prompt = tokens[:, : config.prompt_frames]
             made = rollout(hma, prompt, sequences, robots, decoding, config.decode, hidden_BT=hidden)
-            predicted = Predicted(made[:, 0], made[:, 1:, -1], made[:, 1])
-        metrics = _likelihood(hma, out, window[0][:, 1:], keys["likelihood"])
+            ahead = None if real is None else real[:, config.prompt_frames :]
+            predicted = Predicted(made[:, 0], last_frames(made[:, 1:], ahead, axis=2), made[:, 1])
+        followed = None if seen is None else seen[:, 1:]
+        metrics = _likelihood(hma, out, window[0][:, 1:], keys["likelihood"], followed)
         if predicts_actions(model, setting):
-            metrics |= _policy_errors(hma, *window, keys["policy"], config, causally=setting != "inverse")
+            causally, statistics = setting != "inverse", judged_by(batch, table)
+            metrics |= _policy_errors(hma, *window, keys["policy"], config, causally, statistics, seen)
         return metrics, predicted
 
     return predict
@@ -136,6 +152,7 @@ def _after_recorded(
     key_B: jax.Array,
     config: EvalConfig,
     hidden_BT: jax.Array | None,
+    real_BT: jax.Array | None,
 ) -> tuple[jax.Array, Predicted]:
     """(outputs, Predicted) where every frame follows recorded ones."""
     tokens, actions, embodiment = window
@@ -147,6 +164,12 @@ def _after_recorded(
         return jnp.repeat(x, draws, axis=0)
 
     # The sequences differ from the first chunk on, so that nothing of the past can be shared.
+    if real_BT is not None:  # windows end at different frames: all are made, and each one's last is taken
+        others = sequences[:, 1:].reshape(-1, *actions.shape[1:])
+        hidden = None if hidden_BT is None else each(hidden_BT)
+        _, made = next_frames(model, each(tokens), others, each(embodiment), each(key_B), config.decode, hidden)
+        last = last_frames(made, each(real_BT[:, 1:]))
+        return out, Predicted(predicted, last.reshape(len(tokens), draws, *tokens.shape[2:]), None)
     last = rollout(
         model,
         each(tokens[:, :-1]),
@@ -159,14 +182,16 @@ def _after_recorded(
     return out, Predicted(predicted, last.reshape(len(tokens), draws, *tokens.shape[2:]), None)
 
 
-def _likelihood(model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array) -> dict[str, jax.Array]:
+def _likelihood(
+    model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array, real_BT: jax.Array | None
+) -> dict[str, jax.Array]:
     """Per window [B]: what `out` says of the true tokens."""
     if model.config.diffusion:
-        return {"diffusion_loss": frame_diffusion_loss(model, out, truth, key_B).mean((1, 2))}
+        return {"diffusion_loss": mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)}
     guess = compose(jnp.argmax(out, -1), model.config.factor_vocab)
     return {
-        "cross_entropy": factored_cross_entropy(out, truth).mean((1, 2)),
-        "accuracy": (guess == truth).astype(jnp.float32).mean((1, 2)),
+        "cross_entropy": mean_over_frames(factored_cross_entropy(out, truth), real_BT),
+        "accuracy": mean_over_frames((guess == truth).astype(jnp.float32), real_BT),
     }
 
 
@@ -178,6 +203,8 @@ def _policy_errors(
     key_B: jax.Array,
     config: EvalConfig,
     causally: bool,
+    statistics: tuple[jax.Array, jax.Array],
+    real_BT: jax.Array | None,
 ) -> dict[str, jax.Array]:
     """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live
     action value, of the model and of always giving the mean."""
@@ -187,14 +214,18 @@ def _policy_errors(
     else:
         hidden = jnp.ones(tokens.shape[:2], bool)
         predicted = predict_actions(
-            model, tokens, actions_BTU, embodiment_B, hidden, key_B, decode, causally=False
+            model, tokens, actions_BTU, embodiment_B, hidden, key_B, decode, causally=False, real_BT=real_BT
         )
-    table = model.table
-    alive_BU = jnp.asarray(table.alive())[embodiment_B]
-    truth, guess = (table.normalise(x, embodiment_B)[:, first:] for x in (actions_BTU, predicted))
+    mean_BU, std_BU = statistics
+    alive_BU = std_BU > 0
+    truth, guess = (normalise(x, mean_BU[:, None], std_BU[:, None])[:, first:] for x in (actions_BTU, predicted))
 
     def mean(error_BTU: jax.Array) -> jax.Array:
-        return jnp.sum(error_BTU.mean(1) * alive_BU, -1) / jnp.maximum(alive_BU.sum(-1), 1)
+        of_window = error_BTU.mean(1)
+        if real_BT is not None:
+            real = real_BT[:, first:, None]
+            of_window = jnp.sum(error_BTU * real, 1) / jnp.maximum(jnp.sum(real, 1), 1)
+        return jnp.sum(of_window * alive_BU, -1) / jnp.maximum(alive_BU.sum(-1), 1)
 
     error, of_mean = mean((guess - truth) ** 2), mean(truth**2)
     return {"action_error": error, "action_error_of_mean": of_mean, "action_gain": of_mean - error}

@@ -12,6 +12,7 @@ from hma_jax.generation.rollout import fold_in
 from hma_jax.generation.teacher import beside
 from hma_jax.model.hma import HMA, Outputs
 from hma_jax.objective.diffusion import sample_with_key
+from hma_jax.objective.losses import seen_by_all
 from hma_jax.objective.process import make_process, sampling_process
 
 
@@ -25,14 +26,16 @@ def predict_actions(
     decode: DecodeConfig,
     *,
     causally: bool = True,
+    real_BT: jax.Array | None = None,
 ) -> jax.Array:
     """Raw chunks [B, T, U] read off every frame, where those marked hidden are not shown.
 
     As a policy a frame's chunk is predicted from frames up to it and what is shown of the
-    actions; with `causally` False from the whole window (inverse dynamics). Padding is 0.
+    actions; with `causally` False from the whole window (inverse dynamics), of which frames that are not
+    `real_BT` (None: all are) are no part. Padding is 0.
     """
     count = frames.shape[1]
-    visible = None if causally else jnp.ones((count, count), bool)
+    visible = None if causally else seen_by_all(count, real_BT)
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     out = model(frames, None, model.align(actions_BTU), embodiment_B, hidden_BT=hidden, visible=visible)
     return read_actions(model, out, embodiment_B, key_B, decode)

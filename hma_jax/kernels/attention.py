@@ -19,7 +19,7 @@ Within = Callable[[jax.Array, float], jax.Array]
 
 OverTime = Callable[[jax.Array, jax.Array, float], jax.Array]
 """over_time(qkv, visible, scale): qkv [B, T, P, 3, H, I] -> [B, T, P, H, I]; a token sees its own position in
-the frames that `visible` (bool [T, T]) allows."""
+the frames that `visible` (bool [T, T], or [B, T, T] where examples differ) allows."""
 
 OverCache = Callable[[jax.Array, jax.Array, jax.Array, jax.Array, float], jax.Array]
 """over_cache(qkv, keys, values, visible, scale): as `over_time`, with keys and values [B, T_past, P, H, I] of

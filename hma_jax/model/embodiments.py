@@ -40,6 +40,7 @@ class Embodiment:
     video_targets: bool = True
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
+    layout: str = ""  # a hash of which values its actions are, in what order; "": not known
 
     def __post_init__(self):
         require(
@@ -143,8 +144,7 @@ class EmbodimentTable:
         which turns rounding noise on a constant dimension into values of order 100 (reference
         section 5.6).
         """
-        centre, unit = self._of(embodiment_B, actions.ndim)
-        return (actions - centre) * jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1), 0)
+        return normalise(actions, *self._of(embodiment_B, actions.ndim))
 
     def unnormalise(self, actions: jax.Array, embodiment_B: jax.Array) -> jax.Array:
         """The inverse of `normalise`: raw units; dead dimensions take their centre."""
@@ -155,3 +155,8 @@ class EmbodimentTable:
         """(centre, unit) of each example's robot, shaped to meet [B, ..., U]."""
         shape = (-1, *(1,) * (ndim - 2), self.action_width)
         return tuple(jnp.take(x, embodiment_B, 0).reshape(shape) for x in self.scale())
+
+
+def normalise(actions: jax.Array, centre: jax.Array, unit: jax.Array) -> jax.Array:
+    """Raw values in units of `unit` from `centre`, which broadcast; 0 where `unit` is 0."""
+    return (actions - centre) * jnp.where(unit > 0, 1 / jnp.where(unit > 0, unit, 1), 0)

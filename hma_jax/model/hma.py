@@ -83,8 +83,8 @@ class HMA(nnx.Module):
         chunk executed after it was seen (reference section 1.3). Where `hidden_BT` the model is
         not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
         instead of actions runs without action tokens and conditioning. The frames stand at window
-        positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T]
-        defaults to causal. The cache of the first `remember` frames is returned; of the frames before
+        positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T],
+        or with a leading B, defaults to causal: then padding at a window's end is seen by no real frame. The cache of the first `remember` frames is returned; of the frames before
         `said_from` nothing is said. Where the parameters at hand are those of some robots only, `slice_B`
         says which slice is each example's own.
         """

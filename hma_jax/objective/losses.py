@@ -84,14 +84,19 @@ def masked_loss(
     masking: MaskingConfig,
     key_B: jax.Array,
     slice_B: jax.Array | None = None,
+    real_BT: jax.Array | None = None,
 ) -> LossSums:
     """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise; `slice_B` as for the
-    model."""
+    model.
+
+    `real_BT` (bool; None: all) is False for frames that only fill up a window, at its end. They have no targets
+    (`masking`), and where attention is causal no real frame sees them; where it is not, they are hidden here.
+    """
     slice_B = embodiment_B if slice_B is None else slice_B
     all_shown = masking.setting == "forward" and all(model.table.chunks)
     hidden = model.align_hidden(None if all_shown else masked.hidden_T, actions_BTU.shape[:2])
     frames = tokens.shape[1]
-    everything = jnp.ones((frames, frames), bool) if masking.setting == "inverse" else None
+    everything = seen_by_all(frames, real_BT) if masking.setting == "inverse" else None
     out = model(
         masked.inputs,
         masked.masked,
@@ -118,6 +123,12 @@ def masked_loss(
         per_step = action_loss_per_step(model, out.actions, actions_BTU, embodiment_B, slice_B, key_B)
         action_loss = jnp.sum(per_step * masked.action_targets_T)
     return LossSums(loss, correct, action_loss)
+
+
+def seen_by_all(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
+    """bool [T, T] or [B, T, T]: every frame sees every real one (`real_BT` None: all are), later ones too."""
+    everything = jnp.ones((frames, frames), bool)
+    return everything if real_BT is None else everything & real_BT[:, None]
 
 
 def frame_diffusion_loss(model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array) -> jax.Array:

@@ -63,6 +63,12 @@ class Masked(NamedTuple):
     hidden_T: jax.Array  # bool: recorded chunks that are not shown
     action_targets_T: jax.Array  # bool: recorded chunks that the loss counts
 
+    def among(self, real_T: jax.Array) -> Masked:
+        """The same without targets in frames that are not `real`: bool [T], or [B, T] of a batch."""
+        return self._replace(
+            targets_TS=self.targets_TS & real_T[..., None], action_targets_T=self.action_targets_T & real_T
+        )
+
 
 def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> MaskingDraws | LatentDraws:
     """One example's random numbers.
@@ -183,9 +189,11 @@ def mask_batch(
     config: ModelConfig,
     masking: MaskingConfig,
     table: EmbodimentTable,
+    real_BT: jax.Array | None = None,
 ) -> Masked:
     """Masks every example with its own key, fold_in(key, row): the layout of the batch over
-    devices, processes and micro-batches does not change an example's masks."""
+    devices, processes and micro-batches does not change an example's masks. Frames that are not
+    `real_BT` (None: all are) have no targets."""
     has_actions = jnp.asarray(table.chunks > 0)[embodiment_B]
     has_video = jnp.array([e.video_targets for e in table.entries])[embodiment_B]
 
@@ -193,4 +201,5 @@ def mask_batch(
         window, actions, video = example
         return mask_example(jax.random.fold_in(key, row), window, config, masking, actions, video)
 
-    return jax.vmap(one)(jnp.arange(len(tokens)), tokens, has_actions, has_video)
+    masked = jax.vmap(one)(jnp.arange(len(tokens)), tokens, has_actions, has_video)
+    return masked if real_BT is None else masked.among(real_BT)

@@ -38,7 +38,7 @@ from hma_jax.training.state import FINITE, TrainState, all_finite
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
-embodiment int32 [B]."""
+embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end."""
 
 
 def make_train_step(
@@ -87,6 +87,7 @@ def make_train_step(
             masking,
             batch["key"],
             batch["slice"],
+            batch.get("real"),
         )
         loss = result.tokens / counts.tokens + masking.action_loss_weight * result.actions / counts.actions
         return loss, result
@@ -107,7 +108,8 @@ def make_train_step(
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, jax.Array]]:
         key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-        masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table)
+        real_BT = batch.get("real")
+        masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         counts = count_targets(masked)
         active = robots.choose(batch["embodiment"], table.size)
         own = robots.take(state.params, specs, active)
@@ -117,7 +119,7 @@ def make_train_step(
             grads = keep_own(grads, specs, jnp.asarray(trained_E)[active.robots_G])
         grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
         rate = schedule(state.step)
-        presence = find_presence(masked, batch["embodiment"], trained_E, model, everything=not config.only)
+        presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT)
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
         new, adam = apply_adamw(
             grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer
@@ -142,15 +144,17 @@ def find_presence(
     trained_E: jax.Array,
     model: ModelConfig,
     everything: bool = True,
+    real_BT: jax.Array | None = None,
 ) -> Presence:
     """Which parameters a batch concerns. Only `trained_E` robots' own are moved, and the shared
-    ones not at all unless `everything` is trained."""
+    ones not at all unless `everything` is trained. Frames that are not `real_BT` concern none."""
     hidden_BT = masked.hidden_T
+    real_BT = jnp.ones_like(hidden_BT) if real_BT is None else real_BT
     rows: dict[Use, jax.Array] = {
         "always": jnp.ones(len(embodiment_B), bool),
-        "actions_shown": (~hidden_BT).any(axis=1),
+        "actions_shown": (~hidden_BT & real_BT).any(axis=1),
         # With causal alignment the first frame is never shown an action.
-        "actions_hidden": hidden_BT.any(axis=1) | (model.action_alignment == "causal"),
+        "actions_hidden": (hidden_BT & real_BT).any(axis=1) | (model.action_alignment == "causal"),
         "actions_predicted": masked.action_targets_T.any(axis=1),
         "frames_predicted": masked.targets_TS.any(axis=(1, 2)),
     }

@@ -33,7 +33,7 @@ class Validation:
     """What a run is validated on.
 
     `batches()` yields this process's rows of a few global batches, as for training, perhaps with `valid`
-    bool [B] (False: a row that only fills up). It is read once; the windows stay in memory of the host.
+    bool [B] (False: a row that only fills up) and `real` bool [B, T] (False: such a frame). It is read once; the windows stay in memory of the host.
     """
 
     every: int  # steps
@@ -80,22 +80,20 @@ def make_sums(
 
     def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:
         key = jax.random.fold_in(jax.random.key(SEED), number)
-        masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table)
-        valid_B = batch["valid"]
-        masked = masked._replace(
-            targets_TS=masked.targets_TS & valid_B[:, None, None],
-            action_targets_T=masked.action_targets_T & valid_B[:, None],
-        )
+        valid_B, real_BT = batch["valid"], batch.get("real")
+        masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
+        masked = masked.among(jnp.broadcast_to(valid_B[:, None], masked.hidden_T.shape))
         keys = noise_keys(key, len(valid_B))
         found = masked_loss(
-            declared.merge(params), masked, batch["tokens"], batch["actions"], batch["embodiment"], masking, keys
-        )
+            declared.merge(params), masked, batch["tokens"], batch["actions"], batch["embodiment"], masking, keys,
+            real_BT=real_BT,
+        )  # fmt: skip
         return found, TargetCounts(jnp.sum(masked.targets_TS), jnp.sum(masked.action_targets_T))
 
     return sums
 
 
 def _with_valid(batch: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    names = ("tokens", "actions", "embodiment")
+    names = [name for name in ("tokens", "actions", "embodiment", "real") if name in batch]
     everything = np.ones(len(batch["tokens"]), bool)
     return {name: batch[name] for name in names} | {"valid": batch.get("valid", everything)}

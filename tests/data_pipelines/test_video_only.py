@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.loading.loader import LoaderConfig, make_loader
+from data_pipelines.loading.loader import make_loader
+from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipelines.loading.splits import held_out
+from data_pipelines.sampling.splits import held_out
 from data_pipelines.registry import get_spec
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from experiments.cli.main import main
@@ -29,7 +29,7 @@ from hma_jax.training import train as model_training
 from tests.data_pipelines.fakes import make_spec, write_rlds
 
 ARM, BASE = map(get_spec, ("berkeley_gnm_cory_hall", "ucsd_pick_and_place_dataset_converted_externally_to_rlds"))
-LENGTHS = [10, 11, 12, 13, 14, 15]  # a window of the smoke study takes 8 native frames
+LENGTHS = [12, 13, 14, 15, 12, 13]  # a whole window of the smoke study takes 12 native frames
 SMOKE = ("--preset", "smoke")
 
 
@@ -60,7 +60,7 @@ def arm(tmp_path_factory):
 def study(arm, tmp_path_factory):
     """A prepared study with a trained model; its second dataset is too short for any window."""
     root = tmp_path_factory.mktemp("study")
-    short = write_rlds(root / "rlds", BASE, [5, 6, 7, 5])
+    short = write_rlds(root / "rlds", BASE, [3, 2, 3, 3])
     data = ("--data", str(arm), str(short))
     assert main(["train", *SMOKE, "--out", str(root / "out"), *data]) == 0
     return root / "out", data
@@ -178,7 +178,7 @@ def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
         if episode in bad:
             features["steps/action"][0] = np.nan
 
-    rlds = write_rlds(tmp_path, ARM, [8] * 40, change=spoil)
+    rlds = write_rlds(tmp_path, ARM, [12] * 40, change=spoil)
     skip = ("--set", "store.corrupt=skip", "--set", "store.min_val=8")  # some of those held out are whole
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
     assert "17 episodes are unusable, more than max_skipped=16" in message
@@ -229,12 +229,13 @@ def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
     out, data = study
     assert main(["tokenize", *SMOKE, "--out", str(out), *data]) == 0
     said = capsys.readouterr().out
-    assert f"{BASE.name}: 2 of 2 training episodes are too short for 4 frames" in said
-    assert "it is not evaluated: 4 frames need 8 native frames" in said
+    assert f"{BASE.name}: 3 of 3 training episodes are too short for any window" in said
+    assert "it is not evaluated: 3 frames, the least there may be, need 6 native frames" in said
     assert f"1 of 2 datasets can be trained on; {BASE.name} has no training window" in said
-    assert f"held out, not trained on: 2 of 6 episodes of {ARM.name}, 2 of 4 episodes of {BASE.name}" in said
     facts = json.loads((out / "data.json").read_text())
-    assert facts[BASE.name] == {"episodes": 2, "too_short": 2, "windows": 0, "held_out": 2, "skipped": 0}
+    assert facts[BASE.name] == {
+        "episodes": 3, "too_short": 3, "padded": 0, "windows": 0, "held_out": 1, "skipped": 0
+    }  # fmt: skip
     assert facts[ARM.name]["too_short"] == 0 and facts[ARM.name]["windows"] > 0
 
 
@@ -242,7 +243,16 @@ def test_no_window_at_all(arm, tmp_path, refused):
     long = ("--set", "model.frames=8", "--set", "eval.prompt_frames=7")
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, *long)
     assert "no val episode is long enough for a window" in message and ARM.name in message
-    assert "8 frames need 16 native frames" in message and "use at most" in message
+    assert "8 frames, the least there may be, need 24 native frames" in message and "a shorter prompt" in message
+
+
+def test_a_judged_dataset_without_windows_stops_the_study(study, refused):
+    """Each point would say of two datasets what was made with one."""
+    out, data = study
+    message = refused(2, "study", *SMOKE, "--out", out, *data)
+    assert f"{BASE.name} is judged and has no held-out window: 3 frames, the least" in message
+    assert f"{BASE.name} has no training window" in message and "Leave it out of the study" in message
+    assert not list(out.glob("trials/*/result.json"))
 
 
 # --- Directories -----------------------------------------------------------------------------

@@ -13,9 +13,12 @@ from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
 from tests.data_pipelines.fakes import write_rlds
-from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
+from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
 STEPS = ("suite", "tokenizer", "tokens", "windows", "study")
+
+
+LENGTHS = [12, 12, 13, 13, 14, 14, 15, 15]  # of eight episodes two are held out, with a whole window each
 
 
 @pytest.fixture(scope="module")
@@ -94,10 +97,11 @@ def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
         (["--set", "tokenizer_train.steps=3"], "tokenizer", "tokenizer_train.steps: 5 -> 3"),
         (["--set", "tokenizer.channels=8"], "tokenizer", "tokenizer.channels: 16 -> 8"),
         (["--set", "store.min_val=1"], "tokenizer", "store.min_val: 2 -> 1"),
-        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 2 -> 1 (berkeley_gnm_cory_hall, "),
+        (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 3 -> 1 (berkeley_gnm_cory_hall, "),
         (["--set", "eval.windows_per_dataset=1"], "windows", "eval.windows_per_dataset: 2 -> 1"),
         (["--set", "eval.seed=7"], "windows", "eval.seed: 0 -> 7"),
         (["--set", "model.frames=3"], "windows", "model.frames: 4 -> 3"),
+        (["--set", "rate=1", "--set", "store.frame_step=3"], "windows", "rate: 2.0 -> 1.0"),
     ],
 )
 @pytest.mark.parametrize("command", ["tokenize", "train"])
@@ -274,5 +278,5 @@ def test_the_stamp_holds_the_inputs(made):
     stamp = json.loads((made[0] / "tokenizer" / STAMP).read_text())
     assert stamp["inputs"]["tokenizer_train"]["steps"] == 5
     assert stamp["inputs"]["datasets"] == [ARM.name, "dlr_edan_shared_control_converted_externally_to_rlds"]
-    assert set(stamp["recorded"]) == {"tau", "sources"}
+    assert set(stamp["recorded"]) == {"tau", "order", "sources"}
     assert BASE.name not in stamp["inputs"]["data"]

@@ -4,8 +4,9 @@ import itertools
 
 import numpy as np
 
-from data_pipelines.loading.evalset import eval_batches
-from data_pipelines.loading.loader import LoaderConfig, make_loader
+from data_pipelines.loading.loader import make_loader
+from data_pipelines.loading.selection import LoaderConfig
+from data_pipelines.windows.evalset import eval_batches
 from experiments.pipeline import prepare
 from experiments.presets import get_preset
 from experiments.study import override

@@ -79,13 +79,22 @@ def test_inspection_ends_with_the_whole_command_that_reads_the_dataset(robot, tm
     assert main([*tokenise, *small]) == 0
 
 
-def test_inspection_of_episodes_without_a_window_leads_to_those_that_fit(robot, tmp_path, capsys):
-    arguments = ["--hz", "4", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
+def test_inspection_of_episodes_without_a_window_leads_to_every_frame(robot, tmp_path, capsys):
+    arguments = ["--hz", "40", "--entry", str(tmp_path / "my.toml"), "--frames", "9", "--out", str(tmp_path)]
     assert main(["data", "inspect", str(robot), *arguments]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "about 0 windows" in said and "hma tokenize" not in said
-    assert f"next: hma data view {robot} --frames 7 --registry {tmp_path}/my.toml" in said
-    assert "so many frames fit its longest episode, 15 steps; train with --set model.frames=7" in said
+    assert f"next: hma data view {robot} --stride 1 --registry {tmp_path}/my.toml" in said
+    assert "no episode that was read has the 40 steps that the shortest window takes at stride 20" in said
+
+
+def test_inspection_of_short_episodes_suggests_a_prompt_that_leaves_a_frame_to_judge(robot, tmp_path, capsys):
+    """About fifteen steps at 10 Hz are three frames at 2 Hz, of which the cpu preset's prompt would take four."""
+    arguments = ["--hz", "10", "--entry", str(tmp_path / "my.toml"), "--out", str(tmp_path)]
+    assert main(["data", "inspect", str(robot), *arguments]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "a whole window of 12 frames takes 60 steps, the shortest 10" in said
+    assert "next: hma tokenize" in said and said.endswith("--set eval.prompt_frames=2")
 
 
 def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsys):
@@ -93,7 +102,7 @@ def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsy
     arguments = [str(REAL_DATA), "--out", str(tmp_path), "--json", str(json_file)]
     assert main(["data", "inspect", *arguments]) == 0
     said = capsys.readouterr().out
-    assert "rate 5 Hz (registry): stride 2" in said and "as its contents suggest" in said
+    assert "rate 5 Hz (registry): stride 3" in said and "as its contents suggest" in said
     facts = json.loads(json_file.read_text())
     assert facts["episodes"] == 3 and len(facts["actions"][0]["dimensions"]) == 7
 

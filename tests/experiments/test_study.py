@@ -216,7 +216,7 @@ def test_paper_preset_has_the_papers_sizes():
 
 def test_declared_table_knows_what_the_registry_knows():
     table = declared_table(["bc_z", "bridge_dataset"])
-    assert [(e.action_dim, e.stride) for e in table.entries] == [(7, 5), (7, 2)]
+    assert [(e.action_dim, e.stride) for e in table.entries] == [(7, 5), (7, 3)]
     assert ONE_ROBOT.action_width == 2
     with pytest.raises(ConfigError, match="unknown dataset"):
         declared_table(["bridge_datase"])

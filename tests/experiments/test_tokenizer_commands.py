@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_pipelines.loading.evalset import eval_batches
 from data_pipelines.registry import get_spec
+from data_pipelines.windows.evalset import eval_batches
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.study import on_tokenizer, override
@@ -25,7 +25,7 @@ from tests.hma_jax.convert.fakes import DISCRETE, official_config, random_tensor
 from tests.hma_jax.pretrained import write_published
 
 ARM = get_spec("berkeley_gnm_cory_hall")
-LENGTHS = [10, 11, 12, 13, 14, 15]
+LENGTHS = [12, 12, 13, 13, 14, 15]
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  #
 def where(tmp_path_factory) -> list[str]:
     """Ten training episodes of one robot with 3 windows each, of another none that is long enough."""
     root = tmp_path_factory.mktemp("data")
-    data = [write_rlds(root, ARM, [12] * 12), write_rlds(root, BASE, [5, 6, 7, 5])]
+    data = [write_rlds(root, ARM, [18] * 12), write_rlds(root, BASE, [3, 2, 3, 3])]
     return [*SMOKE, "--out", str(root / "out"), "--data", *map(str, data)]
 
 
@@ -46,15 +46,15 @@ def test_all_trajectories_unless_told_otherwise(train, tmp_path):
     """The smoke study has at most 4 of each robot; no sweep's bound holds for a single model."""
     said, trial, _ = train()
     assert trial.max_trajectories is None
-    assert "training on 1 of 2 robots: 10 of 12 trajectories, 30 windows of 4 frames" in said
-    assert f"note: not trained on {BASE.name}: 4 frames need 8 native frames, the longest of its 2 train" in said
+    assert "training on 1 of 2 robots: 10 of 13 trajectories, 30 windows of 4 frames" in said
+    assert f"note: not trained on {BASE.name}: 2 frames, the least there may be, need 4 native frames" in said
     assert load_run(tmp_path / "run").provenance["loader"]["max_trajectories"] is None
 
 
 def test_fewer_trajectories_when_asked_for(train):
     said, trial, _ = train("--trajectories", "3")
     assert trial.max_trajectories == 3
-    assert "3 of 12 trajectories (at most 3 of each robot), 9 windows" in said
+    assert "3 of 13 trajectories (at most 3 of each robot), 9 windows" in said
 
 
 @pytest.mark.parametrize(("asked", "every"), [(None, 2), ("3", 3), ("0", 0)])

@@ -10,8 +10,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from data_pipelines.loading.mixture import mixture_weights
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sampling.mixture import mixture_weights
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import DiffusionConfig, ModelConfig, OptimizerConfig
 from hma_jax.convert.table import official_parts

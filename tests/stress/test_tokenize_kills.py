@@ -21,7 +21,7 @@ def test_kills_among_processes_leave_no_trace(tmp_path):
     assert outcome.begun == outcome.parts + outcome.again_in_flight
 
 
-NAME = "two_link_arm_joint_targets"
+NAME = "pusher_mint"
 
 
 @pytest.fixture(scope="module")

@@ -72,9 +72,9 @@ class RldsDataset(EpisodeSource):
         self.name, self.version = meta.name, meta.version
         self.features = meta.features
         self.runs = tuple(
-            EpisodeRun(path.name, 0, count) for path, count in zip(meta.shards, meta.shard_lengths, strict=True)
+            EpisodeRun(path.name, 0, count, part if "+" in split else "")
+            for path, count, part in zip(meta.shards, meta.shard_lengths, meta.shard_splits, strict=True)
         )
-        self._shard_splits = meta.shard_splits
         self.files = len(meta.shards)
         self._paths, self._in_array_records = meta.shards, meta.file_format == "array_record"
         scan = array_record.scan_shard if self._in_array_records else scan_shard
@@ -83,9 +83,6 @@ class RldsDataset(EpisodeSource):
 
     def __len__(self) -> int:
         return len(self._index)
-
-    def in_split(self, split: str) -> np.ndarray:
-        return np.repeat([s == split for s in self._shard_splits], [run.count for run in self.runs])
 
     @property
     def numbers(self) -> np.ndarray:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import resource
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.loader import LoaderConfig, make_loader, select_windows
+from data_pipelines.loading.loader import make_loader
+from data_pipelines.loading.selection import LoaderConfig, select_windows, training_table
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
@@ -37,6 +39,7 @@ def test_batch_has_the_agreed_shapes_and_types(store, table):
         "tokens": ((16, 6, 4), "int32"),
         "actions": ((16, 6, 30), "float32"),
         "embodiment": ((16,), "int32"),
+        "real": ((16, 6), "bool"),
     }
 
 
@@ -62,6 +65,7 @@ def test_every_row_is_one_window_with_its_own_actions(store, table):
             assert (chunk[..., 0] == episode[0]).all()
             assert (chunk[..., 1] == step[:, None] + np.arange(stride)).all()
             assert (actions[:, stride * dim :] == 0).all()
+        assert batch["real"].all()
 
 
 def test_held_out_episodes_are_never_seen(store, table):
@@ -204,28 +208,130 @@ def test_a_window_meets_other_actions_on_each_visit(store):
 # --- errors ----------------------------------------------------------------------------------------
 
 
-def test_too_short_episodes_are_counted(tmp_path):
-    spec = make_spec("mixed", hz=4)
-    rlds = write_rlds(tmp_path, spec, [8, 30] * 5)
-    tokenize_dataset(spec, rlds, FakeTokenizer(), tmp_path / "store")
-    store = TokenStore(tmp_path / "store")
-    config = LoaderConfig(frames=6, batch=2)
-    short = sum(n < 12 for n in store.manifest("mixed").train.steps)
+def store_of(tmp_path, lengths: dict[str, list[int]], hz=4, **options) -> TokenStore:
+    for name, steps in lengths.items():
+        spec = make_spec(name, hz=hz)
+        tokenize_dataset(spec, write_rlds(tmp_path, spec, steps), FakeTokenizer(), tmp_path / "store", **options)
+    return TokenStore(tmp_path / "store")
+
+
+def test_short_episodes_fill_up_their_windows_with_what_is_marked(tmp_path):
+    """At 4 Hz natively 8 steps are four frames; one of 3 steps is too short to learn from."""
+    store = store_of(tmp_path, {"mixed": [8, 30, 3] * 5})
+    config = LoaderConfig(frames=6, batch=4)
+    short = sum(n < 4 for n in store.manifest("mixed").train.steps)
     assert select_windows(store, config).too_short == {"mixed": short} and short >= 3
-    take(store, store.embodiment_table(("mixed",)), 3, config)
+    seen = set()
+    for batch in take(store, store.embodiment_table(("mixed",)), 12, config):
+        for real, tokens, actions in zip(batch["real"], batch["tokens"], batch["actions"], strict=True):
+            count = int(real.sum())
+            seen.add(count)
+            assert real.tolist() == [t < count for t in range(6)]
+            assert (tokens[count:] == 0).all() and (actions[count:] == 0).all()
+            assert (np.diff(tokens[:count, 0]) == 2).all()
+            assert (actions[:count, :6].reshape(count, 2, 3)[..., 1] == tokens[:count, :1] % 256 + [0, 1]).all()
+    assert seen == {4, 6}
 
 
-def test_dataset_without_windows_is_dropped_and_reported(store, table):
-    config = replace(CONFIG, frames=15)  # base has 20 frames at stride 1, arm 15, hand 12
-    selected = select_windows(store, config)
-    assert set(selected.mixture.names) == {"arm", "base"}
-    assert "15 frames need 75 native frames" in selected.mixture.dropped["hand"]
-    assert set(take(store, table, 1, config)[0]["embodiment"].tolist()) == {0, 1}
+def test_shuffled_actions_reach_every_real_frame(tmp_path):
+    """Those of a shorter window are repeated; frames that are none get none."""
+    store = store_of(tmp_path, {"mixed": [8, 30] * 5})
+    config = LoaderConfig(frames=6, batch=4)
+    table = store.embodiment_table(("mixed",))
+    pairs = zip(take(store, table, 12, config), take(store, table, 12, replace(config, shuffle_actions=True)), strict=True)
+    for true, shuffled in pairs:
+        assert np.array_equal(true["real"], shuffled["real"]) and np.array_equal(true["tokens"], shuffled["tokens"])
+        given = shuffled["actions"][..., 0]  # the number of the episode
+        assert len(set(given[0][true["real"][0]])) == 1 and (given[~true["real"]] == 0).all()
+        assert (given[true["real"]] != true["actions"][..., 0][true["real"]]).all()
 
 
-def test_no_window_at_all_says_what_would_fit(store, table):
-    with pytest.raises(DataError, match="base: 21 frames need 21 native frames.*has 20.*at most 20 frames"):
-        make_loader(store, table, replace(CONFIG, frames=21))
+def test_dataset_without_windows_is_dropped_and_reported(tmp_path):
+    store = store_of(tmp_path, {"long": [20] * 6, "short": [3] * 6})
+    selected = select_windows(store, LoaderConfig(frames=6, batch=4))
+    assert set(selected.mixture.names) == {"long"}
+    assert "2 frames, the least there may be, need 4 native frames" in selected.mixture.dropped["short"]
+    table = store.embodiment_table(("short", "long"))
+    (batch,) = take(store, table, 1, LoaderConfig(frames=6, batch=4))
+    assert set(batch["embodiment"].tolist()) == {1}
+    with pytest.raises(DataError, match="short: 2 frames, the least .* longest of its 5 train episodes has 3"):
+        make_loader(store, table, LoaderConfig(frames=6, batch=4, datasets=("short",)))
+
+
+# --- order of datasets, weights, statistics, rate ---------------------------------------------------
+
+
+def test_datasets_are_drawn_anew_in_every_batch(store, table):
+    """Equal weights used to give a few sequences of datasets for ever, the same for every seed."""
+    config, sequences = replace(CONFIG, tau=1e9, batch=12), {}
+    for seed in (0, 1):
+        batches = take(store, table, 60, replace(config, seed=seed))
+        sequences[seed] = {tuple(batch["embodiment"].tolist()) for batch in batches}
+        assert len(sequences[seed]) == 60
+    assert not sequences[0] & sequences[1]
+
+
+def test_weights_can_be_frozen_while_trajectories_are_capped(store):
+    free, capped = LoaderConfig(frames=6), LoaderConfig(frames=6, max_trajectories=2)
+    weights = {
+        (config.max_trajectories, weighed): select_windows(store, replace(config, weighed=weighed)).mixture.weights
+        for config in (free, capped)
+        for weighed in ("used", "all")
+    }
+    assert weights[None, "used"] == weights[None, "all"] == weights[2, "all"] != weights[2, "used"]
+    sets = select_windows(store, replace(capped, weighed="all")).sets
+    assert all(len(s.episodes) == 2 for s in sets.values()), "the cap itself still holds"
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_statistics_are_of_exactly_the_trajectories_used(store_root, tmp_path, kept):
+    """The first value of an action is the number of its episode, so every choice has its own mean."""
+    shutil.copytree(store_root, tmp_path / "store")
+    if not kept:  # a store of an earlier version
+        for path in (tmp_path / "store").glob("*/*.moments.npy"):
+            path.unlink()
+    store = TokenStore(tmp_path / "store")
+    config = LoaderConfig(frames=6, max_trajectories=2)
+    for entry, name in zip(training_table(store, config).entries, store.names, strict=True):
+        used = select_windows(store, config).sets[name].episodes
+        rows = np.concatenate([store.episode(name, "train", int(i)).actions for i in used]).astype(np.float64)
+        np.testing.assert_allclose(entry.mean, rows.mean(0), rtol=1e-14)
+        np.testing.assert_allclose(entry.std, rows.std(0), rtol=1e-12)
+        assert entry.mean != store.manifest(name).action_mean
+    everything = training_table(store, LoaderConfig(frames=6))
+    assert everything == store.embodiment_table(store.names)
+
+
+def test_statistics_beside_a_part_and_of_its_episodes_are_the_same_bits(store_root, tmp_path):
+    shutil.copytree(store_root, tmp_path / "store")
+    config = LoaderConfig(frames=6, max_trajectories=5)
+    kept = training_table(TokenStore(store_root), config)
+    for path in (tmp_path / "store").glob("*/*.moments.npy"):
+        path.unlink()
+    assert training_table(TokenStore(tmp_path / "store"), config) == kept
+
+
+def test_damaged_statistics_are_named(store_root, tmp_path):
+    shutil.copytree(store_root, tmp_path / "store")
+    path = next((tmp_path / "store").glob("arm/*.moments.npy"))
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(DataError, match="moments.npy: statistics of actions cannot be read .* Remove the file"):
+        training_table(TokenStore(tmp_path / "store"), LoaderConfig(frames=6, max_trajectories=2))
+
+
+def test_the_rate_is_a_setting(tmp_path):
+    store = store_of(tmp_path, {"toy": [40] * 6}, hz=10, frame_step=1)
+    for rate, stride in ((2.0, 5), (None, 1), (5.0, 2)):
+        config = LoaderConfig(frames=6, batch=4, rate=rate)
+        (batch,) = take(store, training_table(store, config), 1, config)
+        assert (np.diff(batch["tokens"][..., 0]) == stride).all() and batch["actions"].shape == (4, 6, 3 * stride)
+    with pytest.raises(ConfigError, match="toy: the token store has 3 action values at stride 2, .* at stride 5"):
+        make_loader(store, store.embodiment_table(("toy",)), config)
+
+
+def test_a_store_without_the_frames_of_a_rate_names_the_command(store):
+    with pytest.raises(ConfigError, match="arm: the native rate .* every 2nd.*hma tokenize"):
+        select_windows(store, LoaderConfig(frames=6, rate=None))
 
 
 def test_unknown_dataset(store, table):
@@ -242,6 +348,19 @@ def test_table_of_another_action_layout(store, table):
     wrong = EmbodimentTable((replace(table.entries[0], stride=1), *table.entries[1:]))
     with pytest.raises(ConfigError, match="arm: the token store has 3 action values at stride 2"):
         make_loader(store, wrong, CONFIG)
+
+
+def test_swapped_actions_are_refused(store, tmp_path):
+    """The same number of values at the same rate, in another order."""
+    spec = make_spec("hand", (2, 1, 3), hz=10)
+    table = store.embodiment_table(("hand",))
+    swapped = replace(spec, action_keys=spec.action_keys[::-1], action_dims=spec.action_dims[::-1])
+    tokenize_dataset(swapped, write_rlds(tmp_path, spec, [60] * 4), FakeTokenizer(), tmp_path / "store")
+    other, config = TokenStore(tmp_path / "store"), replace(CONFIG, datasets=("hand",))
+    with pytest.raises(ConfigError, match="hand: the values of an action are others, or stand in another order"):
+        make_loader(other, table, config)
+    unknown = EmbodimentTable((replace(table.entries[0], layout=""),))  # a model of an earlier version
+    assert next(make_loader(other, unknown, config))["tokens"].shape == (16, 6, 4)
 
 
 def test_datasets_of_different_tokenizers_do_not_mix(store_root, tmp_path):

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import re
 from dataclasses import replace
 
@@ -39,7 +40,7 @@ def registered(monkeypatch):
 def test_real_dataset_matches_its_entry():
     spec = get_spec("bridge_dataset")
     RldsDataset(REAL_DATA).check_keys(spec.image_key, spec.action_keys, spec.action_dims)
-    assert (spec.stride, spec.action_dim) == (2, 7)
+    assert (spec.stride, spec.action_dim) == (3, 7)
 
 
 def test_every_embodiment_of_the_suite_is_registered():
@@ -139,10 +140,46 @@ def test_constant_action_dimensions_are_safe_to_normalise():
 
 
 @pytest.mark.parametrize(
-    "hz, stride", [(0.5, 1), (1, 1), (2, 1), (3, 2), (4, 2), (5, 2), (10, 5), (15, 8), (20, 10), (30, 15)]
-)
-def test_stride_brings_the_rate_next_to_2_hz(hz, stride):
+    "hz, stride",
+    [(0.5, 1), (1, 1), (2, 1), (2.8, 1), (2.9, 2), (3, 2), (4, 2), (5, 3), (9, 5), (10, 5), (13, 7), (15, 8), (20, 10),
+     (25, 13), (30, 15), (45, 23)],
+)  # fmt: skip
+def test_stride_brings_the_rate_next_to_2_hz_in_ratio(hz, stride):
+    """5 Hz had stride 2 (2.5 Hz), 9, 13, 25 and 45 Hz 4, 6, 12 and 22: Python rounds halves to even."""
     assert DatasetSpec("x", "observation/image", ("action",), (1,), hz).stride == stride
+    other = min((abs(math.log(hz / s / 2)), s) for s in range(1, 50))
+    assert other[1] == stride
+
+
+@pytest.mark.parametrize("rate, stride", [(None, 1), (2.0, 15), (4.0, 8), (10.0, 3), (30.0, 1), (60.0, 1)])
+def test_stride_at_another_rate(rate, stride):
+    spec = DatasetSpec("x", "observation/image", ("action",), (1,), 30)
+    assert spec.stride_at(rate) == stride
+    assert replace(spec, rate=10.0).stride_at(rate) == 3, "an entry's own rate goes before the study's"
+
+
+def test_impossible_rates_are_refused():
+    spec = DatasetSpec("x", "observation/image", ("action",), (1,), 30)
+    with pytest.raises(ConfigError, match="dataset 'x': rate, of its frames in Hz, must be positive, got 0"):
+        replace(spec, rate=0.0)
+    with pytest.raises(ConfigError, match="rate of a window's frames must be positive"):
+        spec.stride_at(-1.0)
+
+
+def test_an_entry_of_ones_own_may_have_its_own_rate(tmp_path):
+    entry = replace(DatasetSpec("x", "observation/image", ("action",), (1,), 30), rate=30.0)
+    (tmp_path / "own.toml").write_text(to_toml(entry))
+    (read,) = load_entries(tmp_path / "own.toml")
+    assert read == entry and read.stride_at(2.0) == 1
+
+
+def test_the_layout_of_actions_is_that_of_keys_and_their_order_alone():
+    spec = DatasetSpec("x", "observation/image", ("action/a", "action/b"), (2, 2), 30)
+    same = replace(spec, name="y", hz=10, image_key="observation/other", note="words", video_targets=False, rate=5.0)
+    assert same.action_layout() == spec.action_layout()
+    swapped = replace(spec, action_keys=("action/b", "action/a"))
+    cut = replace(spec, action_dims=(1, 3))
+    assert len({s.action_layout() for s in (spec, swapped, cut)}) == 3
 
 
 def test_part_of_a_field_is_read_as_the_action(tmp_path):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.splits import held_out
-from data_pipelines.loading.windows import train_windows
+from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import EpisodeRun, describe, episode_ids
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.tfrecord import index_shard
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from data_pipelines.windows.windows import train_windows
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 
 SPEC = make_spec()

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from data_pipelines.registry import get_spec
+from data_pipelines.sampling.splits import held_out_episodes
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
 from data_pipelines.suite import generate
 from data_pipelines.suite.appearance import draw_appearance
@@ -19,7 +22,11 @@ from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.generate import FEWEST, fingerprint, generate_suite
 from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from data_pipelines.windows.windows import train_windows, val_windows
 from hma_jax.config import ConfigError
+from tests.data_pipelines.fakes import FakeTokenizer
 
 NAMES = ("pusher_mint", "rover_slate", "mobile_sky")
 """Short ones: a single tensor of actions; video alone; dict-valued actions."""
@@ -104,13 +111,9 @@ def test_a_recorded_episode_replays_in_the_true_environment(suite):
 
 def test_the_validation_split_is_what_is_held_out(suite):
     """Whatever fraction is asked for: the store and the frame loader both take it as it is."""
-    from data_pipelines.loading.splits import held_out_episodes
-    from data_pipelines.registry import get_spec
-    from data_pipelines.sources.rlds.dataset import RldsDataset
-
     spec = get_spec("pusher_mint")
     source = RldsDataset(suite / spec.name, spec.split)
-    mask = held_out_episodes(spec, source, 0.5, 1, 1)
+    mask = held_out_episodes(spec, source.runs, 0.5, 1, 1, 0.25)
     assert mask.tolist() == [False] * FEWEST + [True] * 3
     seeds = [int(source.record(i)["episode_metadata/seed"][0]) for i in range(len(source))]
     robot = next(s for s in EMBODIMENTS if s.name == spec.name)
@@ -225,6 +228,16 @@ def test_what_another_process_is_making_is_waited_for_and_not_made_again(tmp_pat
         second = pool.submit(generate_suite, tmp_path, **TINY, names=[name])
         assert first.result() == second.result()
     assert len(made) == 1 and [p.name for p in (tmp_path / name).iterdir()] == ["1.0.0"]
+
+
+def test_subsets_are_of_the_training_split_alone(suite, tmp_path):
+    spec = get_spec("pusher_mint")
+    tokenize_dataset(spec, suite / spec.name, FakeTokenizer(), tmp_path)
+    store = TokenStore(tmp_path)
+    everything, held = train_windows(store, spec.name, 4), val_windows(store, spec.name, 4, 3)
+    assert len(everything.episodes) == FEWEST and len(held.episodes) == 3
+    few, more = (set(train_windows(store, spec.name, 4, n).episodes.tolist()) for n in (3, FEWEST - 1))
+    assert (len(few), len(more)) == (3, FEWEST - 1) and few < more
 
 
 def test_the_fingerprint_follows_everything_the_bytes_depend_on():

@@ -17,7 +17,7 @@ import pytest
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.publishing.claims import claim
 from data_pipelines.tokens.dataset_writer import cut_parts
-from data_pipelines.tokens.moments import Moments, merge_all
+from data_pipelines.tokens.moments import Moments, merge_all, moments_path
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import write_rlds
@@ -97,11 +97,15 @@ def stop_after(episodes: int):
     return progress
 
 
-@pytest.mark.parametrize("damage", ["truncated", "missing", "facts", "other facts"])
+@pytest.mark.parametrize("damage", ["truncated", "missing", "statistics", "no statistics", "facts", "other facts"])
 def test_damaged_part_is_made_again(rlds, undisturbed, tmp_path, damage):
     work = begin(rlds, tmp_path)
-    record, facts = sorted(work.glob("train-*"))[1], sorted(work.glob("parts/*.json"))
-    if damage == "truncated":
+    record, facts = sorted(work.glob("train-*.array_record"))[1], sorted(work.glob("parts/*.json"))
+    if damage == "statistics":
+        moments_path(record).write_bytes(moments_path(record).read_bytes()[:-1])
+    elif damage == "no statistics":
+        moments_path(record).unlink()
+    elif damage == "truncated":
         record.write_bytes(record.read_bytes()[:-1])
     elif damage == "missing":
         record.unlink()

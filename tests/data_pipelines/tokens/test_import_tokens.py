@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.windows import cut_actions, cut_tokens, train_windows
 from data_pipelines.tokens.import_tokens import LATENT_SCALE, import_tokens, pair_folders
 from data_pipelines.tokens.release_folder import open_folder
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.cut import make_cut
+from data_pipelines.windows.windows import train_windows
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import GOLDEN
 
@@ -62,7 +63,7 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
         64,
         16,
     )
-    assert (manifest.spec.name, manifest.stride, manifest.frame_step) == ("toy_arm", 2, 2)
+    assert (manifest.spec.name, manifest.spec.stride, manifest.frame_step) == ("toy_arm", 2, 2)
     store = TokenStore(tmp_path / "store")
     for split, lengths, first in (("train", (7, 5, 9), 0), ("val", (4, 6), 500)):
         assert manifest.split(split).steps == lengths
@@ -78,7 +79,7 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
     np.testing.assert_allclose(manifest.action_mean, [10, 5, -10])
     np.testing.assert_allclose(manifest.action_std[0], rows.std())
     assert (
-        len(train_windows(store, "toy_arm", 3)) == 1 + 0 + 2
+        len(train_windows(store, "toy_arm", 3, least=3)) == 1 + 0 + 2
     )  # 6 native frames each, starts every other one
 
 
@@ -118,11 +119,12 @@ def test_windows_of_an_imported_store_are_what_the_release_reads(tmp_path, kind,
             continue
         root = tmp_path / f"{stride}"
         manifest = import_tokens(CASE / kind, CASE / kind, root, hz=2 * stride, patch=1, frame_step=1)
-        item = TokenStore(root).episode("toy_arm", "train", episode)
+        store = TokenStore(root)
+        item, cut = store.episode("toy_arm", "train", episode), make_cut(store, "toy_arm", frames, 2.0)
         if field == "action_ids":
-            got = cut_actions(item, first, frames, manifest, width=items[key].shape[1])
+            got = cut.actions(item, first, width=items[key].shape[1])
         else:
-            got = cut_tokens(item, first, frames, manifest)
+            got = cut.tokens(item, first)
         np.testing.assert_allclose(got.reshape(items[key].shape), items[key], rtol=tolerance)
         compared += 1
     assert compared >= 6
@@ -142,7 +144,7 @@ def test_the_rate_comes_from_the_user_or_the_registry_never_from_the_folder(tmp_
     with pytest.raises(ConfigError, match="'toy_arm' is not in the registry.*--hz.*metadata.json says 1"):
         import_tokens(*pair, tmp_path / "store")
     manifest = import_tokens(*pair, tmp_path / "store", name="unitree_g1_sample")
-    assert manifest.spec.hz == 30 and manifest.stride == 15
+    assert manifest.spec.hz == 30 and manifest.spec.stride == 15
 
 
 class Decoder:

@@ -12,7 +12,7 @@ import pytest
 
 from data_pipelines.columns import Column, Columns, write_columns
 from data_pipelines.errors import DataError
-from data_pipelines.loading.windows import train_windows
+from data_pipelines.windows.windows import train_windows
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.manifest import SplitFacts, load_manifest
 from data_pipelines.tokens.store import TokenStore

@@ -106,7 +106,7 @@ def test_the_scale_is_an_option_and_off_by_default(tmp_path):
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     store = TokenStore(tmp_path / "store")
     (plain,) = store.embodiment_table(["toy"]).entries
-    (scaled,) = store.embodiment_table(["toy"], "quantiles").entries
+    (scaled,) = store.embodiment_table(["toy"], scale="quantiles").entries
     assert (plain.low, plain.high, plain.centre, plain.unit) == ((), (), plain.mean, plain.std)
     assert (scaled.low[:2], scaled.high[:2]) == (
         manifest.action_quantiles[0][:2], manifest.action_quantiles[-1][:2],
@@ -121,7 +121,7 @@ def test_a_value_that_moves_in_less_than_a_hundredth_is_measured_by_its_extremes
     rlds = write_rlds(tmp_path, SPEC, [60] * 8, change=change)
     manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", min_val=0, val_fraction=0.0)
     assert manifest.action_quantiles[0][2] == manifest.action_quantiles[-1][2] == 0
-    scaled = manifest.embodiment("quantiles")
+    scaled = manifest.embodiment(scale="quantiles")
     assert (scaled.low[2], scaled.high[2]) == (0, 4)
 
 
@@ -133,7 +133,7 @@ def test_quantiles_of_some_trajectories_are_of_those_alone(tmp_path):
     first = store.action_quantiles("toy", [0])
     number = manifest.train.episodes[0]
     assert (first[0][0], first[-1][0], first[2][1]) == (number, number, 14)
-    assert manifest.embodiment("quantiles", first).high[1] == first[-1][1]
+    assert manifest.embodiment(scale="quantiles", quantiles=first).high[1] == first[-1][1]
 
 
 def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
@@ -146,4 +146,4 @@ def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
     manifest = load_manifest(path)
     assert manifest.embodiment().low == ()
     with pytest.raises(DataError, match="toy: its tokens .* kept no quantiles.*train.action_scale=deviation"):
-        manifest.embodiment("quantiles")
+        manifest.embodiment(scale="quantiles")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError, EpisodeError
-from data_pipelines.loading.splits import held_out
+from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.tokens.manifest import load_manifest
 from data_pipelines.tokens.store import TokenStore
@@ -16,7 +16,7 @@ from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import FakeLatents, FakeTokenizer, make_spec, write_rlds
 
 SPEC = make_spec(hz=4)  # stride 2
-FILES = ["train-00000-of-00001.array_record", "val-00000-of-00001.array_record"]
+FILES = ["train-00000-of-00001.array_record", "train-00000-of-00001.moments.npy", "val-00000-of-00001.array_record"]
 
 
 @pytest.fixture

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.evalset import EvalManifest, eval_batches, freeze_manifest
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from data_pipelines.windows.evalset import EvalManifest, eval_batches, freeze_manifest
 from hma_jax.config import ConfigError
+from hma_jax.config.json import stable_hash, to_dict
 from tests.data_pipelines.fakes import FakeTokenizer, make_spec, write_rlds
 
 
@@ -25,7 +26,7 @@ def test_windows_of_an_episode_do_not_overlap(store):
         assert len(set(entry.windows)) == len(entry.windows) > 0
         for episode, start in entry.windows:
             assert start % 4 == 0
-            assert (start + 4) * facts.stride <= facts.val.steps[episode]
+            assert (start + 4) * facts.spec.stride <= facts.val.steps[episode]
 
 
 def test_spacing_allows_overlap_when_asked(store):
@@ -166,12 +167,51 @@ def test_store_without_raw_frames_is_refused(tmp_path):
 
 def test_dataset_too_short_to_evaluate_is_reported_and_all_of_them_an_error(tmp_path):
     small_store(tmp_path, "long")
-    store = small_store(tmp_path, "short", [3] * 4)
-    frozen = freeze_manifest(store, store.names, 4, 5, 0)
+    store = small_store(tmp_path, "short", [2] * 4)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
     assert frozen.names == ("long",)
-    assert "4 frames need 4 native frames" in frozen.empty["short"]
-    with pytest.raises(DataError, match="short: 4 frames need 4.*at most 3"):
-        freeze_manifest(store, ("short",), 4, 5, 0)
+    assert "3 frames, the least there may be, need 3 native frames" in frozen.empty["short"]
+    with pytest.raises(DataError, match="short: 3 frames, the least.*has 2.*a shorter prompt"):
+        freeze_manifest(store, ("short",), 4, 5, 0, prompt=2)
+
+
+def test_short_episodes_are_judged_up_to_their_end(tmp_path):
+    """Of four frames the prompt takes two: three are enough, and the fourth is no frame."""
+    small_store(tmp_path, "long")
+    store = small_store(tmp_path, "short", [3] * 4)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
+    assert frozen.names == ("long", "short")
+    (batch,) = eval_batches(store, store.embodiment_table(store.names), frozen, 12)
+    rows = zip(batch["dataset"], batch["real"], batch["tokens"], batch["images"], batch["actions"], strict=True)
+    for name, real, *arrays in rows:
+        assert real.tolist() == [True, True, True, name == "long"]
+        assert all((x[~real] == 0).all() and (x[:3] != 0).any() for x in arrays)
+    whole = freeze_manifest(store, store.names, 4, 5, 0)
+    assert whole.names == ("long",) and "real" not in next(eval_batches(store, store.embodiment_table(("long",)), whole, 2))
+
+
+def test_windows_frozen_by_an_earlier_version_are_read(manifest, tmp_path):
+    """Their file has neither a rate nor a least number of frames."""
+    path = tmp_path / "eval.json"
+    values = {k: v for k, v in to_dict(manifest).items() if k not in ("rate", "least")}
+    path.write_text(json.dumps({"hash": stable_hash(values), **values}))
+    old = EvalManifest.load(path)
+    assert (old.rate, old.least, old.datasets) == (2.0, 0, manifest.datasets)
+
+
+def test_the_rate_is_that_of_the_frames(tmp_path):
+    """4 Hz natively: at 2 Hz every other frame, at the native rate each."""
+    spec = make_spec("toy", hz=4)
+    rlds = write_rlds(tmp_path, spec, [20] * 4)
+    tokenize_dataset(spec, rlds, FakeTokenizer(), tmp_path / "s", frame_step=1)
+    store = TokenStore(tmp_path / "s")
+    for rate, stride in ((2.0, 2), (None, 1), (1.0, 4)):
+        frozen = freeze_manifest(store, ("toy",), 4, 5, 0, rate=rate)
+        batch = next(eval_batches(store, store.embodiment_table(("toy",), rate), frozen, 1))
+        assert (np.diff(batch["tokens"][0, :, 0]) == stride).all()
+        assert batch["actions"].shape == (1, 4, 3 * stride)
+    with pytest.raises(ConfigError, match="3 action values at stride 4"):
+        eval_batches(store, store.embodiment_table(("toy",)), frozen, 1)
 
 
 def test_unknown_dataset_is_named(store, table, manifest):

@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.order import hash64, stream_seed
-from data_pipelines.loading.windows import cut_actions, cut_frames, cut_tokens, require_windows, val_windows
+from data_pipelines.registry import FRAME_RATE
+from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.cut import make_cut
+from data_pipelines.windows.windows import require_windows, val_windows
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
@@ -40,6 +42,8 @@ class EvalManifest:
     spacing: int  # model frames between starts of windows in one episode
     store: str  # hash of the datasets' manifests
     datasets: tuple[DatasetWindows, ...] = field(default_factory=tuple)
+    rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
+    least: int = 0  # real frames of the shortest window; 0, as before there was padding: of each
 
     def hash(self) -> str:
         return stable_hash(self)
@@ -72,14 +76,14 @@ class EvalManifest:
         advice = "Freeze the evaluation set again; results on the old one are not comparable."
         try:
             values = json.loads(Path(path).read_text())
-            stated = values.pop("hash", None)
+            stated, found = values.pop("hash", None), stable_hash(values)
             manifest = from_dict(cls, values)
         except OSError as error:
             reason = error.strerror or error
             raise DataError(f"{path}: the evaluation set cannot be read ({reason}). {advice}") from error
         except (ValueError, AttributeError, TypeError) as error:
             raise DataError(f"{path}: not an evaluation set ({error}). {advice}") from error
-        if manifest.hash() != stated:
+        if found != stated:  # of what the file says: one of an earlier version lacks fields
             raise DataError(f"{path}: its contents do not match its hash {stated}: it was changed. {advice}")
         return manifest
 
@@ -91,10 +95,13 @@ def freeze_manifest(
     windows_per_dataset: int,
     seed: int,
     *,
+    prompt: int | None = None,
+    rate: float | None = FRAME_RATE,
     spacing: int | None = None,
 ) -> EvalManifest:
     """Chooses up to `windows_per_dataset` held-out windows of each dataset, by hash.
 
+    Windows of short episodes have at least the `prompt` frames and one more; without a prompt all are whole.
     Starts within an episode lie `spacing` model frames apart; the default, `frames`, makes
     windows disjoint, so that standard errors do not count the same pixels twice.
     DIFFERS: the release evaluates the first windows of each dataset (reference section 6.1).
@@ -105,18 +112,19 @@ def freeze_manifest(
     require(windows_per_dataset >= 1, f"windows_per_dataset must be at least 1, got {windows_per_dataset}")
     require(spacing >= 1, f"spacing must be at least 1, got {spacing}")
     require(len(datasets) >= 1, "no dataset was given to evaluate on")
-    sets = {name: val_windows(store, name, frames) for name in sorted(set(datasets))}
+    least = frames if prompt is None else prompt + 1
+    sets = {name: val_windows(store, name, frames, least, rate=rate) for name in sorted(set(datasets))}
     require_windows(sets)
-    chosen = []
+    chosen, shortest = [], frames
     for name, windows in sets.items():
-        manifest = store.manifest(name)
-        step = spacing * manifest.stride // manifest.frame_step
-        apart = np.flatnonzero(windows.start % step == 0)
+        apart = np.flatnonzero(windows.start % (spacing * windows.cut.spacing) == 0)
         order = np.argsort(hash64(apart, stream_seed(seed, "evaluation", name)), kind="stable")
         picked = np.sort(apart[order[:windows_per_dataset]])
         pairs = tuple(windows.locate(int(i)) for i in picked)
+        steps = store.manifest(name).val.steps
+        shortest = min([shortest, *(int(windows.cut.longest(steps[episode])) for episode, _ in pairs)])
         chosen.append(DatasetWindows(name, pairs, "" if pairs else windows.shortage()))
-    return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen))
+    return EvalManifest(frames, seed, spacing, store.hash(tuple(sets)), tuple(chosen), rate, shortest)
 
 
 def eval_batches(
@@ -135,7 +143,9 @@ def eval_batches(
     units), `embodiment` int32 [B], `images` uint8 [B, T, H, W, 3] (recorded), `valid` bool [B] (False
     for padding, which repeats the last window), and what names a window, the same whatever the batch
     size and the choice of datasets: `dataset`, a list of B names, `episode` int32 [B] (its number in
-    the source) and `start` int32 [B] (native frame).
+    the source) and `start` int32 [B] (native frame). `action_mean` and `action_std` float32 [B, U] are of all
+    training actions of the dataset, whichever of them a model was trained on: what random actions are drawn
+    from. Where the manifest has short windows, `real` bool [B, T] says which frames are no padding.
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
     dataset is not in the manifest or in `table`.
@@ -155,16 +165,14 @@ def eval_batches(
             store.manifest(name).settings.keep_frames != "none",
             f"{store.root / name}: no raw frames to compare with. Tokenise it with keep_frames='val'.",
         )
-    store.check_table(table, wanted)
+    store.check_table(table, wanted, manifest.rate)
     windows = [(name, *window) for name in wanted for window in frozen[name].windows[:first]]
-    return _batches(store, table, manifest.frames, batch, windows)
+    return _batches(_Rows(store, table, manifest, wanted), batch, windows)
 
 
-def _batches(
-    store: TokenStore, table: EmbodimentTable, frames: int, batch: int, windows: Sequence[tuple[str, int, int]]
-) -> Iterator[dict]:
+def _batches(rows_of: _Rows, batch: int, windows: Sequence[tuple[str, int, int]]) -> Iterator[dict]:
     for at in range(0, len(windows), batch):
-        rows = [_window(store, table, frames, *window) for window in windows[at : at + batch]]
+        rows = [rows_of(*window) for window in windows[at : at + batch]]
         count = len(rows)
         rows += rows[-1:] * (batch - count)
         columns = {key: [row[key] for row in rows] for key in rows[0]}
@@ -176,16 +184,29 @@ def _batches(
         }
 
 
-def _window(store: TokenStore, table: EmbodimentTable, frames: int, name: str, episode: int, start: int) -> dict:
-    """One row of a batch."""
-    facts = store.manifest(name)
-    item = store.episode(name, "val", episode)
-    return {
-        "tokens": cut_tokens(item, start, frames, facts),
-        "actions": cut_actions(item, start, frames, facts, table.action_width),
-        "images": cut_frames(item.frames, start, frames, facts),
-        "embodiment": np.int32(table.index(name)),
-        "dataset": name,
-        "episode": np.int32(item.episode),
-        "start": np.int32(start * facts.frame_step),
-    }
+class _Rows:
+    """(dataset, episode, start) to one row of a batch."""
+
+    def __init__(self, store: TokenStore, table: EmbodimentTable, manifest: EvalManifest, names: Sequence[str]):
+        self._store, self._table, self._names = store, table, tuple(names)
+        self._cuts = {name: make_cut(store, name, manifest.frames, manifest.rate) for name in names}
+        self._some_are_short = 0 < manifest.least < manifest.frames
+        if names:
+            self._statistics = store.embodiment_table(names, manifest.rate).statistics()
+
+    def __call__(self, name: str, episode: int, start: int) -> dict:
+        cut, item = self._cuts[name], self._store.episode(name, "val", episode)
+        width = self._table.action_width
+        mean, std = (x[self._names.index(name)] for x in self._statistics)
+        row = {
+            "tokens": cut.tokens(item, start),
+            "actions": cut.actions(item, start, width),
+            "images": cut.of_frames(item.frames, item, start),
+            "embodiment": np.int32(self._table.index(name)),
+            "dataset": name,
+            "episode": np.int32(item.episode),
+            "start": np.int32(start * cut.frame_step),
+            "action_mean": np.pad(mean, (0, width - len(mean))),
+            "action_std": np.pad(std, (0, width - len(std))),
+        }
+        return row | {"real": cut.valid(item, start)} if self._some_are_short else row

@@ -8,40 +8,59 @@ divided is all episodes that there should be: which are damaged changes the plac
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
-from data_pipelines.loading.order import hash64, stream_seed
-
-if TYPE_CHECKING:
-    from data_pipelines.registry import DatasetSpec
-    from data_pipelines.sources.source import EpisodeSource
+from data_pipelines.registry import DatasetSpec
+from data_pipelines.sampling.order import hash64, stream_seed
+from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from hma_jax.config import require
 
 
 def held_out_episodes(
-    spec: DatasetSpec, source: EpisodeSource, fraction: float, min_val: int, max_val: int
+    spec: DatasetSpec, runs: Sequence[EpisodeRun], fraction: float, min_val: int, max_val: int, max_fraction: float
 ) -> np.ndarray:
-    """bool [episodes] of a dataset, all that are named, True for validation: the split that its entry names for
-    that, whatever its size, or else as `held_out` chooses."""
-    if spec.val_split:
-        return source.in_split(spec.val_split)
-    return held_out(spec.name, source.ids, fraction, min_val, max_val)
+    """bool [episodes that `runs` name], True for validation: the split that the dataset's entry names for that,
+    whatever its size, or else as `held_out` chooses. Raises ConfigError if there is no such split."""
+    if not spec.val_split:
+        return held_out(spec.name, episode_ids(runs), fraction, min_val, max_val, max_fraction)
+    own = [run.split == spec.val_split for run in runs]
+    require(
+        any(own),
+        f"dataset {spec.name!r}: val_split is {spec.val_split!r}, which is none of the splits that are read, "
+        f"{spec.split!r}. Correct its entry.",
+    )
+    return np.repeat(own, [run.count for run in runs])
 
 
 def held_out(
-    dataset: str, ids: np.ndarray, fraction: float = 0.05, min_val: int = 2, max_val: int = 200
+    dataset: str,
+    ids: np.ndarray,
+    fraction: float = 0.05,
+    min_val: int = 2,
+    max_val: int = 200,
+    max_fraction: float = 0.25,
 ) -> np.ndarray:
     """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 
-    Their number is `fraction` of all, at least `min_val`, at most `max_val` and never more
-    than half of the dataset.
+    How many they are says `count_held_out`.
     DIFFERS: the release takes the first max(20, 5 %) episodes (reference section 5.1).
     """
-    count = min(max(round(fraction * len(ids)), min_val), max_val, len(ids) // 2)
+    count = count_held_out(len(ids), fraction, min_val, max_val, max_fraction)
     mask = np.zeros(len(ids), bool)
     mask[smallest_hashes(dataset, ids, count, "held-out")] = True
     return mask
+
+
+def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, max_fraction: float) -> int:
+    """`fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_fraction` of a dataset.
+
+    Of a small dataset the last decides: with min_val 8, two of nine episodes are held out, not four. One is, of
+    two episodes or more, unless `max_val` is 0.
+    """
+    most = max(int(max_fraction * episodes), 1)
+    return min(max(round(fraction * episodes), min_val), max_val, most, episodes // 2)
 
 
 def subset(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.mixture import make_mixture, mixture_weights
+from data_pipelines.sampling.mixture import make_mixture, mixture_weights
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import GOLDEN
 

@@ -1,0 +1,92 @@
+"""What a run is trained on: which windows, how often each dataset's, and the statistics of their actions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from data_pipelines.registry import FRAME_RATE
+from data_pipelines.sampling.mixture import Mixture, make_mixture
+from data_pipelines.sampling.order import ORDER
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.windows import WindowSet, require_windows, train_windows
+from hma_jax.config import require
+from hma_jax.config.training import ActionScale
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+
+Weighed = Literal["used", "all"]
+"""Whose windows weigh in the mixture: those of the trajectories that are used, or all that there are, so that a
+cap on trajectories changes nothing but the trajectories."""
+
+
+@dataclass(frozen=True)
+class LoaderConfig:
+    """What determines the order of training windows."""
+
+    frames: int = 12  # T
+    batch: int = 64  # B, global
+    tau: float = 3.0  # datasets are drawn with p ∝ windows^(1/tau)
+    seed: int = 0  # of the order and of the subset of trajectories
+    max_trajectories: int | None = None  # per dataset
+    datasets: tuple[str, ...] = ()  # empty: all of the store
+    shuffle_actions: bool = False  # control: actions of another episode
+    rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
+    weighed: Weighed = "used"
+    order: int = ORDER  # of this program; said, so that no run goes on in another order
+
+    def __post_init__(self):
+        require(self.frames >= 1, f"loader.frames must be at least 1, got {self.frames}")
+        require(self.batch >= 1, f"loader.batch must be at least 1, got {self.batch}")
+        require(self.tau > 0, f"loader.tau must be positive, got {self.tau}")
+        require(
+            len(set(self.datasets)) == len(self.datasets),
+            f"loader.datasets repeat: {', '.join(self.datasets)}",
+        )
+
+
+@dataclass(frozen=True)
+class TrainingWindows:
+    """The windows a config draws from, and how often. `too_short` counts episodes per dataset."""
+
+    sets: dict[str, WindowSet]
+    mixture: Mixture
+
+    @property
+    def too_short(self) -> dict[str, int]:
+        return {name: s.too_short for name, s in self.sets.items() if s.too_short}
+
+
+def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
+    """Counts windows and weighs datasets. Raises DataError if not one window is left."""
+    names = config.datasets or store.names
+    sets = {name: _windows(store, name, config, config.max_trajectories) for name in names}
+    require_windows(sets)
+    weighed = sets
+    if config.weighed == "all" and config.max_trajectories is not None:
+        weighed = {name: _windows(store, name, config, None) for name in names}
+    counts = {name: len(s) for name, s in weighed.items()}
+    return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.shortage() for n, s in sets.items()}))
+
+
+def training_table(
+    store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation"
+) -> EmbodimentTable:
+    """The table of the datasets of `config`, in their order, with statistics of exactly the trajectories used."""
+    names = config.datasets or store.names
+    return EmbodimentTable(tuple(training_embodiment(store, name, config, scale) for name in names))
+
+
+def training_embodiment(
+    store: TokenStore, name: str, config: LoaderConfig, scale: ActionScale = "deviation"
+) -> Embodiment:
+    """One entry of it. Raises what `Manifest.embodiment` raises."""
+    manifest, used = store.manifest(name), _windows(store, name, config, config.max_trajectories).episodes
+    all_of_them = not len(used) or len(used) == len(manifest.train.episodes)
+    if all_of_them or not manifest.spec.action_dim:
+        return manifest.embodiment(config.rate, scale=scale)
+    quantiles = store.action_quantiles(name, used) if scale == "quantiles" else None
+    return manifest.embodiment(config.rate, store.action_moments(name, used), scale, quantiles)
+
+
+def _windows(store: TokenStore, name: str, config: LoaderConfig, limit: int | None) -> WindowSet:
+    return train_windows(store, name, config.frames, limit, config.seed, rate=config.rate)

@@ -1,0 +1,1 @@
+"""Seeded choices, below all that make them: order, splits and subsets, the mixture of datasets."""

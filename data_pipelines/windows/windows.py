@@ -1,0 +1,173 @@
+"""Windows as index arithmetic over episodes: T frames at the study's rate, each with its action chunk.
+
+Owns which windows exist; how one is cut from an episode is in `cut`. Reads no record to count them.
+
+In an episode that is long enough every start counts whose T frames all have whole chunks. A shorter one
+gives padded windows of as many real frames as it has: at least `TO_TRAIN` to train on, the prompt and one
+more to judge.
+DIFFERS: the release has no padded windows, accepts windows whose last chunk runs up to stride - 1 actions
+past the end of the episode, into the next one, drops the last window of a dataset, and keeps
+non-overlapping windows only (reference section 5.6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from data_pipelines.registry import FRAME_RATE
+from data_pipelines.sampling.splits import held_out_episodes, smallest_hashes, subset
+from data_pipelines.sources.identity import episode_ids
+from data_pipelines.tokens.manifest import Manifest
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.cut import Cut, make_cut
+from hma_jax.config import require
+
+TO_TRAIN = 2
+"""Real frames of a window to train on, at least: one to see and one to predict."""
+
+
+@dataclass(frozen=True)
+class WindowSet:
+    """The windows of one split of one dataset.
+
+    Held as cumulative counts per episode, so memory grows with episodes, not with windows.
+    """
+
+    name: str
+    split: str
+    cut: Cut
+    least: int  # real frames of a window
+    episodes: np.ndarray  # int32: positions in the store
+    ends: np.ndarray  # int64: windows up to and including each episode
+    padded: int  # episodes whose windows are padded
+    too_short: int  # episodes without a single window
+    longest: int  # native frames of the longest episode
+
+    def __len__(self) -> int:
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    @property
+    def needed(self) -> int:
+        """Native frames that the shortest window takes."""
+        return self.least * self.cut.stride
+
+    def locate(self, i: int) -> tuple[int, int]:
+        """(episode position in the store, start) of window `i`."""
+        at = int(np.searchsorted(self.ends, i, side="right"))
+        return int(self.episodes[at]), int(i - (self.ends[at - 1] if at else 0))
+
+    def siblings(self, i: int) -> tuple[int, int]:
+        """The range [first, end) of all windows of window `i`'s episode."""
+        at = int(np.searchsorted(self.ends, i, side="right"))
+        return int(self.ends[at - 1]) if at else 0, int(self.ends[at])
+
+    @property
+    def counts(self) -> np.ndarray:
+        """int64: windows of each episode."""
+        return np.diff(self.ends, prepend=0)
+
+    @property
+    def episode_idx(self) -> np.ndarray:
+        """int32 [windows]: the episode of each window."""
+        return np.repeat(self.episodes, self.counts).astype(np.int32)
+
+    @property
+    def start(self) -> np.ndarray:
+        """int32 [windows]: the start of each window, in stored frames."""
+        return (np.arange(len(self)) - np.repeat(self.ends - self.counts, self.counts)).astype(np.int32)
+
+    def shortage(self) -> str:
+        """Why there are no windows, for a message."""
+        if not self.longest:
+            return f"it has no {self.split} episode"
+        return (
+            f"{self.least} frames, the least there may be, need {self.needed} native frames at stride "
+            f"{self.cut.stride}; the longest of its {self.too_short} {self.split} episodes has {self.longest}"
+        )
+
+
+def require_windows(sets: Mapping[str, WindowSet]) -> None:
+    """Raises DataError, saying what would help, if not one window is left."""
+    if any(len(s) for s in sets.values()):
+        return
+    reasons = "; ".join(f"{name}: {s.shortage()}" for name, s in sets.items())
+    shorter = " or a shorter prompt" if any(s.least > TO_TRAIN for s in sets.values()) else ""
+    raise DataError(
+        f"no {next(iter(sets.values())).split} episode is long enough for a window. {reasons}. Use a higher rate of "
+        f"frames{shorter}, or datasets with more or longer episodes."
+    )
+
+
+def train_windows(
+    store: TokenStore,
+    name: str,
+    frames: int,
+    max_trajectories: int | None = None,
+    subset_seed: int = 0,
+    *,
+    rate: float | None = FRAME_RATE,
+    least: int = TO_TRAIN,
+) -> WindowSet:
+    """Windows of the train split, optionally of `max_trajectories` episodes chosen by hash.
+
+    Windows have `least` real frames or more, and all of theirs where the model's T are fewer.
+
+    Subsets with one `subset_seed` are nested: 10 trajectories are among the 100. Episodes without a window
+    are none of them.
+    """
+    require(
+        max_trajectories is None or max_trajectories >= 1,
+        f"max_trajectories must be at least 1, got {max_trajectories}",
+    )
+    cut = make_cut(store, name, frames, rate)
+    return _windows(store, name, "train", cut, min(least, frames), max_trajectories, subset_seed)
+
+
+def val_windows(
+    store: TokenStore, name: str, frames: int, least: int, *, rate: float | None = FRAME_RATE
+) -> WindowSet:
+    """Windows of the held-out split with at least `least` real frames."""
+    return _windows(store, name, "val", make_cut(store, name, frames, rate), least, None, 0)
+
+
+def _windows(
+    store: TokenStore, name: str, split: str, cut: Cut, least: int, limit: int | None, seed: int
+) -> WindowSet:
+    require(1 <= least <= cut.frames, f"windows of {cut.frames} frames cannot have {least} real ones")
+    manifest = store.manifest(name)
+    steps = np.asarray(manifest.split(split).steps, np.int64)
+    counts = cut.count(steps, least)
+    usable = np.flatnonzero(counts)
+    chosen = usable if limit is None else _chosen(manifest, split, counts > 0, limit, f"subset/{seed}")
+    return WindowSet(
+        name=name,
+        split=split,
+        cut=cut,
+        least=least,
+        episodes=chosen.astype(np.int32),
+        ends=np.cumsum(counts[chosen]),
+        padded=int((steps[chosen] < cut.native).sum()),
+        too_short=len(steps) - len(usable),
+        longest=int(steps.max()) if len(steps) else 0,
+    )
+
+
+def _chosen(manifest: Manifest, split: str, usable: np.ndarray, limit: int, salt: str) -> np.ndarray:
+    """Positions in the store's split, ascending, of those `usable` (bool) episodes that are among the `limit` drawn.
+
+    Drawn from the usable ones and those that were lost, whose length nobody knows: what is lost leaves a gap.
+    """
+    name, present = manifest.spec.name, np.asarray(manifest.split(split).episodes, np.int64)
+    at = np.flatnonzero(usable)
+    if not manifest.runs:  # a store that names episodes by their number
+        return at[smallest_hashes(name, present[at], limit, salt)]
+    ids, s = episode_ids(manifest.runs), manifest.settings
+    bounds = (s.val_fraction, s.min_val, s.max_val, s.max_val_fraction)
+    is_val = held_out_episodes(manifest.spec, manifest.runs, *bounds)
+    members = is_val == (split == "val")
+    members[present[~usable]] = False
+    return at[subset(name, ids, members, present[at], limit, salt)]
