@@ -9,12 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.names import NAME_RULE, is_name, shown
-from data_pipelines.registry.angles import (
-    AngleForm,
-    AngleUnit,
-    angle_width,
-    convert_angles,
-)
+from data_pipelines.registry.angles import AngleForm, AngleUnit, angle_width, convert_angles
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash

@@ -264,7 +264,7 @@ def test_fields_of_another_kind_than_the_schema_says_are_unusable(tmp_path):
         RldsDataset(directory).frames(0, SPEC.image_key, lambda n: [0])
     with pytest.raises(EpisodeError, match="episode 1 .*'steps/action' has 18 values"):
         RldsDataset(directory).episode(1, *KEYS)
-    facts, _ = inspect_dataset(directory)
+    facts = inspect_dataset(directory).facts
     assert facts.sampled == 1 and sorted(facts.damaged.values()) == [1, 1]
 
 
