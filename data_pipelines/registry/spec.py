@@ -88,8 +88,8 @@ class DatasetSpec:
             f"dataset {name!r}: hz, the native rate, must be positive and finite, got {self.hz}",
         )
         require(
-            self.rate is None or self.rate > 0,
-            f"dataset {name!r}: rate, of its frames in Hz, must be positive, got {self.rate}",
+            self.rate is None or 0 < self.rate < math.inf,
+            f"dataset {name!r}: rate, of its frames in Hz, must be positive and finite, got {self.rate}",
         )
         require(
             all(d >= 1 for d in self.action_dims),
