@@ -9,12 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.names import NAME_RULE, is_name, shown
-from data_pipelines.registry.angles import (
-    AngleForm,
-    AngleUnit,
-    angle_width,
-    convert_angles,
-)
+from data_pipelines.registry.angles import AngleForm, AngleUnit, angle_width, convert_angles
 from data_pipelines.sources.rlds.schema import field_slice
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
@@ -94,8 +89,8 @@ class DatasetSpec:
             f"dataset {name!r}: hz, the native rate, must be positive and finite, got {self.hz}",
         )
         require(
-            self.rate is None or self.rate > 0,
-            f"dataset {name!r}: rate, of its frames in Hz, must be positive, got {self.rate}",
+            self.rate is None or 0 < self.rate < math.inf,
+            f"dataset {name!r}: rate, of its frames in Hz, must be positive and finite, got {self.rate}",
         )
         require(
             all(d >= 1 for d in self.action_dims),

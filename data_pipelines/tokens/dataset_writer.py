@@ -24,14 +24,7 @@ from pathlib import Path
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.claims import claim, living_claim, pauses_between_looks
 from data_pipelines.publishing.files import remove, sync
-from data_pipelines.tokens.manifest import (
-    FILE,
-    SPLITS,
-    LostEpisodes,
-    Manifest,
-    SplitFacts,
-    load_manifest,
-)
+from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts, load_manifest
 from data_pipelines.tokens.moments import merge_all
 from data_pipelines.tokens.part_files import Part, PartFacts, read_part
 from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, claims_of
@@ -206,6 +199,10 @@ def _published(final: Path, plan: Manifest) -> Manifest | None:
 
 def _changes(there: Manifest, plan: Manifest) -> list[str]:
     inputs = ("spec", "tokenizer", "settings", "source")
+    n, asked = len(there.train.episodes) + len(there.val.episodes) + there.lost, plan.settings
+    own = replace(asked, max_val_fraction=there.settings.max_val_fraction)
+    if own.count_held_out(n) == asked.count_held_out(n):  # the limit differs, and changes nothing here
+        plan = replace(plan, settings=own)
     return [line for name in inputs for line in diff(getattr(there, name), getattr(plan, name), name)]
 
 

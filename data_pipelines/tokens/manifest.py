@@ -20,6 +20,7 @@ from data_pipelines.columns import Column, Columns, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.names import brief
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
+from data_pipelines.sampling.splits import count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
 from hma_jax.config import ConfigError, require
@@ -87,6 +88,10 @@ class JobSettings:
             self.keep_frames in ("none", "val", "all"),
             f"keep_frames must be none, val or all, got {self.keep_frames!r}",
         )
+
+    def count_held_out(self, episodes: int) -> int:
+        """How many of `episodes` are held out."""
+        return count_held_out(episodes, self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
 
 
 @dataclass(frozen=True)

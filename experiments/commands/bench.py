@@ -167,13 +167,7 @@ def load(
     import tempfile
 
     from data_pipelines.tokens.store import TokenStore
-    from experiments.bench.load import (
-        MemoryPoint,
-        make_store,
-        plot_memory,
-        time_shards,
-        time_windows,
-    )
+    from experiments.bench.load import MemoryPoint, make_store, plot_memory, time_shards, time_windows
     from experiments.rows import write_csv
 
     with tempfile.TemporaryDirectory() as scratch:

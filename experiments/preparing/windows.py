@@ -81,7 +81,8 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
     empty = EvalManifest.load(workspace.manifest).empty
     summary = json.loads(workspace.data_summary.read_text())
     names = study.dataset_names()
-    lines = [f"{name} is judged and has no held-out window: {empty[name]}" for name in names if name in empty and name in judged]
+    unjudged = [name for name in names if name in empty and name in judged]
+    lines = [f"{name} is judged and has no held-out window: {empty[name]}" for name in unjudged]
     lines += [f"{name} has no training window" for name in names if not summary[name]["windows"]]
     require(
         not lines,

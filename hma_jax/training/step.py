@@ -13,14 +13,7 @@ from einops import rearrange
 from hma_jax.config import ModelConfig, TrainConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Use, is_spec
-from hma_jax.objective.losses import (
-    LossSums,
-    TargetCounts,
-    count_targets,
-    loss_metrics,
-    masked_loss,
-    noise_keys,
-)
+from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import Masked, mask_batch
 from hma_jax.training import robots
 from hma_jax.training.average import update_average

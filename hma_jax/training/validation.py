@@ -13,13 +13,7 @@ import numpy as np
 from hma_jax.config import MaskingConfig, ModelConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Params
-from hma_jax.objective.losses import (
-    LossSums,
-    TargetCounts,
-    loss_metrics,
-    masked_loss,
-    noise_keys,
-)
+from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
 from hma_jax.training.loop import Watch
 from hma_jax.training.state import TrainState

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -88,23 +89,40 @@ def test_page_is_one_file_with_clips_curves_and_statistics(toy, tmp_path, capsys
 def test_a_dataset_without_windows_gets_a_command_that_finds_some(toy, tmp_path, capsys):
     directory, entries = toy
     arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]
-    assert main([*arguments, "--frames", "40"]) == 0
+    assert main([*arguments, "--stride", "16"]) == 0
     said = capsys.readouterr().out
-    assert "toy: no window: a window of 40 frames at stride 2 takes 80 steps; the longest of 4 episodes has 31" in said
-    assert "hma tokenize" not in said and re.search(r"next for toy: hma data view \S+ --frames 15 ", said)
-    assert main([*arguments, "--frames", "15"]) == 0 and "hma tokenize" in capsys.readouterr().out
+    assert "toy: no window: the shortest window at stride 16 takes 32 steps; the longest of 4 episodes has 31" in said
+    assert "hma tokenize" not in said
+    assert re.search(r"next for toy: hma data view \S+ --stride 1 --registry \S+  \(no episode .* has the 32 steps", said)
+    assert main([*arguments, "--stride", "1"]) == 0
+    (command,) = re.findall(r"next: (hma tokenize .*)", capsys.readouterr().out)
+    assert command.endswith("--set rate=4")  # of every frame
+
+
+def test_a_rate_of_its_own_is_not_overruled(toy, tmp_path, capsys):
+    directory, entries = toy
+    entries.write_text(to_toml(replace(SPEC, rate=1.0)))
+    arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "next: hma tokenize" in said and "rate=" not in said
+    assert main([*arguments, "--stride", "2"]) == 0
+    assert "its entry has a rate of its own, 1 Hz: a study takes it at stride 4" in capsys.readouterr().out
 
 
 def test_several_datasets_share_a_page_and_only_those_with_windows_go_on(toy, tmp_path, capsys):
     directory, entries = toy
+    short = replace(SPEC, name="short")
+    without = write_rlds(tmp_path, short, [3, 2, 3])
+    entries.write_text(f"{to_toml(SPEC)}\n{to_toml(short)}")
     out = tmp_path / "page.html"
-    arguments = ["data", "view", str(REAL_DATA), str(directory), "--registry", str(entries), "--out", str(out)]
-    assert main([*arguments, "--frames", "8"]) == 0
+    arguments = ["data", "view", str(without), str(REAL_DATA), str(directory), "--registry", str(entries)]
+    assert main([*arguments, "--frames", "8", "--out", str(out)]) == 0
     said, text = capsys.readouterr().out, out.read_text()
-    assert "bridge_dataset: no window" in said and "next for bridge_dataset: hma data view" in said
+    assert "short: no window" in said and "next for short: hma data view" in said
     (command,) = re.findall(r"next: (hma tokenize .*)", said)
-    assert str(directory) in command and "bridge_dataset" not in command
-    assert text.count("<section") == 3 and "<td><b>0</b></td>" in text
+    assert str(directory) in command and str(REAL_DATA) in command and str(without) not in command
+    assert text.count("<section") == 4 and "<td><b>0</b></td>" in text
 
 
 def test_an_unknown_dataset_is_shown_and_its_entry_comes_next(toy, tmp_path, capsys):

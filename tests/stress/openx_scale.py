@@ -135,7 +135,8 @@ def measure_tokenise(out: Path) -> dict:
 
 def measure_training(out: Path, windows: int) -> dict:
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    from data_pipelines.loading.loader import LoaderConfig, make_loader
+    from data_pipelines.loading.loader import make_loader
+    from data_pipelines.loading.selection import LoaderConfig
     from data_pipelines.tokens.store import TokenStore
 
     begin = time.perf_counter()

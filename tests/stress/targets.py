@@ -209,7 +209,7 @@ def _manifest(root: Path) -> Target:
         path.write_bytes(data[1:])
         try:
             manifest = load_manifest(path.with_name(FILE))
-            manifest.embodiment(), manifest.hash(), manifest.train.native_frames, list(manifest.val.episodes)
+            manifest.check(), manifest.hash(), manifest.train.native_frames, list(manifest.val.episodes)
         finally:
             path.write_bytes(there)
 

@@ -27,14 +27,7 @@ from data_pipelines.sources.rlds.location import OpenFiles, is_remote, missing
 from data_pipelines.sources.rlds.schema import field_slice, read_metadata, resolve_version, step_key
 from data_pipelines.sources.rlds.steps import load_steps, save_steps
 from data_pipelines.sources.rlds.tfrecord import open_record, read_parts, scan_shard
-from data_pipelines.sources.source import (
-    MAX_SKIPPED,
-    SUCCESS_KEY,
-    Corrupt,
-    EpisodeSource,
-    OpenEpisode,
-    join_actions,
-)
+from data_pipelines.sources.source import MAX_SKIPPED, SUCCESS_KEY, Corrupt, EpisodeSource, OpenEpisode, join_actions
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location

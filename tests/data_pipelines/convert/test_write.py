@@ -13,13 +13,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.sources import robomimic, video
 from data_pipelines.sources.human import detections
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
-from data_pipelines.sources.units import (
-    Episode,
-    Layout,
-    LeftOut,
-    UnitError,
-    require_module,
-)
+from data_pipelines.sources.units import Episode, Layout, LeftOut, UnitError, require_module
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import contents, number, picture, read_back
 

@@ -49,13 +49,13 @@ def test_nothing_stands_out_of_healthy_data(tmp_path):
 
 
 def test_no_window(tmp_path):
-    assert remarks_of(tmp_path, lengths=[5, 7], frames=4) == {
-        "no window": "bad: a window of 4 frames at stride 2 takes 8 steps; the longest of 2 episodes has 7"
+    assert remarks_of(tmp_path, lengths=[2, 3], frames=4) == {
+        "no window": "bad: the shortest window at stride 2 takes 4 steps; the longest of 2 episodes has 3"
     }
 
 
 def test_some_short_episodes(tmp_path):
-    found = remarks_of(tmp_path, lengths=[5, 7, 8, 9], frames=4)
+    found = remarks_of(tmp_path, lengths=[2, 3, 8, 9], frames=4)
     assert found["short episodes"].endswith("2 of 4 episodes are shorter")
 
 

@@ -66,8 +66,8 @@ def test_order_does_not_change_between_releases(tmp_path, rlds):
     other = make_spec("other")
     datasets = [(SPEC, rlds), (other, write_rlds(tmp_path, other, [200] * 5))]
     frames = np.concatenate(take(datasets, 50, start_step=1000))[:, 0, 0, :2]
-    assert frames[:8].tolist() == [[3, 146], [3, 127], [3, 181], [3, 92], [8, 1], [8, 8], [8, 0], [8, 12]]
-    assert hashlib.sha256(frames.tobytes()).hexdigest()[:16] == "2cb36c0fa159595d"
+    assert frames[:8].tolist() == [[4, 146], [4, 127], [4, 181], [4, 92], [8, 1], [8, 8], [8, 0], [8, 12]]
+    assert hashlib.sha256(frames.tobytes()).hexdigest()[:16] == "e01ee5299b75b1f5"
 
 
 def test_files_kept_open_are_bounded_over_all_datasets(tmp_path, monkeypatch):

@@ -8,15 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_pipelines.registry import (
-    MIXTURES,
-    DatasetSpec,
-    all_specs,
-    get_mixture,
-    get_spec,
-    known_groups,
-    register,
-)
+from data_pipelines.registry import MIXTURES, DatasetSpec, all_specs, get_mixture, get_spec, known_groups, register
 from data_pipelines.registry import openx_rest
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.openx import OPENX
@@ -160,7 +152,7 @@ def test_stride_at_another_rate(rate, stride):
 
 def test_impossible_rates_are_refused():
     spec = DatasetSpec("x", "observation/image", ("action",), (1,), 30)
-    with pytest.raises(ConfigError, match="dataset 'x': rate, of its frames in Hz, must be positive, got 0"):
+    with pytest.raises(ConfigError, match="dataset 'x': rate, of its frames in Hz, must be positive and finite, got 0"):
         replace(spec, rate=0.0)
     with pytest.raises(ConfigError, match="rate of a window's frames must be positive"):
         spec.stride_at(-1.0)

@@ -232,3 +232,11 @@ def test_manifest_is_json_that_people_can_read(tmp_path, rlds):
     values = json.loads((tmp_path / "store/toy/manifest.json").read_text())
     assert values["spec"]["hz"] == 4 and values["tokenizer"]["identity"] == "fake"
     assert values["train"]["parts"] == [6] and values["settings"]["frame_step"] == 2
+
+
+def test_a_limit_on_what_is_held_out_that_changes_nothing_makes_no_other_store(tmp_path, rlds):
+    """Stores of earlier versions have the limit 0.5, which is the same two of eight episodes."""
+    there = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", max_val_fraction=0.5)
+    assert tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store") == there
+    with pytest.raises(ConfigError, match="settings.max_val_fraction: 0.5 -> 0.125"):
+        tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", max_val_fraction=0.125)
