@@ -14,7 +14,7 @@ import threading
 import time
 from pathlib import Path
 
-from hma_jax.runtime.host_memory import HUGE_PAGES, keep_freed_memory
+from hma_jax.runtime.host_memory import KEPT_PAGES, keep_freed_memory
 
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
 _PR_SET_PDEATHSIG = 1
@@ -22,7 +22,7 @@ _PR_SET_PDEATHSIG = 1
 
 def child_environment(slot: int, workers: int, compile_cache: Path | None = None) -> dict[str, str]:
     """The environment of the child in `slot` of `workers`: 1/workers of cores and accelerator."""
-    environment = {**HUGE_PAGES, **os.environ}
+    environment = {**KEPT_PAGES, **os.environ}
     environment[_PARENT] = str(os.getpid())
     if workers > 1 and hasattr(os, "sched_getaffinity"):
         cores = sorted(os.sched_getaffinity(0))

@@ -12,7 +12,7 @@ from pathlib import Path
 from experiments.bench.record import Stage
 from experiments.bench.timing import summarise
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.host_memory import HUGE_PAGES
+from hma_jax.runtime.host_memory import KEPT_PAGES
 
 RELEASED = {
     "forward": "forward",
@@ -66,12 +66,12 @@ def time_beside(
     # As text: started from its file, it would find our modules beside it before those of the standard library.
     script = Path(__file__).with_name("released.py").read_text()
     order = list(dict.fromkeys(turn for name in names for turn in ((THEIRS, RELEASED[name]), (OURS, name))))
-    as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(HUGE_PAGES, "")
+    as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
     seconds: dict[tuple[str, str], list[float]] = {turn: [] for turn in order}
     with ExitStack() as stack:
         workers = {
             THEIRS: stack.enter_context(Worker([str(python), "-c", script], **as_its_users)),
-            OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"], **HUGE_PAGES)),
+            OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"], **KEPT_PAGES)),
         }
         for turn in range(-1, turns):  # the first one compiles and warms up
             for whose, stage in order:

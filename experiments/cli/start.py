@@ -2,11 +2,11 @@
 
 import sys
 
-from hma_jax.runtime.host_memory import restart_with_huge_pages
+from hma_jax.runtime.host_memory import restart_keeping_pages
 
 
 def start() -> None:
-    restart_with_huge_pages()
+    restart_keeping_pages()
     from experiments.cli.main import main
 
     sys.exit(main())

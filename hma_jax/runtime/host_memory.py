@@ -1,10 +1,10 @@
-"""How a process holds host memory: in huge pages, and on one core it keeps what it frees.
+"""How a process holds host memory: in huge pages, and it keeps what it frees for its next call.
 
 XLA's CPU backend takes its temporary buffers anew for every call. glibc gives blocks of that
 size back to the kernel and asks for them again, and the page faults are then a third of a
-training step. Pages of 2 MiB make them few. With one arena that never shrinks there are none,
-but several threads then wait for one another: that is for processes of one core.
-docs/performance.md has the figures.
+training step. Pages of 2 MiB make them few, and a heap that keeps what is freed needs none.
+With one arena for all threads not even small blocks go back, but several threads then wait for
+one another: that is for processes of one core. docs/performance.md has the figures.
 """
 
 from __future__ import annotations
@@ -14,22 +14,28 @@ import os
 import platform
 import sys
 
-HUGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
-"""Environment that a process starts with to use transparent huge pages; glibc reads it before
-anything of ours runs."""
+TUNABLES = (
+    "glibc.malloc.hugetlb=1",  # transparent huge pages
+    "glibc.malloc.mmap_max=0",  # large blocks come from the heap too
+    f"glibc.malloc.trim_threshold={2**36}",  # which does not shrink
+    f"glibc.malloc.top_pad={2**28}",  # and grows by so much
+)
+
+KEPT_PAGES = {"GLIBC_TUNABLES": ":".join(TUNABLES)}
+"""Environment that a process starts with to hold memory so; glibc reads it before anything of ours runs."""
 
 # Names and numbers of malloc.h.
 _M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -2, -4, -8
 
 
-def restart_with_huge_pages() -> None:
-    """Starts the program of this process again, in this process, with `HUGE_PAGES`. Call it first of all.
+def restart_keeping_pages() -> None:
+    """Starts the program of this process again, in this process, with `KEPT_PAGES`. Call it first of all.
 
     Returns where it is so already: the tunables are set, as the user wants them or by an earlier
     call. Does nothing where the C library is not glibc.
     """
     if "GLIBC_TUNABLES" not in os.environ and _is_glibc():
-        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | HUGE_PAGES)
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | KEPT_PAGES)
 
 
 def keep_freed_memory() -> None:

@@ -13,6 +13,7 @@ import pytest
 from experiments.children import child_environment
 from experiments.ledger import Ledger
 from experiments.runner import Job, Monitor, read_states, run_missing
+from hma_jax.runtime.host_memory import KEPT_PAGES
 from tests.experiments import fake_trial
 
 
@@ -131,7 +132,7 @@ def test_workers_share_the_cores():
 
 
 def test_a_child_uses_huge_pages_unless_the_user_said_otherwise(monkeypatch):
-    assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=1"
+    assert child_environment(0, 1)["GLIBC_TUNABLES"] == KEPT_PAGES["GLIBC_TUNABLES"]
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.hugetlb=0")
     assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=0"
 
@@ -142,13 +143,13 @@ def test_the_program_starts_again_with_huge_pages_unless_the_user_said_otherwise
     program = tmp_path / "program.py"
     program.write_text(
         "import os, sys\n"
-        "from hma_jax.runtime.host_memory import restart_with_huge_pages\n"
+        "from hma_jax.runtime.host_memory import restart_keeping_pages\n"
         "print('started', flush=True)\n"
-        "restart_with_huge_pages()\n"
+        "restart_keeping_pages()\n"
         "print(os.environ['GLIBC_TUNABLES'], *sys.argv[1:])\n"
     )
     environment = {k: v for k, v in os.environ.items() if k != "GLIBC_TUNABLES"}
     environment |= {"GLIBC_TUNABLES": asked} if asked else {}
     command = [sys.executable, "-u", program, "--set", "a b"]
     lines = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert lines == ["started"] * (1 if asked else 2) + [f"{asked or 'glibc.malloc.hugetlb=1'} --set a b"]
+    assert lines == ["started"] * (1 if asked else 2) + [f"{asked or KEPT_PAGES['GLIBC_TUNABLES']} --set a b"]
