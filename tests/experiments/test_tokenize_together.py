@@ -136,7 +136,7 @@ def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
         assert spec == ARM and directory == root
         assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "out"), "--data", str(root)]) == 0
         assert f"--data memory://bucket/{ARM.name}" in capsys.readouterr().out.replace("\n", " ")
-        assert json.loads((tmp_path / "out/data.json").read_text())[ARM.name]["episodes"] == 4
+        assert json.loads((tmp_path / "out/data.json").read_text())[ARM.name]["episodes"] == 5
     finally:
         root.fs.rm("/bucket", recursive=True)
 
