@@ -24,7 +24,8 @@ from pathlib import Path
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.claims import claim, living_claim, pauses_between_looks
 from data_pipelines.publishing.files import remove, sync
-from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts, load_manifest
+from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts
+from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import merge_all
 from data_pipelines.tokens.part_files import Part, PartFacts, read_part
 from data_pipelines.tokens.part_maker import Make, PartMaker, Progress, claims_of

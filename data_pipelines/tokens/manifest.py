@@ -16,15 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.columns import Column, Columns, write_columns
+from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
-from data_pipelines.names import brief
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sampling.splits import count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
-from hma_jax.config import ConfigError, require
-from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.config import require
+from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.config.training import ActionScale
 from hma_jax.model.embodiments import Embodiment
 
@@ -281,59 +280,3 @@ def ordinal(number: int) -> str:
 def part_name(split: str, part: int, parts: int) -> str:
     """The file with a part's episodes of one split."""
     return f"{split}-{part:05d}-of-{parts:05d}.array_record"
-
-
-def load_manifest(path: Path) -> Manifest:
-    """Reads a manifest of this format or the one before, whose columns lie in its JSON.
-
-    Raises DataError if it is missing, damaged or of another format.
-    """
-    advice = "Remove the dataset from the store and tokenise it again."
-    try:
-        values = json.loads(path.read_text())
-        if values.get("format") not in READ:
-            raise DataError(
-                f"{path}: manifest format {values.get('format')!r}; this reads "
-                f"{' and '.join(map(str, READ))}. {advice}"
-            )
-        take = _from_json if values["format"] == 2 else _from_file
-        lists = take(path, values)
-        manifest = from_dict(Manifest, values)
-        manifest.check()
-        return replace(manifest, **{s: replace(manifest.split(s), **lists[s]) for s in SPLITS})
-    except OSError as error:
-        raise DataError(f"{path}: the manifest cannot be read ({error.strerror}). {advice}") from error
-    except (ValueError, AttributeError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        if isinstance(error, ConfigError):
-            raise DataError(f"{path}: not a manifest of this program: {brief(error)}. {advice}") from error
-        raise DataError(f"{path}: the manifest is damaged ({brief(error)}). {advice}") from error
-
-
-Lists = dict[str, dict[str, Sequence[int]]]
-"""Columns by split and name."""
-
-
-def _from_json(path: Path, values: dict[str, Any]) -> Lists:
-    """Takes the columns out of a manifest of format 2."""
-    del path
-    return {s: {name: _integers(values[s].pop(name), f"{s}.{name}") for name in LISTS} for s in SPLITS}
-
-
-def _from_file(path: Path, values: dict[str, Any]) -> Lists:
-    """The columns beside a manifest, which says what they are."""
-    stated = values.pop("columns")
-    columns = Columns(path.with_name(COLUMNS_FILE))
-    lists = {s: {name: Column.of(columns, f"{s}.{name}") for name in LISTS} for s in SPLITS}
-    for split, by_name in lists.items():
-        for name, column in by_name.items():
-            if stated[f"{split}.{name}"] != column.digest():
-                raise ValueError(f"{columns.path.name} is not the one it was written with")
-            if len(column) != sum(values[split]["parts"]):
-                raise ValueError(f"{split}.{name} has {len(column)} entries, not one per episode")
-    return {s: {n: c if len(c) else () for n, c in by_name.items()} for s, by_name in lists.items()}
-
-
-def _integers(values: list, name: str) -> Sequence[int]:
-    array = np.asarray(values or np.zeros(0, np.int64))
-    require(array.ndim == 1 and array.dtype.kind == "i", f"{name}: expected a list of integers")
-    return array if len(array) else ()

@@ -16,7 +16,8 @@ from array_record.python import array_record_module
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE
 from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
-from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, load_manifest, part_name
+from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
+from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
 from data_pipelines.tokens.row_sample import RowSampler
 from hma_jax.config import ConfigError

@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +27,7 @@ from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
 from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts, write_dataset
+from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
     JobSettings,
@@ -200,7 +200,7 @@ class _Work:
             self._threads,
         )
         pending: deque[_Pending] = deque()
-        with closing(items), _Encoder(self._tokenizer, self._batch) as encoder:
+        with closing(items), Encoder(self._tokenizer, self._batch) as encoder:
             for item in items:
                 if isinstance(item, Begin):
                     pending.append(_Pending(item, self._keeps(item.index)))
@@ -223,7 +223,7 @@ class _Work:
     def _keeps(self, index: int) -> bool:
         return self._plan.settings.keep_frames in ("all", self._split(index))
 
-    def _finished(self, pending: deque[_Pending], encoder: _Encoder) -> Iterator[PartItem]:
+    def _finished(self, pending: deque[_Pending], encoder: Encoder) -> Iterator[PartItem]:
         """Takes the episodes from `pending` that have all their tokens."""
         while pending and pending[0].end is not None and encoder.ready >= pending[0].came:
             episode = pending.popleft()
@@ -248,63 +248,3 @@ class _Work:
         reason = str(error).replace(f"{self._source.location}/", "")
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
         return LostEpisodes(reason, *place)
-
-
-class _Encoder:
-    """Frames in, their tokens out in the same order. The device works while the next piece gathers."""
-
-    def __init__(self, tokenizer: Tokenizer, batch: int):
-        self._tokenizer, self._batch = tokenizer, batch
-        self._frames: list[np.ndarray] = []
-        self._tokens: deque[np.ndarray] = deque()
-        self._under_way: Future | None = None
-        self._pool = ThreadPoolExecutor(1, "encode")
-        self.ready = 0
-        """Frames whose tokens can be taken."""
-
-    def __enter__(self) -> _Encoder:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self._pool.shutdown(cancel_futures=True)
-
-    def put(self, frame: np.ndarray) -> None:
-        self._frames.append(frame)
-        if len(self._frames) == self._batch:
-            self._start()
-
-    def flush(self) -> None:
-        """Encodes what has gathered; afterwards everything is ready."""
-        if self._frames:
-            self._start()
-        self._collect()
-
-    def take(self, count: int) -> np.ndarray:
-        """The tokens of the next `count` frames, which are ready."""
-        taken = [np.zeros((0, *self._shape()), np.int32)]
-        missing = count
-        while missing:
-            piece = self._tokens.popleft()
-            taken.append(piece[:missing])
-            if len(piece) > missing:
-                self._tokens.appendleft(piece[missing:])
-            missing -= len(taken[-1])
-        self.ready -= count
-        return np.concatenate(taken[1:] or taken)
-
-    def _shape(self) -> tuple[int, ...]:
-        t = self._tokenizer
-        return (t.tokens, t.channels) if t.channels else (t.tokens,)
-
-    def _start(self) -> None:
-        images = np.stack(self._frames)
-        self._frames.clear()
-        self._collect()
-        self._under_way = self._pool.submit(self._tokenizer.encode, images)
-
-    def _collect(self) -> None:
-        if self._under_way is not None:
-            tokens = np.asarray(self._under_way.result())
-            self._tokens.append(tokens)
-            self.ready += len(tokens)
-            self._under_way = None

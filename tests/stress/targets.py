@@ -22,7 +22,8 @@ from data_pipelines.sources.lerobot_meta import read_meta
 from data_pipelines.sources.rlds.example import encode_example, parse_record
 from data_pipelines.sources.rlds.schema import FEATURES, INFO, read_features, read_info, read_metadata
 from data_pipelines.sources.rlds.tfrecord import masked_crc32c, open_record, read_record, scan_shard
-from data_pipelines.tokens.manifest import COLUMNS_FILE, FILE, LISTS, SPLITS, load_manifest
+from data_pipelines.tokens.manifest import COLUMNS_FILE, FILE, LISTS, SPLITS
+from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.release_folder import open_folder
 from tests.data_pipelines.fakes import REAL_DATA, OneDataset, make_features, make_spec
 from tests.stress.mutate import change_bytes, change_json

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.tokens.manifest import load_manifest
+from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, merge_samples, rows_of_part
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset

@@ -9,7 +9,7 @@ import pytest
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.rlds.dataset import RldsDataset
-from data_pipelines.tokens.manifest import load_manifest
+from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError

@@ -1,0 +1,72 @@
+"""Frames of many episodes through the tokenizer, in equal pieces and in order."""
+
+from __future__ import annotations
+
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from hma_jax.tokenizers.base import Tokenizer
+
+
+class Encoder:
+    """Frames in, their tokens out in the same order. The device works while the next piece gathers."""
+
+    def __init__(self, tokenizer: Tokenizer, batch: int):
+        self._tokenizer, self._batch = tokenizer, batch
+        self._frames: list[np.ndarray] = []
+        self._tokens: deque[np.ndarray] = deque()
+        self._under_way: Future | None = None
+        self._pool = ThreadPoolExecutor(1, "encode")
+        self.ready = 0
+        """Frames whose tokens can be taken."""
+
+    def __enter__(self) -> Encoder:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
+
+    def put(self, frame: np.ndarray) -> None:
+        self._frames.append(frame)
+        if len(self._frames) == self._batch:
+            self._start()
+
+    def flush(self) -> None:
+        """Encodes what has gathered; afterwards everything is ready."""
+        if self._frames:
+            self._start()
+        self._collect()
+
+    def take(self, count: int) -> np.ndarray:
+        """The tokens of the next `count` frames, which are ready."""
+        taken = [np.zeros((0, *self._shape()), np.int32)]
+        missing = count
+        while missing:
+            piece = self._tokens.popleft()
+            taken.append(piece[:missing])
+            if len(piece) > missing:
+                self._tokens.appendleft(piece[missing:])
+            missing -= len(taken[-1])
+        self.ready -= count
+        return np.concatenate(taken[1:] or taken)
+
+    def _shape(self) -> tuple[int, ...]:
+        t = self._tokenizer
+        return (t.tokens, t.channels) if t.channels else (t.tokens,)
+
+    def _start(self) -> None:
+        images = np.stack(self._frames)
+        self._frames.clear()
+        self._collect()
+        self._under_way = self._pool.submit(self._tokenizer.encode, images)
+
+    def _collect(self) -> None:
+        if self._under_way is not None:
+            tokens = np.asarray(self._under_way.result())
+            self._tokens.append(tokens)
+            self.ready += len(tokens)
+            self._under_way = None
