@@ -20,7 +20,7 @@ FRAME_RATE = 2.0
 
 NOT_OF_ACTIONS = (
     "name", "image_key", "hz", "rate", "camera", "split", "note", "video_targets", "version", "unverified",
-    "episodes", "median_steps", "mean_steps",
+    "episodes", "median_steps", "mean_steps", "val_split",
 )  # fmt: skip
 """Fields of an entry that say nothing of what an action's values are."""
 

@@ -22,7 +22,7 @@ from data_pipelines.sources.lerobot import SUCCESS, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
-from data_pipelines.sources.rlds.schema import FlatFeature, field_slice, step_key
+from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
     MAX_SKIPPED,
@@ -63,11 +63,7 @@ class LeRobotDataset(EpisodeSource):
         self.version = self._read.meta.version
         self._cameras = {step_key(k): name for k, name in self._read.cameras.items()}
         self._vectors = {step_key(k): name for k, name in self._read.vectors.items()}
-        sizes = {step_key(k): size for k, size in self._read.layout.vectors.items()}
-        self.features = {
-            **{key: FlatFeature(image=True, size=0) for key in self._cameras},
-            **{key: FlatFeature(image=False, size=sizes[key]) for key in self._vectors},
-        }
+        self.features = self._read.layout.flat_features()
         self._numbered = np.asarray([e.index for e in self._entries], np.int64)
         self.runs = _runs(self._numbered)
         self._lengths = np.asarray([e.length for e in self._entries], np.int64)
@@ -81,10 +77,6 @@ class LeRobotDataset(EpisodeSource):
     @property
     def hz(self) -> float:
         return self._read.hz
-
-    @property
-    def numbers(self) -> np.ndarray:
-        return np.arange(len(self), dtype=np.int64)
 
     def fingerprint(self) -> str:
         """Hash over the meta folder, statistics of episodes included, and all files' names and sizes."""

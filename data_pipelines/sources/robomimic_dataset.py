@@ -17,7 +17,7 @@ import numpy as np
 
 from data_pipelines.errors import EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
-from data_pipelines.sources.rlds.schema import FlatFeature, field_slice, step_key
+from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.robomimic import RobomimicSource, read_rows, source_key, succeeded
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.source import (
@@ -55,11 +55,7 @@ class RobomimicDataset(EpisodeSource):
         self._read = RobomimicSource(path, RobomimicSettings(filter_key=None if split == "train" else split))
         self.name = dataset_name(self._read)
         self._demos = list(self._read.units)
-        layout = self._read.layout
-        self.features = {
-            **{step_key(key): FlatFeature(image=True, size=0) for key in layout.images},
-            **{step_key(key): FlatFeature(image=False, size=size) for key, size in layout.vectors.items()},
-        }
+        self.features = self._read.layout.flat_features()
         numbers = [int(name.removeprefix("demo_")) for name in self._demos]
         self.runs = tuple(EpisodeRun(self.location.name, number, 1) for number in numbers)
         with self._read.open() as file:
@@ -73,10 +69,6 @@ class RobomimicDataset(EpisodeSource):
     @property
     def hz(self) -> float:
         return self._read.hz
-
-    @property
-    def numbers(self) -> np.ndarray:
-        return np.arange(len(self), dtype=np.int64)
 
     def fingerprint(self) -> str:
         """Hash over the file's size, and the name and actions of every demonstration."""

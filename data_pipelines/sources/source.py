@@ -120,9 +120,10 @@ class EpisodeSource(ABC):
     def __len__(self) -> int: ...
 
     @property
-    @abstractmethod
     def numbers(self) -> np.ndarray:
-        """int64 [episodes]: which of the episodes named by `runs` each one is."""
+        """int64 [episodes]: which of the episodes named by `runs` each one is. All are there unless a source says
+        otherwise."""
+        return np.arange(len(self), dtype=np.int64)
 
     @abstractmethod
     def fingerprint(self) -> str:

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
+from data_pipelines.sources.rlds.schema import FlatFeature, step_key
 from data_pipelines.sources.rlds.writer import STEP_FIELDS, TEXT, Field, vector_field
 from hma_jax.config import ConfigError
 
@@ -30,6 +31,13 @@ class Layout:
     images: Mapping[str, Field]
     vectors: Mapping[str, int]
     knows_success: bool
+
+    def flat_features(self) -> dict[str, FlatFeature]:
+        """The same fields as an `EpisodeSource` states them."""
+        return {
+            **{step_key(key): FlatFeature(image=True, size=0) for key in self.images},
+            **{step_key(key): FlatFeature(image=False, size=size) for key, size in self.vectors.items()},
+        }
 
     def step_fields(self) -> dict[str, Field]:
         vectors = {key: vector_field(size) for key, size in self.vectors.items()}
