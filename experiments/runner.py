@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.children import child_environment
 from experiments.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, STARTED, Ledger
 from experiments.trial_main import FAILURE, JOB, PROGRESS, RESULT, STOPPED
@@ -144,7 +144,7 @@ def _start(
     directory = trials / job.id
     directory.mkdir(parents=True, exist_ok=True)
     (directory / FAILURE).unlink(missing_ok=True)
-    write_atomically(directory / JOB, json.dumps(job.record, indent=1))
+    write_file(directory / JOB, json.dumps(job.record, indent=1))
     ledger.append(job.id, STARTED, title=job.title)
     with open(directory / "output.txt", "a") as output:
         process = subprocess.Popen(

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.provenance import Provenance
 from experiments.run_options import UNWATCHED, RunOptions
 from experiments.workspace import Workspace
@@ -277,7 +277,7 @@ def run_trial(
             "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
         },
     }
-    write_atomically(directory / "result.json", json.dumps(result, indent=1))
+    write_file(directory / "result.json", json.dumps(result, indent=1))
     return result
 
 

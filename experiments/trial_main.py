@@ -24,7 +24,7 @@ def main(directory: Path) -> int:
     settle()  # before anything imports JAX
 
     from data_pipelines.errors import DataError
-    from experiments.atomic import write_atomically
+    from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
     from experiments.ledger import DIVERGED, FAILED
     from experiments.trial import run_trial
@@ -45,7 +45,7 @@ def main(directory: Path) -> int:
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
         state = DIVERGED if isinstance(error, DivergedError) else FAILED
-        write_atomically(directory / FAILURE, json.dumps({"state": state, "message": message}))
+        write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
         return 1
 
 

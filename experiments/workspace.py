@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.program import PROGRAM
 from experiments.provenance import Provenance
 from experiments.study import Study
@@ -119,7 +119,7 @@ class Record:
 
 
 def save_record(workspace: Workspace, record: Record) -> None:
-    write_atomically(workspace.record, json.dumps(to_dict(record), indent=1))
+    write_file(workspace.record, json.dumps(to_dict(record), indent=1))
 
 
 def find_record(workspace: Workspace) -> Record | None:

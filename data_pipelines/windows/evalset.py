@@ -6,7 +6,6 @@ Owns the choice of windows, its file, and their batches. Measures nothing.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
+from data_pipelines.publishing.files import write_file
 from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
@@ -61,11 +61,9 @@ class EvalManifest:
     def save(self, path: str | Path) -> None:
         """Writes JSON with its own hash; whole or not at all. ConfigError if it cannot be written."""
         path = Path(path)
-        aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            aside.write_text(json.dumps({"hash": self.hash(), **to_dict(self)}, indent=1) + "\n")
-            os.replace(aside, path)
+            write_file(path, json.dumps({"hash": self.hash(), **to_dict(self)}, indent=1) + "\n")
         except OSError as error:
             reason = error.strerror or error
             raise ConfigError(f"{path}: cannot be written ({reason}). Choose another path.") from error

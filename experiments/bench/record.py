@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
 from experiments.machine import describe_machine
 from hma_jax.config import ConfigError
@@ -100,7 +100,7 @@ def write_record(record: BenchRecord, directory: Path) -> Path:
     device = record.machine["devices"][0].split(" x ", 1)[-1].lower().replace(" ", "-")
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f"{record.kind}-{record.subject}-{record.dtype}-{device}.json"
-    write_atomically(path, json.dumps(to_dict(record), indent=1) + "\n")
+    write_file(path, json.dumps(to_dict(record), indent=1) + "\n")
     return path
 
 

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.commands.study import wrote
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step, tidy_table
@@ -175,7 +175,7 @@ def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
         table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
     console.print(table)
     write_evaluation(run, evaluation)
-    write_atomically(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
+    write_file(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
     wrote(run / "evaluation.json", run / FILE, run / "samples.npz")
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.text import Text
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.commands.after_data import no_window, tokenize_command
 from experiments.commands.study import wrote
 from experiments.progress import console, step, tidy_table
@@ -126,7 +126,7 @@ def inspect(
     if as_json is not None:
         values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
         strict = json.loads(json.dumps(values), parse_constant=lambda _: None)  # JSON has no NaN
-        write_atomically(as_json, json.dumps(strict, indent=1))
+        write_file(as_json, json.dumps(strict, indent=1))
         wrote(as_json)
     if entry is not None:
         _write_entry(entry, suggestion)
@@ -210,7 +210,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
     from data_pipelines.registry.toml_file import load_entries, to_toml
 
     others = [e for e in load_entries(path) if e.name != suggestion.name] if path.exists() else []
-    write_atomically(path, "\n".join(to_toml(e) for e in (*others, suggestion.spec())))
+    write_file(path, "\n".join(to_toml(e) for e in (*others, suggestion.spec())))
     wrote(path)
 
 

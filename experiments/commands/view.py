@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.text import Text
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.commands.after_data import no_window, tokenize_command
 from experiments.commands.study import wrote
 from experiments.progress import console, step
@@ -60,7 +60,7 @@ def view(
     options = [word for name, value in given.items() if value is not None for word in (f"--{name}", f"{value}")]
     again = command("data view", *directories, "--out", out, *options)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, draw_page(viewed, frames, again))
+    write_file(out, draw_page(viewed, frames, again))
     wrote(out)
     _say_next(viewed, frames, registry)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.progress import console
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
@@ -52,7 +52,7 @@ class MadeFrom:
         return stable_hash(self)
 
     def save(self, directory: Path) -> None:
-        write_atomically(directory / STAMP, json.dumps(to_dict(self), indent=1))
+        write_file(directory / STAMP, json.dumps(to_dict(self), indent=1))
 
 
 def read_stamp(directory: Path) -> MadeFrom | None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -110,7 +110,7 @@ def make_tokenizer(
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, frames(0, "val"))
     console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
-    write_atomically(aside / QUALITY, json.dumps(quality))
+    write_file(aside / QUALITY, json.dumps(quality))
     _publish(aside, workspace.tokenizer, made_from)
 
 

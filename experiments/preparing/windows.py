@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from experiments.atomic import write_atomically
+from data_pipelines.publishing.files import write_file
 from experiments.preparing.made_from import Step, dataset_differences, few, require_same
 from experiments.progress import console
 from experiments.provenance import Provenance, source_hash
@@ -50,7 +50,7 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
             require_same("windows", workspace.manifest, _differences(there, manifest), replace)
         manifest.save(workspace.manifest)
     summary = summarise(store, names, frames, study.rate)
-    write_atomically(workspace.data_summary, json.dumps(summary, indent=1))
+    write_file(workspace.data_summary, json.dumps(summary, indent=1))
     for name, facts in summary.items():
         _remark(name, facts, manifest.empty.get(name, ""), frames)
     _say_held_out(summary, study.store)

@@ -281,7 +281,7 @@ def test_disk_that_fills_up_later(study, tmp_path, refused, monkeypatch):
         raise OSError(28, "No space left on device", str(path))
 
     out, data = study
-    monkeypatch.setattr(windows, "write_atomically", full)
+    monkeypatch.setattr(windows, "write_file", full)
     message = refused(1, "tokenize", *SMOKE, "--out", out, *data)
     assert f"{out / 'data.json'}: No space left on device" in message and "the space on its disk" in message
 
