@@ -30,7 +30,8 @@ def main(directory: Path) -> int:
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
-    from hma_jax.training.loop import DivergedError, Interrupted
+    from hma_jax.training.divergence import DivergedError
+    from hma_jax.training.loop import Interrupted
 
     job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS)

@@ -81,7 +81,7 @@ def make_tokenizer(
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there
     that was made from other inputs, unless `replace` allows it.
     """
-    from data_pipelines.loading.frames import make_frame_loader
+    from data_pipelines.loading.frames import FrameLoader, make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
@@ -94,7 +94,7 @@ def make_tokenizer(
     if _in_place(workspace.tokenizer, made_from, replace):
         return
 
-    def frames(start: int, split: str = "train") -> Iterator[np.ndarray]:
+    def frames(start: int, split: str = "train") -> FrameLoader:
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
             **{name: getattr(settings, name) for name in HELD_OUT},
@@ -107,6 +107,7 @@ def make_tokenizer(
             config, train, frames, aside, provenance=to_dict(made_from),
             options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
+            records=lambda index: frames(0).describe(index),
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, frames(0, "val"))
     console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.locks import Held, exclusive
+from hma_jax.runtime.locks import Held, Lock, exclusive
 
 NAME = ".lock"
 
@@ -17,13 +17,13 @@ class RunBusy(Held):
 
 
 @contextmanager
-def claimed(run_dir: Path) -> Iterator[None]:
+def claimed(run_dir: Path) -> Iterator[Lock]:
     """Makes `run_dir` and holds it. Raises RunBusy naming the process that holds it already, and
     ConfigError if it cannot be written."""
     with ExitStack() as stack:
         try:
             run_dir.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(exclusive(run_dir / NAME))
+            lock = stack.enter_context(exclusive(run_dir / NAME))
         except Held as held:
             raise RunBusy(
                 f"{run_dir} is being trained in by {held.who}; wait for it or stop it (Ctrl-C saves first), or "
@@ -35,4 +35,4 @@ def claimed(run_dir: Path) -> Iterator[None]:
                 f"cannot write to the run directory {run_dir}: {error.strerror}; choose another output directory "
                 "or fix its permissions"
             ) from error
-        yield
+        yield lock
