@@ -18,11 +18,11 @@ from experiments import (
     scale_width,
     transfer_lr,
 )
-from experiments.ledger import FINISHED, Ledger
 from experiments.preparing.made_from import Step, require_same
 from experiments.program import command_line
 from experiments.progress import SweepMonitor, console
-from experiments.runner import Job, State, read_states, run_missing
+from experiments.running.ledger import FINISHED, Ledger
+from experiments.running.runner import Job, State, read_states, run_missing
 from experiments.setting import Setting, short
 from experiments.study import Study
 from experiments.sweep import titles, unique_trials

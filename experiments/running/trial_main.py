@@ -1,4 +1,4 @@
-"""The process of one trial: `python -m experiments.trial_main DIRECTORY`.
+"""The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
 the state and one message. The runner starts this; run it by hand to debug a trial.
@@ -12,7 +12,7 @@ import time
 import traceback
 from pathlib import Path
 
-from experiments.children import settle
+from experiments.running.children import settle
 
 RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
 STOPPED = 130
@@ -26,7 +26,7 @@ def main(directory: Path) -> int:
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
-    from experiments.ledger import DIVERGED, FAILED
+    from experiments.running.ledger import DIVERGED, FAILED
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
