@@ -13,9 +13,10 @@ import traceback
 from pathlib import Path
 
 from experiments.running.children import settle
+from hma_jax.runtime.exits import Exit, terminated_like_interrupted
 
 RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
-STOPPED = 130
+STOPPED = Exit.STOPPED
 """Exit code of a trial that was asked to stop and saved its state."""
 
 
@@ -37,7 +38,8 @@ def main(directory: Path) -> int:
     report = _ProgressFile(directory / PROGRESS)
     try:
         trial, execution = read_job(job)
-        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
+        with terminated_like_interrupted():  # also while it evaluates
+            run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
     except (Interrupted, KeyboardInterrupt):
         return STOPPED
