@@ -21,7 +21,7 @@ class Exit(IntEnum):
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, as schedulers and `kill` send it: a program ends as it does on Ctrl-C."""
+    """SIGTERM, as schedulers send it: a program ends as it does on Ctrl-C."""
 
 
 @contextmanager

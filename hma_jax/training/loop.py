@@ -225,7 +225,7 @@ def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:
 class _Stop(threading.Event):
     """Set when the run is asked to stop; `exit` says how."""
 
-    exit = Exit.INTERRUPTED
+    exit = Exit.STOPPED  # of a process that another one tells
 
 
 @contextmanager
