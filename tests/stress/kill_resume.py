@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,8 @@ IN_SAVES = 0.5
 TERM = 0.4
 """Of the kills, those by SIGTERM, which lets the command save."""
 
-GRACE = 60.0
-"""Seconds from SIGTERM to the end, at most."""
+PATIENCE = 900.0
+"""Seconds after which a process that should end, or be finished, is said to hang."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class Stress:
         self.root, self.kills, self.seed = root, kills, seed
         self.context = multiprocessing.get_context("forkserver")
         self.context.set_forkserver_preload(["tests.stress.mortal"])
+        forkserver.ensure_running()  # before `tokenize_kills` asks for one with less
         self.journal = Journal(root / "journal.jsonl")
         self.rounds = [Round(**line) for line in self.journal.read()]
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(root / "compiled"))
@@ -73,10 +75,12 @@ class Stress:
         quotas = {s.name: round(s.share * self.kills) for s in todo}
         quotas[TOKENISING] = self.kills - sum(quotas.values())
         while left := quotas[TOKENISING] - self._done(TOKENISING):
-            self._finish(self._tokenising(min(left, TOKENISING_AT_A_TIME)))
+            if not self._finish(self._tokenising(min(left, TOKENISING_AT_A_TIME))):
+                return False
         for subject in todo:
             while left := quotas[subject.name] - self._done(subject.name):
-                self._finish(self._round(subject, min(left, subject.at_a_time)))
+                if not self._finish(self._round(subject, min(left, subject.at_a_time))):
+                    return False
         return all(r.equal for r in self.rounds)
 
     def _done(self, subject: str) -> int:
@@ -86,15 +90,18 @@ class Stress:
         """(number, empty directory, dice) of the next round."""
         number = sum(r.subject == subject for r in self.rounds)
         place = self.root / subject.replace(" ", "_") / str(number)
-        shutil.rmtree(place, ignore_errors=True)
+        while place.exists():  # of this program, killed in the midst of it, whose process may be ending just now
+            shutil.rmtree(place, ignore_errors=True)
         place.mkdir(parents=True)
         return number, place, random.Random(f"{self.seed}/{subject}/{number}")
 
-    def _finish(self, done: Round) -> None:
+    def _finish(self, done: Round) -> bool:
+        """Notes a round. Returns whether it ended well."""
         self.rounds.append(done)
         self.journal.append(asdict(done))
         fate = "equal" if done.equal else f"NOT EQUAL: {done.problem}"
         print(f"{done.subject} {done.number}: {done.kills} kills, {done.in_saves} within saves: {fate}", flush=True)
+        return done.equal
 
     # --- Tokenising --------------------------------------------------------------------------
 
@@ -124,7 +131,7 @@ class Stress:
                 if process.is_alive():
                     os.kill(process.pid, how)
             began = time.monotonic()
-            process.join(seconds * 20 + GRACE)
+            process.join(PATIENCE)
             code = process.exitcode
             if code is None:
                 process.kill()
@@ -167,10 +174,12 @@ class Stress:
         self, command: tuple[str, ...], place: Path, ends_in: int = 0, how: signal.Signals = signal.SIGKILL
     ) -> Any:
         place.mkdir(parents=True, exist_ok=True)
+        begun = self.context.Event()
         process = self.context.Process(
-            target=mortal.run, args=(list(command), place / "output.txt", place / "steps.jsonl", ends_in, how)
+            target=mortal.run, args=(list(command), place / "output.txt", place / "steps.jsonl", ends_in, how, begun)
         )
         process.start()
+        begun.wait(PATIENCE)
         return process
 
     def _once(self, command: tuple[str, ...], place: Path) -> int:
