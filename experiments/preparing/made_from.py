@@ -17,6 +17,7 @@ from typing import Any, Literal, get_args
 
 from data_pipelines.publishing.files import write_file
 from experiments.progress import console
+from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
 
@@ -84,11 +85,6 @@ def dataset_differences(there: Sequence[str], wanted: Sequence[str]) -> list[str
     new = [n for n in wanted if n not in there]
     parts = [f"without {few(gone)}"] * bool(gone) + [f"with {few(new)}"] * bool(new)
     return [f"datasets: {len(there)} -> {len(wanted)}, {' and '.join(parts) or 'in another order'}"]
-
-
-def few(names: Sequence[str]) -> str:
-    """The first names of a list that may be long."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def may_replace(step: Step, asked: Step | None) -> bool:

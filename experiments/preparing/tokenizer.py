@@ -25,8 +25,8 @@ from experiments.preparing.made_from import (
 )
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import console, step
-from experiments.provenance import source_hash
 from experiments.run_options import CHECKPOINTS
+from experiments.running.provenance import source_hash
 from experiments.study import Study
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, TokenizerConfig, require

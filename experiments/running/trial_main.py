@@ -1,7 +1,7 @@
 """The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
-the state and one message. The runner starts this; run it by hand to debug a trial.
+the state and one message. A trial whose sources are not those that job.json names is refused before any work. The runner starts this; run it by hand to debug a trial.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ STOPPED = 130
 
 
 def main(directory: Path) -> int:
-    """0: finished; 1: failed or diverged (see failure.json); STOPPED: will resume."""
+    """0: finished; 1: failed or diverged (see failure.json); 2: refused, the sources changed; STOPPED: will resume."""
     settle()  # before anything imports JAX
 
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
-    from experiments.running.ledger import DIVERGED, FAILED
+    from experiments.running.ledger import DIVERGED, FAILED, REFUSED
+    from experiments.running.provenance import CodeChanged, inputs_of, load_sources, record_start
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
@@ -36,10 +37,15 @@ def main(directory: Path) -> int:
     report = _ProgressFile(directory / PROGRESS)
     try:
         trial, execution = read_job(job)
+        closure = load_sources(job.get("code"))
+        record_start(directory, inputs_of(job["provenance"]), closure)
         run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
     except (Interrupted, KeyboardInterrupt):
         return STOPPED
+    except CodeChanged as error:
+        write_file(directory / FAILURE, json.dumps({"state": REFUSED, "message": str(error)}))
+        return 2
     except Exception as error:  # the boundary of the process: every failure becomes a record
         traceback.print_exc()
         known = isinstance(error, (ConfigError, DataError, DivergedError))

@@ -8,10 +8,10 @@ import pytest
 
 from data_pipelines.registry import get_spec
 from data_pipelines.suite import generate as suite_generator
-from experiments import provenance
 from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
+from experiments.running import provenance
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
