@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
+from data_pipelines.publishing.files import publish, write_file
+from experiments.machine import describe_machine
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -22,11 +22,11 @@ from experiments.preparing.made_from import (
     read_stamp,
     require_same,
     say_recorded,
+    stage_code,
 )
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import console, step
 from experiments.run_options import CHECKPOINTS
-from experiments.running.provenance import source_hash
 from experiments.study import Study
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, TokenizerConfig, require
@@ -42,14 +42,17 @@ QUALITY_FRAMES = 1024
 HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
 """Settings of the store that say which episodes no tokenizer is trained on."""
 
+OF_FRAMES = ("image_key", "split", "val_split")
+"""Facts of a registry entry that say which frames a dataset has for a tokenizer."""
+
 TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
 
 
 def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     """What the tokenizer of a study is trained from, under the names that --set has for it.
 
-    Steps, batch or objective of the model are no part of it. Of the mixture's temperature, which is set for the
-    model's sake, the frames depend a little: it is recorded only.
+    Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
+    of where a dataset's frames are.
     """
     from data_pipelines.sampling.order import ORDER
 
@@ -57,8 +60,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     data = {
         spec.name: {
             "shards": open_source((spec, path), settings).fingerprint(),
-            "split": spec.split,
-            "image_key": spec.image_key,
+            **{name: getattr(spec, name) for name in OF_FRAMES},
         }
         for spec, path in sources
     }
@@ -67,10 +69,12 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
         "tokenizer": to_dict(study.tokenizer),
         "tokenizer_train": to_dict(study.tokenizer_train),
         "store": {name: getattr(settings, name) for name in HELD_OUT},
+        "tau": study.tau,
+        "order": ORDER,
         "datasets": list(data),
         "data": data,
     }
-    return MadeFrom(inputs, {"tau": study.tau, "order": ORDER, "sources": source_hash(("hma_jax/tokenizers",))})
+    return MadeFrom(inputs, {"code": stage_code("tokenizer")}, describe_machine())
 
 
 def make_tokenizer(
@@ -81,7 +85,7 @@ def make_tokenizer(
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there
     that was made from other inputs, unless `replace` allows it.
     """
-    from data_pipelines.loading.frames import make_frame_loader
+    from data_pipelines.loading.frames import FrameLoader, make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
@@ -94,7 +98,7 @@ def make_tokenizer(
     if _in_place(workspace.tokenizer, made_from, replace):
         return
 
-    def frames(start: int, split: str = "train") -> Iterator[np.ndarray]:
+    def frames(start: int, split: str = "train") -> FrameLoader:
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
             **{name: getattr(settings, name) for name in HELD_OUT},
@@ -104,14 +108,16 @@ def make_tokenizer(
     aside = workspace.root / f"tokenizer.{made_from.id}"  # never resumed with other inputs
     with step("train the tokenizer") as update:
         tokenizer = train_tokenizer(
-            config, train, frames, aside, provenance=to_dict(made_from),
+            config, train, frames, aside, provenance=made_from.identity(),
             options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
+            records=lambda index: frames(0).describe(index),
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, frames(0, "val"))
     console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
     write_file(aside / QUALITY, json.dumps(quality))
-    _publish(aside, workspace.tokenizer, made_from)
+    made_from.save(aside)
+    publish(aside, workspace.tokenizer)
 
 
 def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
@@ -158,18 +164,8 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
     aside = workspace.root / "tokenizer.adopted"
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
-    _publish(aside, place, made_from)
-
-
-def _publish(aside: Path, place: Path, made_from: MadeFrom) -> None:
-    """Puts a finished directory in place of whatever is there."""
     made_from.save(aside)
-    gone = place.with_name(f".{place.name}.removed")
-    shutil.rmtree(gone, ignore_errors=True)
-    if place.exists():
-        os.replace(place, gone)
-    os.replace(aside, place)
-    shutil.rmtree(gone, ignore_errors=True)
+    publish(aside, place)
 
 
 def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> dict[str, float]:

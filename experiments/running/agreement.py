@@ -39,7 +39,10 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
                 job = json.loads((directory / "job.json").read_text())
                 found = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
             except (OSError, ValueError, KeyError) as error:
-                raise ConfigError(f"{directory}: the finished trial does not say what it is ({error})") from error
+                raise ConfigError(
+                    f"{directory}: the finished trial does not say what it is ({error}). Copy it "
+                    "again from where it ran, or remove the directory to run it again"
+                ) from error
             require(
                 found == id,
                 f"{directory}: its job.json describes trial {found}: it was renamed or edited. Remove the directory "

@@ -1,7 +1,8 @@
 """The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
-the state and one message. A trial whose sources are not those that job.json names is refused before any work. The runner starts this; run it by hand to debug a trial.
+the state and one message. A trial whose sources are not those that job.json names is refused before any work.
+The runner starts this; run it by hand to debug a trial.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import traceback
 from pathlib import Path
 
 from experiments.running.children import settle
+from hma_jax.runtime.exits import Exit, terminated_like_interrupted
 
 RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
-STOPPED = 130
+STOPPED = Exit.STOPPED
 """Exit code of a trial that was asked to stop and saved its state."""
 
 
@@ -23,29 +25,31 @@ def main(directory: Path) -> int:
     """0: finished; 1: failed or diverged (see failure.json); 2: refused, the sources changed; STOPPED: will resume."""
     settle()  # before anything imports JAX
 
+    job = json.loads((directory / JOB).read_text())
+    closure = _load_sources(directory, job.get("code"))
+    if closure is None:
+        return Exit.REFUSED
+
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
-    from experiments.running.ledger import DIVERGED, FAILED, REFUSED
-    from experiments.running.provenance import CodeChanged, inputs_of, load_sources, record_start
+    from experiments.running.ledger import DIVERGED, FAILED
+    from experiments.running.provenance import inputs_of, record_start
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
-    from hma_jax.training.loop import DivergedError, Interrupted
+    from hma_jax.training.divergence import DivergedError
+    from hma_jax.training.loop import Interrupted
 
-    job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS)
     try:
         trial, execution = read_job(job)
-        closure = load_sources(job.get("code"))
         record_start(directory, inputs_of(job["provenance"]), closure)
-        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
+        with terminated_like_interrupted():  # also while it evaluates
+            run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
     except (Interrupted, KeyboardInterrupt):
         return STOPPED
-    except CodeChanged as error:
-        write_file(directory / FAILURE, json.dumps({"state": REFUSED, "message": str(error)}))
-        return 2
     except Exception as error:  # the boundary of the process: every failure becomes a record
         traceback.print_exc()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
@@ -53,6 +57,19 @@ def main(directory: Path) -> int:
         state = DIVERGED if isinstance(error, DivergedError) else FAILED
         write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
         return 1
+
+
+def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, str] | None:
+    """The closure of what is run, imported; None if it is not what was given, of which failure.json is left."""
+    from data_pipelines.publishing.files import write_file
+    from experiments.running.ledger import REFUSED
+    from experiments.running.provenance import CodeChanged, load_sources
+
+    try:
+        return load_sources(given)
+    except CodeChanged as error:
+        write_file(directory / FAILURE, json.dumps({"state": REFUSED, "message": str(error)}))
+        return None
 
 
 class _ProgressFile:

@@ -1,7 +1,6 @@
 """What names a trial, and what is recorded and checked of the sources that it ran."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from experiments.rows import Row, write_csv
 from experiments.running import provenance
 from experiments.running.agreement import check_finished, group_by_sources, require_one_closure
 from experiments.running.closure import ROOT, closure_hash, source_hash, trace
-from experiments.running.ledger import Ledger
+from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.runner import Job, read_states, run_missing
 from experiments.setting import Where, make_setting
@@ -114,22 +113,19 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
     def command(directory: Path) -> list[str]:
         return ["env", f"PYTHONPATH={checkout}", sys.executable, "-m", "experiments.running.trial_main", str(directory)]
 
-    def run() -> dict:
-        return run_missing(jobs, tmp_path / "trials", ledger, command=command, poll_seconds=0.01)
-
-    states = run()
+    states = run_missing(jobs, tmp_path / "trials", ledger, command=command, poll_seconds=0.01)
     assert [states[f"t{i}"].event for i in range(3)] == ["refused", "missing", "missing"]
     assert "sources changed since this sweep was started: hma_jax.objective.losses." in states["t0"].message
     assert not (tmp_path / "trials" / "t0" / "run").exists()
-    run()  # it is tried again without being asked for
-    assert [r["event"] for r in ledger.records()] == ["started", "refused"] * 2
+    (tmp_path / "trials" / "t0" / "failure.json").unlink()
+    assert subprocess.run(command(tmp_path / "trials" / "t0")).returncode == Exit.REFUSED
 
 
-def test_a_refused_trial_ends_with_its_code(checkout, tmp_path):
-    job = {"trial": {}, "provenance": {}, "code": {"experiments.trial": "0"}}
-    (tmp_path / "job.json").write_text(json.dumps(job))
-    command = [sys.executable, "-m", "experiments.running.trial_main", str(tmp_path)]
-    assert subprocess.run(command, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 2
+def test_a_refused_trial_is_tried_again_without_being_asked_for(tmp_path):
+    ledger, jobs = Ledger(tmp_path / "ledger.jsonl"), [Job("t0", "trial", {"end": "result", "steps": 1, "seconds": 0})]
+    ledger.append("t0", REFUSED)
+    states = run_missing(jobs, tmp_path / "trials", ledger, command=fake_trial.command, poll_seconds=0.01)
+    assert states["t0"].event == "finished"
 
 
 def test_a_comment_in_mid_sweep_is_no_change(checkout):
@@ -233,10 +229,7 @@ def run_by(directory: Path, *closures: dict[str, str]) -> None:
     for closure in closures:
         record_start(directory, PROVENANCE, closure)
     values = json.loads((directory / "result.json").read_text())
-    provenance_of = {k: v for k, v in values.items() if k not in ("hash", "files", "trial")}
-    from experiments.running.sealed import write_result
-
-    write_result(directory, provenance_of)
+    write_result(directory, {name: value for name, value in values.items() if name != "hash"})
 
 
 OLD, NEW = {"experiments.trial": "1", "hma_jax.a": "1"}, {"experiments.trial": "1", "hma_jax.a": "2"}
@@ -255,8 +248,7 @@ def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
     with pytest.raises(CodeChanged, match="to be run; differs in hma_jax.a"):
         require_one_closure(workspace.trials, ids[1:], NEW, accept=False)
     require_one_closure(workspace.trials, ids, NEW, accept=True)
-    commands.draw(workspace, record_of())
-    page = workspace.report.read_text()
+    page = _origin(workspace, record_of(), PROVENANCE, ids, None)
     assert "2 different ones, by hash: " in page and closure_hash(NEW) in page and closure_hash(OLD) in page
 
 
