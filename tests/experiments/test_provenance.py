@@ -10,18 +10,22 @@ from pathlib import Path
 import pytest
 
 from experiments.commands import study as commands
-from experiments.rows import Row, write_csv
+from experiments.report.page import _origin
+from experiments.rows import Row, read_csv, write_csv
 from experiments.running import provenance
 from experiments.running.agreement import check_finished, group_by_sources, require_one_closure
 from experiments.running.closure import ROOT, closure_hash, source_hash, trace
 from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.runner import Job, read_states, run_missing
+from experiments.running.sealed import write_result
 from experiments.setting import Where, make_setting
 from experiments.sweep import unique_trials
 from experiments.trial import trial_id
 from experiments.workspace import Workspace, find_record, save_record
 from hma_jax.config import ConfigError
+from hma_jax.runtime.exits import Exit
+from tests.experiments import fake_trial
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
 
 PLAIN = '''
@@ -111,7 +115,8 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
     ledger = Ledger(tmp_path / "ledger.jsonl")
 
     def command(directory: Path) -> list[str]:
-        return ["env", f"PYTHONPATH={checkout}", sys.executable, "-m", "experiments.running.trial_main", str(directory)]
+        trial = [sys.executable, "-m", "experiments.running.trial_main", str(directory)]
+        return ["sh", "-c", 'cd "$0" && PYTHONPATH="$0" exec "$@"', str(checkout), *trial]
 
     states = run_missing(jobs, tmp_path / "trials", ledger, command=command, poll_seconds=0.01)
     assert [states[f"t{i}"].event for i in range(3)] == ["refused", "missing", "missing"]
@@ -286,11 +291,17 @@ KEPT = Path(commands.__file__).parents[1] / "results"
 
 
 @pytest.mark.parametrize("name", ["cpu", "ablations"])
-def test_results_that_are_kept_are_read_and_drawn_again(name, tmp_path):
+def test_results_that_are_kept_are_read(name):
+    record, rows = find_record(Workspace(KEPT / name)), read_csv(KEPT / name / "results.csv")
+    assert record.provenance.results == 0 and record.study.name == "cpu" and record.study.eval.decode.unmask_steps == 2
+    assert {(r.store, r.manifest, r.tokenizer, r.results) for r in rows} == {tuple(vars(record.provenance).values())}
+    assert {r.sweep for r in rows} == set(record.axes) and all(r.code for r in rows)
+
+
+def test_results_that_are_kept_are_drawn_again_from_their_table(tmp_path):
     for file in ("study.json", "results.csv"):
-        shutil.copy(KEPT / name / file, tmp_path)
-    record = find_record(Workspace(tmp_path))
-    assert record.provenance.results == 0 and record.provenance.store and record.study.name == "cpu"
+        shutil.copy(KEPT / "ablations" / file, tmp_path)
     commands.draw_again(tmp_path)
-    assert (tmp_path / "results.csv").read_bytes() == (KEPT / name / "results.csv").read_bytes()
-    assert {f"{axis}.png" for axis in record.axes} <= {p.name for p in (tmp_path / "figures").iterdir()}
+    assert (tmp_path / "results.csv").read_bytes() == (KEPT / "ablations" / "results.csv").read_bytes()
+    assert {p.name for p in (tmp_path / "figures").iterdir()} >= {"settings.png", "conditioning.png"}
+    assert not (tmp_path / "report.html").exists()
