@@ -17,7 +17,6 @@ from typing import Any, Literal, get_args
 
 from data_pipelines.publishing.files import write_file
 from experiments.progress import console
-from experiments.running.closure import closure_hash, trace
 from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
@@ -39,14 +38,6 @@ OLD_STAMP = "made_from.txt"
 
 FORMERLY_RECORDED = ("tau", "order")
 """Inputs that stamps of earlier versions have as recorded only."""
-
-SOURCES = {
-    "suite": ("data_pipelines.suite.generate",),
-    "tokenizer": ("hma_jax.tokenizers.train", "data_pipelines.loading.frames"),
-    "tokens": ("data_pipelines.tokens.tokenize_job", "hma_jax.tokenizers.io"),
-    "windows": ("data_pipelines.windows.evalset",),
-}
-"""The modules by which each step is made; what they import follows from them (`running.closure`)."""
 
 ORIGIN = "origin"
 """The input that decides which others there are."""
@@ -70,11 +61,6 @@ class MadeFrom:
 
     def save(self, directory: Path) -> None:
         write_file(directory / STAMP, json.dumps(to_dict(self), indent=1))
-
-
-def stage_code(step: Step) -> str:
-    """Hash of the sources that make a step."""
-    return closure_hash(trace(SOURCES[step]))
 
 
 def read_stamp(directory: Path) -> MadeFrom | None:

@@ -22,11 +22,11 @@ from experiments.preparing.made_from import (
     read_stamp,
     require_same,
     say_recorded,
-    stage_code,
 )
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import console, step
 from experiments.run_options import CHECKPOINTS
+from experiments.running.closure import closure_hash, trace
 from experiments.study import Study
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, TokenizerConfig, require
@@ -44,6 +44,9 @@ HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
 
 OF_FRAMES = ("image_key", "split", "val_split")
 """Facts of a registry entry that say which frames a dataset has for a tokenizer."""
+
+SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames")
+"""The modules that train it; what they import follows (`running.closure`)."""
 
 TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
 
@@ -74,7 +77,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
         "datasets": list(data),
         "data": data,
     }
-    return MadeFrom(inputs, {"code": stage_code("tokenizer")}, describe_machine())
+    return MadeFrom(inputs, {"code": closure_hash(trace(SOURCES))}, describe_machine())
 
 
 def make_tokenizer(

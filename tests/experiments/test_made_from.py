@@ -8,16 +8,15 @@ import pytest
 
 from data_pipelines.registry import get_spec
 from data_pipelines.suite import generate as suite_generator
+from data_pipelines.tokens import tokenize_job
 from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
 from experiments.preparing.made_from import (
     OLD_STAMP,
-    SOURCES,
     STAMP,
     dataset_differences,
     differences,
     may_replace,
-    stage_code,
 )
 from experiments.running.closure import trace
 from tests.data_pipelines.fakes import write_rlds
@@ -177,7 +176,7 @@ def test_the_tokenizer_that_is_there_can_be_given(hma, out):
 
 def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypatch):
     before = contents(out)
-    monkeypatch.setattr(tokenizer_step, "stage_code", lambda _: "edited")
+    monkeypatch.setattr(tokenizer_step, "closure_hash", lambda _: "edited")
     code, said = hma("tokenize")
     assert code == 0 and "made with other code: " in said and "-> 'edited'" in said
     assert contents(out) == before
@@ -188,8 +187,7 @@ def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypat
 
 
 def test_sources_of_the_tokenizer_are_its_own():
-    assert len({stage_code(step) for step in SOURCES}) == len(SOURCES)
-    names = trace(SOURCES["tokenizer"])
+    names = trace(tokenizer_step.SOURCES)
     assert {"hma_jax.tokenizers.lfq", "data_pipelines.sources.rlds.images", "hma_jax.training.loop"} <= names.keys()
     assert not [name for name in names if name.startswith(("experiments", "hma_jax.model.trunk"))]
 
@@ -235,6 +233,16 @@ def test_tokenizer_and_windows_copied_to_another_place_are_those_of_the_study(hm
     assert {name: again[name] for name in copied} == copied
     tokens = {name: data for name, data in contents(out).items() if name.startswith("tokens/")}
     assert tokens and {name: data for name, data in again.items() if name.startswith("tokens/")} == tokens
+
+
+def test_tokens_that_earlier_code_would_make_otherwise_are_refused_and_stay(hma, out, monkeypatch):
+    before = contents(out)
+    monkeypatch.setattr(tokenize_job, "RECIPE", tokenize_job.RECIPE + 1)
+    code, said = hma("tokenize")
+    assert code == 2 and f"recipe: {tokenize_job.RECIPE - 1} -> {tokenize_job.RECIPE} ({ARM.name}" in " ".join(said.split())
+    assert "--replace tokens" in said and contents(out) == before
+    assert hma("tokenize", "--replace", "tokens")[0] == 0 and hma("tokenize")[0] == 0
+    assert contents(out) != before
 
 
 @pytest.mark.parametrize("old", [True, False])
