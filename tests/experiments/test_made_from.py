@@ -85,11 +85,11 @@ def test_settings_that_nothing_prepared_depends_on_ask_for_nothing(setting, hma,
 
 def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
     shutil.rmtree(out / "tokenizer")
-    publish = tokenizer_step._publish
-    monkeypatch.setattr(tokenizer_step, "_publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    publish = tokenizer_step.publish
+    monkeypatch.setattr(tokenizer_step, "publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     assert hma("tokenize")[0] == 130
     (aside,) = out.glob("tokenizer.*")
-    monkeypatch.setattr(tokenizer_step, "_publish", publish)
+    monkeypatch.setattr(tokenizer_step, "publish", publish)
     trained = (aside / "metrics.jsonl").stat().st_mtime_ns
     assert hma("tokenize")[0] == 0
     assert not aside.exists() and (out / "tokenizer" / "metrics.jsonl").stat().st_mtime_ns >= trained
