@@ -73,8 +73,11 @@ class TrialRecord:
 
 
 def trial_closure() -> dict[str, str]:
-    """The sources that a trial started now would run."""
-    return trace(ROOTS)
+    """The sources that a trial started now would run. Raises CodeChanged while they cannot be read."""
+    try:
+        return trace(ROOTS)
+    except (OSError, SyntaxError, ValueError) as error:  # in the middle of a `git pull`, say
+        raise CodeChanged(f"the sources cannot be read ({error}); try again when they are whole") from error
 
 
 def load_sources(given: Closure | None) -> dict[str, str]:
