@@ -14,7 +14,7 @@ from hma_jax.kernels.dense import FROM_EXAMPLES, TO_EXAMPLES
 from hma_jax.runtime.sharding import GATHER, SCATTER
 
 KINDS = ("all-gather", "all-reduce", "reduce-scatter", "all-to-all", "collective-permute")
-LINE = re.compile(rf"= (?P<result>\(.*?\)|\S+) (?P<kind>{'|'.join(KINDS)})(?:-start)?\(")
+LINE = re.compile(rf"= (?P<result>\(.*?\)|\S+) (?P<kind>{'|'.join(KINDS)})(?P<start>-start)?\(")
 ARRAY = re.compile(r"\b(?:pred|[a-z]+?(?P<bits>\d+)\w*)\[(?P<shape>[\d,]*)\]")
 SMALL = 2**16
 """Bytes of what is called numbers and flags below."""
@@ -45,7 +45,9 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
             continue
         label = re.search(r'op_name="([^"]*)"', line)
         name, kind = label[1] if label else "", found["kind"]
-        size, over = count_bytes(found["result"]), find_axes(line, mesh)
+        arrays, over = count_bytes(found["result"]), find_axes(line, mesh)
+        # What starts a gather or a permutation holds what is sent beside what is received.
+        size = max(arrays) if found["start"] and kind in ("all-gather", "collective-permute") else sum(arrays)
         collective = Collective(kind, over, "while/body" in name, explain(kind, name, over, size))
         counts[collective] += 1
         sizes[collective] += size
@@ -111,7 +113,7 @@ def _first_group(line: str, devices: int) -> list[int] | None:
     return list(range(devices)) if "replica_groups={}" in line else None
 
 
-def count_bytes(result: str) -> int:
-    """Of the arrays in the type of an instruction's result, such as 'f32[8]{0}' or '(f32[8], u32[])'."""
+def count_bytes(result: str) -> list[int]:
+    """Of each array in the type of an instruction's result, such as 'f32[8]{0}' or '(f32[8], u32[])'."""
     arrays = [(int(x["bits"] or 8), x["shape"]) for x in ARRAY.finditer(re.sub(r"\{[^}]*\}|/\*.*?\*/", "", result))]
-    return sum(bits * math.prod(int(n) for n in shape.split(",") if n) for bits, shape in arrays) // 8
+    return [bits * math.prod(int(n) for n in shape.split(",") if n) // 8 for bits, shape in arrays]

@@ -64,7 +64,7 @@ def test_collectives_are_counted_whole_or_started_with_what_is_sent_over_which_a
     assert count_kinds(found) == {"all-gather": 1, "all-reduce": 1, "reduce-scatter": 1, "all-to-all": 1, "collective-permute": 1}
     assert found[Collective("all-to-all", "fsdp", False, "robots' parameters, to their examples")] == Sent(1, 8 * 4096 * 4)
     gathered = Collective("all-gather", "fsdp+tensor", True, "parameters, from storage to compute")
-    assert found[gathered] == Sent(1, 2 * (8 + 128))
+    assert found[gathered] == Sent(1, 2 * 128)
     by_axes = {c.kind: c.over for c in found}
     assert by_axes["all-reduce"] == "data" and by_axes["collective-permute"] == "fsdp"
     assert by_axes["reduce-scatter"] == "data+fsdp"
