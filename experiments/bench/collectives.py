@@ -40,9 +40,15 @@ def find_collectives(text: str, mesh: Mapping[str, int]) -> dict[Collective, Sen
     """Those of a program compiled for a mesh of those sizes, most bytes first."""
     counts: Counter[Collective] = Counter()
     sizes: Counter[Collective] = Counter()
+    channels: set[tuple[str, str]] = set()
     for line in text.splitlines():
         if (found := LINE.search(line)) is None:
             continue
+        # TPU programs write one gather several times: with every computation during which it goes on.
+        if channel := re.search(r"channel_id=(\d+)", line):
+            if (found["kind"], channel[1]) in channels:
+                continue
+            channels.add((found["kind"], channel[1]))
         label = re.search(r'op_name="([^"]*)"', line)
         name, kind = label[1] if label else "", found["kind"]
         arrays, over = count_bytes(found["result"]), find_axes(line, mesh)

@@ -50,7 +50,8 @@ def test_a_mesh_that_does_not_suit_the_devices_is_refused():
 
 TEXT = """
   %a = f32[8]{0} all-reduce(f32[8]{0} %x), replica_groups={{0,4},{1,5}}, metadata={op_name="jit(step)/reduce_sum"}
-  %b = (bf16[1,8]{0}, bf16[2,64]{1,0}) all-gather-start(%x), replica_groups=[2,4]<=[8], metadata={op_name="jit(step)/jvp()/while/body/gather_parameters/x"}
+  %b = (bf16[1,8]{0}, bf16[2,64]{1,0}) all-gather-start(%x), channel_id=7, replica_groups=[2,4]<=[8], metadata={op_name="jit(step)/jvp()/while/body/gather_parameters/x"}
+  %again = bf16[2,64]{1,0} all-gather(%x), channel_id=7, replica_groups=[2,4]<=[8], metadata={op_name="jit(step)/jvp()/while/body/gather_parameters/x"}
   %c = bf16[64]{0} all-gather-done(%b)
   %m = f32[8]{0} reduce-scatter(%x), replica_groups=mesh['axis_0'=4,'axis_1'=2] {'axis_0'}, metadata={op_name="jit(step)/z"}
   %p = (bf16[4]{0}, bf16[4]{0}, u32[], u32[]) collective-permute-start(%x), source_target_pairs={{0,2},{2,0}}, metadata={op_name="jit(step)/transpose(jvp())/dot_general"}
@@ -59,7 +60,7 @@ TEXT = """
 """  # noqa: E501
 
 
-def test_collectives_are_counted_whole_or_started_with_what_is_sent_over_which_axes():
+def test_collectives_are_counted_once_with_what_is_sent_over_which_axes():
     found = find_collectives(TEXT, {"data": 2, "fsdp": 2, "tensor": 2})
     assert count_kinds(found) == {"all-gather": 1, "all-reduce": 1, "reduce-scatter": 1, "all-to-all": 1, "collective-permute": 1}
     assert found[Collective("all-to-all", "fsdp", False, "robots' parameters, to their examples")] == Sent(1, 8 * 4096 * 4)

@@ -46,10 +46,11 @@ def test_forty_robots_train_on_eight_devices_as_on_one():
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("kind", ["ids", "latents", "attended"])
 def test_forty_robots_train_on_every_mesh_as_on_one_device(kind: str):
     found = check_forty_robots(kind, 20, MESHES)
-    assert found[ONE]["losses"][-1] < 0.99 * found[ONE]["losses"][0]  # parameters have moved, and it shows
+    assert found[ONE]["losses"][-1] < 0.995 * found[ONE]["losses"][0]  # parameters have moved, and it shows
     sharded = found["1,8,1"]
     assert sharded["bytes_on_first"] <= 1.05 * sharded["bytes"] / 8
 
