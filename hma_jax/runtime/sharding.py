@@ -107,9 +107,9 @@ def mesh_axes(part: str | tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def is_split() -> bool:
-    """Whether what is traced runs under a mesh of several devices."""
+    """Whether what is traced runs under a mesh of several devices; what `shard_map` runs on each does not."""
     mesh = jax.sharding.get_abstract_mesh()
-    return not mesh.empty and math.prod(mesh.shape.values()) > 1
+    return math.prod(mesh.shape[axis] for axis in mesh.auto_axes) > 1
 
 
 def batch_ways() -> int:
