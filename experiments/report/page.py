@@ -22,8 +22,8 @@ from experiments.report.plot_style import drawn_metrics
 from experiments.report.style import CSS
 from experiments.report.sweeps import GAINS, TITLES, describe
 from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve, load_result
+from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
-from experiments.running.runner import State
 from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from experiments.trial import Trial, trial_id
 from experiments.workspace import Record, Workspace

@@ -1,7 +1,7 @@
 """The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
-the state and one message. The runner starts this; run it by hand to debug a trial.
+the state and one message. A launcher starts this, on whichever machine; run it by hand to debug a trial.
 """
 
 from __future__ import annotations
@@ -10,19 +10,29 @@ import json
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 
+from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, STOPPED, attempt
 from experiments.running.children import settle
 
-RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
-STOPPED = 130
-"""Exit code of a trial that was asked to stop and saved its state."""
+LOOK_EVERY = 30.0
+"""Seconds between two looks whether the trial is still ours."""
 
 
 def main(directory: Path) -> int:
     """0: finished; 1: failed or diverged (see failure.json); STOPPED: will resume."""
     settle()  # before anything imports JAX
+    try:
+        with attempt(directory) as held:
+            if (directory / RESULT).exists():  # another attempt finished while this one waited
+                return 0
+            return _run(directory, held.lost)
+    except KeyboardInterrupt:
+        return STOPPED
 
+
+def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
@@ -33,12 +43,15 @@ def main(directory: Path) -> int:
     from hma_jax.training.loop import DivergedError, Interrupted
 
     job = json.loads((directory / JOB).read_text())
-    report = _ProgressFile(directory / PROGRESS)
+    report = _ProgressFile(directory / PROGRESS, lost)
     try:
         trial, execution = read_job(job)
         run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
-    except (Interrupted, KeyboardInterrupt):
+    except Interrupted:
+        return STOPPED
+    except TakenOver as error:
+        print(error, file=sys.stderr)
         return STOPPED
     except Exception as error:  # the boundary of the process: every failure becomes a record
         traceback.print_exc()
@@ -49,15 +62,27 @@ def main(directory: Path) -> int:
         return 1
 
 
-class _ProgressFile:
-    """Writes {phase, done, total} for the runner to show, a few times a second at most."""
+class TakenOver(Exception):
+    """Another attempt works on the trial: this process was cut off for longer than its lease."""
 
-    def __init__(self, path: Path):
-        self.path = path
+
+class _ProgressFile:
+    """Writes {phase, done, total} for the runner to show, a few times a second at most.
+
+    Raises TakenOver when `lost` says that the trial is another attempt's by now.
+    """
+
+    def __init__(self, path: Path, lost: Callable[[], bool]):
+        self.path, self.lost = path, lost
         self.last = ("", 0.0)
+        self.looked = time.monotonic()
 
     def __call__(self, phase: str, done: int, total: int) -> None:
         now = time.monotonic()
+        if now - self.looked >= LOOK_EVERY:
+            self.looked = now
+            if self.lost():
+                raise TakenOver(f"{self.path.parent}: another attempt at this trial has taken over")
         if phase == self.last[0] and now - self.last[1] < 0.3 and done < total:
             return
         self.last = (phase, now)

@@ -13,8 +13,8 @@ from experiments.commands.study import AXES, SCALING
 from experiments.presets import SMOKE
 from experiments.provenance import Provenance
 from experiments.rows import Row, collect
+from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
-from experiments.running.runner import read_states
 from experiments.study import Study, TransferConfig
 from experiments.sweep import Sweep, titles, unique_trials
 from experiments.trial import Trial, write_samples

@@ -1,0 +1,60 @@
+"""A process of an engine on some machine, which makes one attempt at a trial in a child of its own.
+
+The child's memory, signals and accelerators are its own, and it ends with this process however that ends. The
+engine's SIGTERM is handed on as SIGINT: some engines send it to the child too, and a trial takes the second one
+of a kind for impatience.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+from pathlib import Path
+
+from experiments.running.attempts import OUTPUT
+from experiments.running.children import child_environment
+from experiments.running.launchers.base import GRACE_SECONDS, Command
+
+
+class Attempt:
+    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk."""
+
+    def __init__(self, directory: Path, cache: Path, command: Command):
+        self.directory, self.cache, self.command = directory, cache, command
+        self._child: subprocess.Popen | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return vars(self) | {"_child": None}
+
+    def run(self) -> int:
+        """Makes the attempt and returns its exit code, as of `subprocess`."""
+        with open(self.directory / OUTPUT, "a") as output:
+            self._child = subprocess.Popen(
+                self.command(self.directory),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=child_environment(self.cache),
+                start_new_session=True,  # signals come through here, once
+            )
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, lambda *_: self._ask())
+        try:
+            return self._child.wait()
+        finally:  # the engine interrupts the call
+            self.end()
+
+    def _ask(self) -> None:
+        self._child.send_signal(signal.SIGINT)
+
+    def end(self) -> int:
+        """Asks the child to save, waits, and returns its exit code."""
+        child = self._child
+        if child.poll() is None:
+            self._ask()
+            try:
+                child.wait(GRACE_SECONDS)
+            except subprocess.TimeoutExpired:
+                child.kill()
+        return child.wait()
