@@ -65,8 +65,15 @@ def attempt(directory: Path) -> Iterator[Claim]:
     """
     with claim(directory / "trial", wait=True) as held:
         who = {"host": socket.gethostname(), "process": os.getpid(), "token": secrets.token_hex(4)}
-        write_file(directory / STARTED, json.dumps(who))
+        write_file(directory / STARTED, json.dumps(who | _engine_job()))
         yield held
+
+
+def _engine_job() -> dict[str, str]:
+    """The job of an engine that this process is in, by the name that the engine's commands take."""
+    array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
+    job = f"{array}_{task}" if array else os.environ.get("SLURM_JOB_ID")
+    return {"job": job} if job else {}
 
 
 def is_alive(directory: Path) -> bool:
@@ -75,7 +82,7 @@ def is_alive(directory: Path) -> bool:
 
 
 def read_start(directory: Path) -> dict[str, Any] | None:
-    """Of the latest attempt: host, process and a token of its own; None before its process is up."""
+    """Of the latest attempt: host, process, an engine's job and a token of its own; None before its process is up."""
     return _read(directory / STARTED)
 
 

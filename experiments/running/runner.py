@@ -174,7 +174,7 @@ class _Run:
         start = read_start(attempt.directory)
         if start and start != attempt.start:
             attempt.start = start
-            where = {key: start[key] for key in ("host", "process") if key in start}
+            where = {key: value for key, value in start.items() if key != "token"}
             self.ledger.append(attempt.job.id, RUNNING, title=attempt.job.title, **where)
 
     def _end(self, attempt: _Attempt, state: State, again: bool) -> None:
