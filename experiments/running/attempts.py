@@ -33,11 +33,8 @@ RESULT, FAILURE, OUTPUT = "result.json", "failure.json", "output.txt"
 RUN = "run"
 """The training run, with its checkpoints."""
 
-STOPPED = 130
-"""Exit code of an attempt that was asked to stop and saved its state."""
-
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-"""An attempt that they ended before it could say so was asked to stop, too."""
+"""What an attempt is asked to stop by. It saves and ends with 128 + n; before it can, with -n."""
 
 
 @dataclass(frozen=True)

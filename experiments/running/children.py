@@ -43,8 +43,7 @@ def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str
 
 def settle() -> None:
     """Called first in a child: takes its cores, arranges to die with its parent and to end in order when asked to."""
-    for number in (signal.SIGTERM, signal.SIGINT):  # also where a shell's background had it ignored
-        signal.signal(number, _interrupt)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
     for number in (signal.SIGUSR1, signal.SIGUSR2):  # Slurm's, for the process above
         signal.signal(number, signal.SIG_IGN)
     cores = os.environ.get(_CORES)
@@ -55,10 +54,6 @@ def settle() -> None:
     parent = int(os.environ.get(_PARENT, "0"))
     if parent:
         _die_with(parent)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    raise KeyboardInterrupt
 
 
 def _die_with(parent: int) -> None:

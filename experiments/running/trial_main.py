@@ -13,23 +13,24 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, STOPPED, attempt
+from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, attempt
 from experiments.running.children import settle
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
 LOOK_EVERY = 30.0
 """Seconds between two looks whether the trial is still ours."""
 
 
 def main(directory: Path) -> int:
-    """0: finished; 1: failed or diverged (see failure.json); STOPPED: will resume."""
+    """FAILED: see failure.json, also where it diverged; STOPPED or INTERRUPTED: the next attempt goes on from here."""
     settle()  # before anything imports JAX
     try:
-        with attempt(directory) as held:
+        with terminated_like_interrupted(), attempt(directory) as held:
             if (directory / RESULT).exists():  # another attempt finished while this one waited
-                return 0
+                return Exit.DONE
             return _run(directory, held.lost)
-    except KeyboardInterrupt:
-        return STOPPED
+    except KeyboardInterrupt as request:
+        return exit_of_interrupt(request)
 
 
 def _run(directory: Path, lost: Callable[[], bool]) -> int:
@@ -40,26 +41,27 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
-    from hma_jax.training.loop import DivergedError, Interrupted
+    from hma_jax.training.divergence import DivergedError
+    from hma_jax.training.loop import Interrupted
 
     job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS, lost)
     try:
         trial, execution = read_job(job)
         run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
-        return 0
-    except Interrupted:
-        return STOPPED
+        return Exit.DONE
+    except Interrupted as request:
+        return request.exit
     except TakenOver as error:
         print(error, file=sys.stderr)
-        return STOPPED
+        return Exit.STOPPED
     except Exception as error:  # the boundary of the process: every failure becomes a record
         traceback.print_exc()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
         state = DIVERGED if isinstance(error, DivergedError) else FAILED
         write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
-        return 1
+        return Exit.FAILED
 
 
 class TakenOver(Exception):
