@@ -32,7 +32,7 @@ from experiments.running.attempts import (
     read_states,
 )
 from experiments.running.launchers.base import Launcher
-from experiments.running.ledger import DIVERGED, FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
+from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
 
 TRIES = 3
 """How often in one command a trial may be lost: what kills it may be its own size."""

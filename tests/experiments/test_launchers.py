@@ -210,22 +210,28 @@ def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_pat
     assert (copy.directory, copy.cache) == (attempt.directory, attempt.cache)
 
 
-def test_sigterm_to_the_engines_process_stops_its_trial_in_order(tmp_path):
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 130), (signal.SIGUSR2, 77)])
+def test_a_signal_to_the_engines_process_stops_its_trial_in_order(tmp_path, sent, code):
+    """SIGTERM of scancel, and SIGUSR2, on which submitit asks for a checkpoint in the signal's handler."""
     program = (
-        "import sys; from pathlib import Path\n"
+        "import signal, sys; from pathlib import Path\n"
         "from experiments.running.launchers.far import Attempt; from tests.experiments import fake_trial\n"
-        "sys.exit(Attempt(Path(sys.argv[1]), Path('compiled'), fake_trial.command).run() % 256)"
+        "attempt = Attempt(Path(sys.argv[1]), Path('compiled'), fake_trial.command)\n"
+        "def announced(*_): attempt.end(); sys.exit(77)\n"
+        "signal.signal(signal.SIGUSR2, announced)\n"
+        "code = attempt.run()\n"
+        "sys.exit(128 - code if code < 0 else code)"
     )
     directory = tmp_path / "trials/a"
     directory.mkdir(parents=True)
     (directory / "job.json").write_text('{"steps": 2000, "seconds": 0.02, "end": "result"}')
     engine = subprocess.Popen([sys.executable, "-c", program, str(directory)])
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while not (directory / "run/count.txt").exists():
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    engine.send_signal(signal.SIGTERM)
-    assert engine.wait(20) == -signal.SIGINT % 256
+    engine.send_signal(sent)
+    assert engine.wait(50) == code
     assert not (directory / "trial.lock").exists(), "it did not leave in order"
 
 

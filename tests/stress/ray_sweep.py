@@ -18,8 +18,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from tests.stress.launched import Sweep, run_here
 
 
@@ -38,9 +36,17 @@ def cluster() -> Iterator[Any]:
         made.shutdown()
 
 
+def parents(process: int) -> Iterator[int]:
+    """The process above a process, the one above that, and so on."""
+    while process > 1:
+        status = Path(f"/proc/{process}/status").read_text()
+        process = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("PPid:"))
+        yield process
+
+
 def raylet_above(made: Any, process: int) -> Any:
     """The node on which a trial's process runs."""
-    above = {p.pid for p in psutil.Process(process).parents()}
+    above = set(parents(process))
     for node in made.worker_nodes:
         if any(info.process.pid in above for info in node.all_processes["raylet"]):
             return node
@@ -49,7 +55,7 @@ def raylet_above(made: Any, process: int) -> Any:
 
 def disturb(sweep: Sweep, made: Any) -> None:
     first = sweep.wait_for("a trial whose worker is killed", sweep.training)
-    psutil.Process(first["process"]).parent().send_signal(signal.SIGKILL)
+    os.kill(next(parents(first["process"])), signal.SIGKILL)
     sweep.wait_for_start("it starts again", first["trial"], 1)
 
     second = sweep.wait_for("a trial whose node is killed", lambda: sweep.training([first["trial"]]))

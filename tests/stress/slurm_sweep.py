@@ -80,6 +80,8 @@ def cluster(root: Path) -> Iterator[dict[str, str]]:
         time.sleep(2)
         for file in [*root.glob("*.pid"), *started]:
             stop_daemon(file)
+        for process in ours(configuration):  # steps of a node that went down outlive it
+            os.kill(process, signal.SIGKILL)
 
 
 def start_munge(root: Path) -> list[Path]:
@@ -98,6 +100,19 @@ def stop_daemon(pid_file: Path) -> None:
         os.kill(int(pid_file.read_text()), signal.SIGTERM)
     except (OSError, ValueError):  # it has ended
         return
+
+
+def ours(configuration: Path) -> list[int]:
+    """What is left of this cluster: processes, but this one, that were told of its configuration."""
+    told = f"SLURM_CONF={configuration}".encode()
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if told in path.read_bytes().split(b"\0"):
+                found.append(int(path.parent.name))
+        except OSError:  # it has ended
+            continue
+    return [process for process in found if process != os.getpid()]
 
 
 def free_ports(count: int) -> list[int]:

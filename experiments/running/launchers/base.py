@@ -70,3 +70,4 @@ class Launcher(ABC):
 
     def __exit__(self, *exc: object) -> None:
         """Leaves the place. Everything launched has ended."""
+        return
