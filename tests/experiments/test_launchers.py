@@ -35,7 +35,7 @@ class FakeSlurm:
     def __init__(self, folder: Path, monkeypatch):
         self.folder, self.arrays, self.states, self.cancelled = folder, [], {}, []
         folder.mkdir()
-        monkeypatch.setattr(slurm, "ask_states", lambda former: dict(self.states))
+        monkeypatch.setattr(slurm, "ask_states", lambda: dict(self.states))
         monkeypatch.setattr(slurm.subprocess, "run", lambda words, **_: self.cancelled.append(words))
 
     def submit_array(self, attempts):
@@ -176,12 +176,18 @@ def test_a_job_that_stopped_is_not_brought_back_by_slurm_beside_the_next_one(sub
     assert fake.cancelled == [["scancel", "7_0"]]
 
 
-def test_a_controller_that_does_not_answer_ends_no_trial(monkeypatch):
+def test_a_controller_that_does_not_answer_ends_no_trial(submitted, monkeypatch):
+    place, fake, handle = submitted
+    monkeypatch.undo()
+
     def run(*_, **__):
         raise subprocess.CalledProcessError(1, "squeue")
 
     monkeypatch.setattr(slurm.subprocess, "run", run)
-    assert slurm.ask_states({"7_0": "RUNNING"}) == {"7_0": "RUNNING"}
+    monkeypatch.setattr(slurm, "LINGER", 0.0)
+    assert slurm.ask_states() is None and place.ended(handle) is None
+    monkeypatch.setattr(slurm, "ask_states", lambda: {"6_0": "RUNNING"})
+    assert place.ended(handle).code is None  # it answers, and knows the job no more
 
 
 def start_attempt(root: Path, kind: type[Attempt] = Attempt) -> tuple[Attempt, threading.Thread, list[int]]:

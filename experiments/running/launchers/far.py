@@ -17,7 +17,6 @@ from experiments.running.attempts import OUTPUT
 from experiments.running.children import child_environment
 from experiments.running.launchers.base import GRACE_SECONDS, Command
 
-
 LOOK_EVERY = 0.1
 """Seconds between two looks whether the child has ended."""
 

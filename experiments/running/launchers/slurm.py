@@ -90,7 +90,7 @@ class SlurmLauncher(Launcher):
         self._root, self._command = root, command
         self._executor = executor or _make_executor(root / "slurm", workers, settings)
         self._asked = -math.inf
-        self._states: dict[str, str] = {}
+        self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
         self._over: dict[str, float] = {}  # when a job was first seen to be over
 
     def launch(self, directories: Sequence[Path]) -> list[Any]:
@@ -103,7 +103,7 @@ class SlurmLauncher(Launcher):
                 jobs += self._executor.submit_array(attempts[first : first + LARGEST_ARRAY])
         except FailedJobError as error:
             raise ConfigError(f"Slurm does not take the jobs: {error}; change --launcher-set") from error
-        self._asked = -math.inf  # what is known is older than these jobs
+        self._asked, self._states = -math.inf, None
         return jobs
 
     def ended(self, handle: Any) -> Ended | None:
@@ -137,7 +137,10 @@ class SlurmLauncher(Launcher):
         """Of one job; all are asked for at once, not more often than is good for the cluster."""
         if time.monotonic() - self._asked >= self.pause:
             self._asked = time.monotonic()
-            self._states = ask_states(self._states)
+            answer = ask_states()
+            self._states = self._states if answer is None else answer
+        if self._states is None:
+            return "UNKNOWN"
         return self._states.get(id, COMPLETED)  # squeue forgets what has been over for a while
 
     def ask_to_stop(self, handles: Sequence[Any]) -> None:
@@ -149,14 +152,14 @@ class SlurmLauncher(Launcher):
         """Slurm has done that by now."""
 
 
-def ask_states(former: dict[str, str]) -> dict[str, str]:
-    """The state of each job of this user, {id: state}; the `former` ones if Slurm does not answer now."""
+def ask_states() -> dict[str, str] | None:
+    """The state of each job of this user, {id: state}; None if Slurm does not answer now."""
     command = ["squeue", "--me", "--array", "--noheader", "--states=all", "--format=%i %T"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     except (OSError, subprocess.SubprocessError) as error:
         log.warning("squeue does not answer (%s); asking again", error)
-        return former
+        return None
     return dict(line.split() for line in done.stdout.splitlines())
 
 
