@@ -57,9 +57,10 @@ def _run(command: str, where: Where, how: How, remake: Remake, axes: tuple[str, 
     commands.run_study(
         setting,
         axes,
-        again=setting.command(command, *how.words(), "--retry-failed"),
+        again=setting.command(command, *how.words(), "--retry-failed", *["--accept-code"] * how.accept_code),
         launcher=Launching(how.launcher, how.workers, how.launcher_set),
         retry_failed=how.retry_failed,
+        accept_code=how.accept_code,
         replace=remake.replace,
     )
 

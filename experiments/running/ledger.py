@@ -22,6 +22,9 @@ LOST, PREEMPTED = "lost", "preempted"
 """Ended without a result, through no fault of its own: its process is gone (killed, out of memory, a machine
 that died), or it was asked to stop and has saved. Both go on from the last checkpoint."""
 
+REFUSED = "refused"
+"""Its sources are not those that the sweep was started with: it did not run, and may the next time."""
+
 MISSING = "missing"
 """The state of a trial without a line: it has not run."""
 

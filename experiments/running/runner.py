@@ -32,7 +32,7 @@ from experiments.running.attempts import (
     read_states,
 )
 from experiments.running.launchers.base import Launcher
-from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
+from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
 
 TRIES = 3
 """How often in one command a trial may be lost: what kills it may be its own size."""
@@ -82,7 +82,7 @@ def run_missing(
     for id, state in before.items():  # an earlier runner ended between an event and its line
         if state.event not in (RUNNING, MISSING) and recorded.get(id, {}).get("event") != state.event:
             run.record(id, state)
-    again = {MISSING, LOST, PREEMPTED} | ({FAILED, DIVERGED} if retry_failed else set())
+    again = {MISSING, LOST, PREEMPTED, REFUSED} | ({FAILED, DIVERGED} if retry_failed else set())
     run.waiting = [(job, before[job.id].event) for job in jobs if before[job.id].event in again]
     run.elsewhere = [job for job in jobs if before[job.id].event == RUNNING]
     try:
@@ -163,6 +163,8 @@ class _Run:
             self.running.remove(attempt)
             state = outcome(attempt.directory, ended)
             self._end(attempt, state, again=self._try_again(attempt.job, state))
+            if state.event == REFUSED:  # as every other one would be
+                self.waiting.clear()
             return
         progress = read_progress(attempt.directory)
         if progress and progress != attempt.shown:
