@@ -16,7 +16,7 @@ from experiments.running.children import settle
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job, run_missing
-from hma_jax.runtime.exits import terminated_like_interrupted
+from hma_jax.runtime.exits import exit_of_interrupt, terminated_like_interrupted
 
 THREE = [Job(f"t{i}", f"trial {i}", {"steps": 8, "seconds": 0.05, "end": "result"}) for i in range(3)]
 
@@ -65,5 +65,8 @@ if __name__ == "__main__":
         run_missing(THREE, root / "trials", Ledger(root / "ledger.jsonl"), launcher(root))
     else:
         settle()
-        with terminated_like_interrupted(), attempt(Path(sys.argv[1])):
-            sys.exit(count_to_the_end(Path(sys.argv[1])))
+        try:
+            with terminated_like_interrupted(), attempt(Path(sys.argv[1])):
+                sys.exit(count_to_the_end(Path(sys.argv[1])))
+        except KeyboardInterrupt as request:
+            sys.exit(exit_of_interrupt(request))
