@@ -17,6 +17,7 @@ from experiments.running.agreement import check_finished, group_by_sources, requ
 from experiments.running.attempts import read_states
 from experiments.running.closure import ROOT, closure_hash, source_hash, trace
 from experiments.running.launchers.local import LocalLauncher
+from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.runner import Job, run_missing
@@ -276,7 +277,7 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
     setting = replace(make_setting(Where("smoke", tmp_path)), study=STUDY)
 
     def run():
-        commands.run_study(setting, commands.SCALING, again="", workers=1, retry_failed=False, accept_code=accept,
+        commands.run_study(setting, commands.SCALING, again="", launcher=Launching(), retry_failed=False, accept_code=accept,
                            replace=None)  # fmt: skip
 
     if accept:
