@@ -129,7 +129,7 @@ def train_trial(
     """
     import jax
 
-    from data_pipelines.loading.loader import make_loader
+    from data_pipelines.loading.loader import describe_batch, make_loader
     from data_pipelines.loading.selection import LoaderConfig, training_table
     from hma_jax.config.json import from_dict
     from hma_jax.training.loop import LoopOptions
@@ -166,6 +166,7 @@ def train_trial(
         },
         modernise_provenance=modernise,
         initial=initial,
+        records=lambda index: describe_batch(store, table, loader, index),
         options=LoopOptions(
             checkpoint_every=checkpoint_every,
             checkpoint_minutes=options.checkpoint_minutes,

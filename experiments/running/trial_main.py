@@ -13,9 +13,10 @@ import traceback
 from pathlib import Path
 
 from experiments.running.children import settle
+from hma_jax.runtime.exits import Exit, terminated_like_interrupted
 
 RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
-STOPPED = 130
+STOPPED = Exit.STOPPED
 """Exit code of a trial that was asked to stop and saved its state."""
 
 
@@ -30,13 +31,15 @@ def main(directory: Path) -> int:
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
-    from hma_jax.training.loop import DivergedError, Interrupted
+    from hma_jax.training.divergence import DivergedError
+    from hma_jax.training.loop import Interrupted
 
     job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS)
     try:
         trial, execution = read_job(job)
-        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
+        with terminated_like_interrupted():  # also while it evaluates
+            run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
     except (Interrupted, KeyboardInterrupt):
         return STOPPED
