@@ -108,7 +108,8 @@ def test_a_trial_that_is_asked_to_stop_while_it_evaluates_says_so(tmp_path, monk
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10)
 
-    (tmp_path / "job.json").write_text("{}")
+    inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
+    (tmp_path / "job.json").write_text(json.dumps({"provenance": inputs}))
     monkeypatch.setattr("experiments.job.read_job", lambda record: (None, None))
     monkeypatch.setattr(trials, "run_trial", asked)
     before = signal.getsignal(signal.SIGTERM)
