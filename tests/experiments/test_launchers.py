@@ -260,6 +260,18 @@ def test_a_ray_worker_that_dies_is_a_lost_trial(tmp_path):
     assert outcome(tmp_path, ended).event == "lost" and "the node died" in ended.why
 
 
+def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):
+    """Ray takes it over, and would abort the command before its trials are asked to save."""
+    before = signal.getsignal(signal.SIGTERM)
+    engine = SimpleNamespace(init=lambda **_: signal.signal(signal.SIGTERM, signal.SIG_DFL))
+    monkeypatch.setitem(sys.modules, "ray", engine)
+    try:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        assert ray._join("auto") is engine and signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 @pytest.mark.parametrize(
     ("said", "words"),
     [

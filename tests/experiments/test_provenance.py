@@ -277,8 +277,8 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
     setting = replace(make_setting(Where("smoke", tmp_path)), study=STUDY)
 
     def run():
-        commands.run_study(setting, commands.SCALING, again="", launcher=Launching(), retry_failed=False, accept_code=accept,
-                           replace=None)  # fmt: skip
+        commands.run_study(setting, commands.SCALING, again="", launcher=Launching(), retry_failed=False,
+                           accept_code=accept, replace=None)  # fmt: skip
 
     if accept:
         run()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.running import runner
+from experiments.running import runner, trial_main
 from experiments.running.attempts import attempt, read_states
 from experiments.running.children import child_environment
 from experiments.running.ledger import Ledger
@@ -192,6 +192,18 @@ def test_a_child_uses_huge_pages_unless_the_user_said_otherwise(monkeypatch):
     assert child_environment(Path("compiled"))["GLIBC_TUNABLES"] == KEPT_PAGES["GLIBC_TUNABLES"]
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.hugetlb=0")
     assert child_environment(Path("compiled"))["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=0"
+
+
+def test_a_trial_that_lost_its_lease_stops_for_the_one_that_took_over(tmp_path, monkeypatch):
+    """A machine that was cut off for longer than its lease finds out when it is back."""
+    monkeypatch.setattr(trial_main, "LOOK_EVERY", 0.0)
+    with attempt(tmp_path) as held:
+        report = trial_main._ProgressFile(tmp_path / "progress.json", held.lost)
+        report("training", 1, 2)
+        (tmp_path / "trial.lock").unlink()
+        with attempt(tmp_path), pytest.raises(trial_main.TakenOver, match="another attempt"):
+            report("training", 2, 2)
+    assert json.loads((tmp_path / "progress.json").read_text())["done"] == 1
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the setting is glibc's")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -104,8 +105,11 @@ def _join(address: str) -> Any:
         import ray
     except ImportError:
         raise ConfigError("--launcher ray needs Ray: pip install 'hma-jax[ray]'") from None
+    before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level="warning")
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)  # Ray's would abort this process, before trials are asked to save
     except (ConnectionError, TimeoutError, RuntimeError) as error:
         raise ConfigError(
             f"no Ray cluster at {address} ({error}); start one with `ray start --head`, or name its head with "
