@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments.preparing.made_from import Step
-from experiments.setting import UNSET
+from experiments.setting import UNSET, require_local
 
 
 @dataclass(frozen=True)
@@ -41,3 +41,6 @@ class OneModel:
     """Directory of the training run. Resumed if it exists."""
     trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Trajectories of each robot, chosen by hash: the same as in a sweep over trajectories."""
+
+    def __post_init__(self):
+        require_local("--run", self.run)

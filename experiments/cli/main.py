@@ -1,7 +1,8 @@
 """The program `hma`: its commands, and what an error becomes.
 
 Exit codes: 0 done; 1 the work failed (data, a trial, a full disk); 2 wrong arguments or
-configuration; 130 interrupted; 143 asked to stop by SIGTERM. `--debug` or HMA_DEBUG=1 shows the traceback of an
+configuration; 75 another process of the same program is lost or failed (docs/hosts.md); 130 interrupted; 143 asked
+to stop by SIGTERM. `--debug` or HMA_DEBUG=1 shows the traceback of an
 error.
 """
 
@@ -60,17 +61,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
                 args=arguments or ["--help"],
             )
+            _end_together()
         return 0
     except KeyboardInterrupt as request:
         stopped = isinstance(request, Terminated)
         _say(f"{'stopped by SIGTERM' if stopped else 'interrupted'}; the same command goes on from here")
+        _end_together(request, 143 if stopped else 130)
         return 143 if stopped else 130
     except Exception as error:  # the boundary of the program
         code = _exit_code(error)
         if debug or code is None:
+            _end_together(error, code or 1)
             raise
         _say(f"error: {_words(error)}")
+        _end_together(error, code)
         return code
+
+
+def _end_together(error: BaseException | None = None, code: int = 0) -> None:
+    """With other processes, where there are any: none is left waiting for one that ends."""
+    if "hma_jax.runtime.processes" in sys.modules:  # otherwise none was started
+        from experiments.cli.hosts import end_together
+
+        end_together(error, code)
 
 
 class Terminated(KeyboardInterrupt):
