@@ -10,8 +10,8 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from experiments.ledger import DIVERGED, FINISHED
 from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference
+from experiments.running.ledger import DIVERGED, FINISHED
 from experiments.sweep import Sweep
 
 LOSSES = {"cross_entropy": OVERALL, LOSS: TRAINING}

@@ -13,8 +13,8 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from experiments.ledger import FINISHED
-from experiments.runner import Job, Monitor, State
+from experiments.running.ledger import FINISHED
+from experiments.running.runner import Job, Monitor, State
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)

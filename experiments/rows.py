@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.ledger import FINISHED
 from experiments.provenance import Provenance
-from experiments.runner import State
+from experiments.running.ledger import FINISHED
+from experiments.running.runner import State
 from experiments.sweep import POINT, Point, Sweep
 from experiments.trial import trial_id
 from hma_jax.config import ConfigError

@@ -127,7 +127,7 @@ def train_trial(
     A model that is not new has a `table` of its own (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.
     """
-    from data_pipelines.loading.loader import make_loader
+    from data_pipelines.loading.loader import describe_batch, make_loader
     from data_pipelines.loading.selection import LoaderConfig, training_table
     from hma_jax.config.json import from_dict
     from hma_jax.runtime.rows import own_rows
@@ -164,6 +164,7 @@ def train_trial(
         },
         modernise_provenance=modernise,
         initial=initial,
+        records=lambda index: describe_batch(store, table, loader, index),
         options=LoopOptions(
             checkpoint_every=checkpoint_every,
             checkpoint_minutes=options.checkpoint_minutes,

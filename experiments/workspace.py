@@ -83,15 +83,16 @@ class Workspace:
         return self.root / "study.json"
 
     @contextmanager
-    def claimed(self) -> Iterator[None]:
-        """Makes the directory and holds the right to write in it; a lock that dies with its process.
+    def claimed(self, lock: str = ".lock") -> Iterator[None]:
+        """Makes the directory and holds the right to write in it, or what another `lock` is for; it dies with its
+        process.
 
         Raises ConfigError if the directory cannot be written, Busy if another process holds it.
         """
         with ExitStack() as stack:
             try:
                 self.root.mkdir(parents=True, exist_ok=True)
-                stack.enter_context(exclusive(self.root / ".lock"))
+                stack.enter_context(exclusive(self.root / lock))
             except Held as held:
                 raise Busy(
                     f"another command is at work in {self.root} ({held.who}); wait for it or choose another --out",

@@ -21,6 +21,7 @@ from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.mixture import make_mixture
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
 from data_pipelines.sampling.splits import held_out_episodes
+from data_pipelines.sources.identity import describe
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.rlds.location import OpenFiles
@@ -49,7 +50,7 @@ def make_frame_loader(
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: float = MAX_SKIPPED,
     threads: int = 2,
-) -> Iterator[np.ndarray]:
+) -> FrameLoader:
     """Endless batches of frames, uint8 [B, image_size, image_size, 3].
 
     Datasets are drawn with p ∝ episodes^(1/tau), episodes and frames within them uniformly.
@@ -78,7 +79,22 @@ def make_frame_loader(
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads, AHEAD))
     iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
-    return iterator
+    return FrameLoader(batches, iterator)
+
+
+@dataclass(frozen=True)
+class FrameLoader(Iterator[np.ndarray]):
+    """Batches one after the other, and what each is made of."""
+
+    batches: _Batches
+    iterator: Iterator[np.ndarray]
+
+    def __next__(self) -> np.ndarray:
+        return next(self.iterator)
+
+    def describe(self, step: int) -> list[str]:
+        """The episodes that batch `step` (from 0 on) takes frames of: dataset, file and episode."""
+        return self.batches.describe(step)
 
 
 @dataclass(frozen=True)
@@ -92,7 +108,7 @@ class _Stream:
 
     def read(self, i: int, draws: np.ndarray, size: int) -> list[np.ndarray]:
         """A frame per number of `draws` (uint64) out of the i-th episode drawn; see `EpisodeSource.frames`."""
-        at = int(endless_shuffle(i, len(self.episodes), self.seed))
+        at = self._drawn(i)
         for k in range(len(self.episodes)):  # the drawn episode or, under 'skip', the next usable one
             episode = int(self.episodes[(at + k) % len(self.episodes)])
             try:
@@ -100,6 +116,14 @@ class _Stream:
             except EpisodeError as error:
                 self.source.skip(error)
         raise DataError(f"{self.source.name}: none of its {len(self.episodes)} episodes can be read")
+
+    def describe(self, i: int) -> str:
+        """The i-th episode drawn, for people."""
+        number = int(self.source.numbers[self.episodes[self._drawn(i)]])
+        return f"{self.source.name}: {describe(self.source.runs, number)}"
+
+    def _drawn(self, i: int) -> int:
+        return int(endless_shuffle(i, len(self.episodes), self.seed))
 
 
 @dataclass(frozen=True)
@@ -117,8 +141,7 @@ class _Batches:
 
     def __getitem__(self, step: int) -> np.ndarray:
         """uint8 [batch, H, W, 3]."""
-        groups = self.batch // self.group
-        streams, positions = self.draws.at(step * groups + np.arange(groups))
+        streams, positions = self._chosen(step)
         seeds = np.asarray([self.streams[d].seed for d in streams], np.uint64)
         draws = hash64(positions[:, None] * self.group + np.arange(self.group), seeds[:, None])
         frames = np.empty((self.batch, self.size, self.size, 3), np.uint8)
@@ -128,3 +151,11 @@ class _Batches:
                 frames[row] = fit_image(image, self.size)
                 row += 1
         return frames
+
+    def describe(self, step: int) -> list[str]:
+        return [self.streams[d].describe(i) for d, i in zip(*map(np.ndarray.tolist, self._chosen(step)), strict=True)]
+
+    def _chosen(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """(dataset, how many were drawn of it before) of every group."""
+        groups = self.batch // self.group
+        return self.draws.at(step * groups + np.arange(groups))

@@ -15,6 +15,7 @@ import numpy as np
 from data_pipelines.loading.selection import LoaderConfig, TrainingWindows, select_windows
 from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, random_below, stream_seed
+from data_pipelines.sources.identity import describe
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.windows import WindowSet
 from hma_jax.config import require
@@ -58,6 +59,14 @@ def make_loader(
     return iterator
 
 
+def describe_batch(store: TokenStore, table: EmbodimentTable, config: LoaderConfig, step: int) -> list[str]:
+    """The windows of the global batch of `step` (from 0 on), row by row: dataset, file and episode, first frame.
+
+    Raises what `make_loader` raises.
+    """
+    return _Batches(store, table, select_windows(store, config), config, np.arange(config.batch)).describe(step)
+
+
 class _Batches:
     """Element s: `rows` of the global batch of step s."""
 
@@ -80,11 +89,17 @@ class _Batches:
         return ENDLESS // self._batch
 
     def __getitem__(self, step: int) -> dict[str, np.ndarray]:
+        rows = [self._streams[d].read(i, at) for d, i, at in self._chosen(step)]
+        return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+
+    def describe(self, step: int) -> list[str]:
+        return [self._streams[d].describe(at) for d, _, at in self._chosen(step)]
+
+    def _chosen(self, step: int) -> Iterator[tuple[int, int, int]]:
+        """(dataset, how many were drawn of it before, window) of every row."""
         dataset, draw = self._draws.at(step * self._batch + self._rows)
         window = endless_shuffle(draw, self._lengths[dataset], self._seeds[dataset])
-        chosen = zip(dataset.tolist(), draw.tolist(), window.tolist(), strict=True)
-        rows = [self._streams[d].read(i, at) for d, i, at in chosen]
-        return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+        return zip(dataset.tolist(), draw.tolist(), window.tolist(), strict=True)
 
 
 class _Stream:
@@ -96,6 +111,14 @@ class _Stream:
         self.action_width = table.action_width
         self.shuffle_actions = config.shuffle_actions
         self.action_seed = stream_seed(config.seed, "shuffled actions", windows.name)
+
+    def describe(self, at: int) -> str:
+        """Window `at` for people: where it was read from."""
+        episode, start = self.windows.locate(at)
+        manifest = self.store.manifest(self.windows.name)
+        number = manifest.train.episodes[episode]
+        place = describe(manifest.runs, number) if manifest.runs else f"episode {number}"
+        return f"{self.windows.name}: {place}, from frame {start * manifest.frame_step}"
 
     def read(self, i: int, at: int) -> dict[str, np.ndarray]:
         """Window `at`, the i-th ever drawn of this dataset."""

@@ -1,21 +1,15 @@
 """The program `hma`: its commands, and what an error becomes.
 
-Exit codes: 0 done; 1 the work failed (data, a trial, a full disk); 2 wrong arguments or
-configuration; 75 another process of the same program is lost or failed (docs/hosts.md); 130 interrupted; 143 asked
-to stop by SIGTERM. `--debug` or HMA_DEBUG=1 shows the traceback of an
-error.
+Exit codes are those of `hma_jax.runtime.exits`. `--debug` or HMA_DEBUG=1 shows the traceback of an error.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
-import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 from tyro.extras import SubcommandApp
 
@@ -25,6 +19,7 @@ from experiments.commands.study import TrialsFailed
 from experiments.program import PROGRAM
 from experiments.progress import errors
 from hma_jax.config import ConfigError
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
 app = SubcommandApp()
 app.command(name="study")(study.study)
@@ -55,19 +50,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if own_process and not debug:
         _silence_background()
     try:
-        with _terminated_like_interrupted():
+        with terminated_like_interrupted():
             app.cli(
                 prog=PROGRAM,
                 description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
                 args=arguments or ["--help"],
             )
             _end_together()
-        return 0
+        return Exit.DONE
     except KeyboardInterrupt as request:
-        stopped = isinstance(request, Terminated)
-        _say(f"{'stopped by SIGTERM' if stopped else 'interrupted'}; the same command goes on from here")
-        _end_together(request, 143 if stopped else 130)
-        return 143 if stopped else 130
+        code = exit_of_interrupt(request)
+        _say(f"{'stopped by SIGTERM' if code == Exit.STOPPED else 'interrupted'}; the same command goes on from here")
+        _end_together(request, code)
+        return code
     except Exception as error:  # the boundary of the program
         code = _exit_code(error)
         if debug or code is None:
@@ -86,27 +81,6 @@ def _end_together(error: BaseException | None = None, code: int = 0) -> None:
         end_together(error, code)
 
 
-class Terminated(KeyboardInterrupt):
-    """SIGTERM, as schedulers and `kill` send it: the program ends as it does on Ctrl-C."""
-
-
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """Trials save their state, and the last line says how to go on; by default the process would just be gone."""
-
-    def stop(number: int, frame: object) -> None:
-        raise Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may install handlers
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def _silence_background() -> None:
     """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
     pages of their own, from threads and destructors where nothing can catch it, until the very
@@ -117,19 +91,22 @@ def _silence_background() -> None:
     logging.getLogger("asyncio").setLevel(logging.CRITICAL)
 
 
-def _exit_code(error: Exception) -> int | None:
+def _exit_code(error: Exception) -> Exit | None:
     """None for what is not the user's business: a bug, shown with its traceback."""
     from data_pipelines.errors import DataError
 
     if isinstance(error, ConfigError):
-        return 2
+        return Exit.REFUSED
     if isinstance(error, (DataError, TrialsFailed, OSError)):
-        return 1
+        return Exit.FAILED
     if "jax" in sys.modules:  # otherwise none of these can have been raised
-        from hma_jax.training.loop import DivergedError, Interrupted
+        from hma_jax.training.divergence import DivergedError
+        from hma_jax.training.loop import Interrupted
 
-        if isinstance(error, (DivergedError, Interrupted)):
-            return 130 if isinstance(error, Interrupted) else 1
+        if isinstance(error, DivergedError):
+            return Exit.DIVERGED
+        if isinstance(error, Interrupted):
+            return error.exit
     return None
 
 

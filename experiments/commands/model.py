@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,12 +148,20 @@ def say_data(trial: Trial, materials: Materials) -> None:
 
 
 def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
-    from experiments.trial import evaluate_on, open_materials, write_evaluation
-    from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
+    from hma_jax.training.claim import EVALUATION, claimed
     from hma_jax.training.runs import load_model
 
     trained = load_model(run, setting.study.execution, weights).run
+    with claimed(run, EVALUATION) if is_writer() else nullcontext():  # before the work: that its results can be written, and by nobody else
+        _evaluate(setting, run, trained)
+
+
+def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
+    from experiments.trial import evaluate_on, open_materials, write_evaluation
+    from hma_jax.evaluation.windows import FILE
+    from hma_jax.runtime.processes import is_writer
+
     require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)

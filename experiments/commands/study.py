@@ -5,11 +5,13 @@ Every command ends by saying what it wrote and what to run next.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.text import Text
 
+from data_pipelines.publishing.claims import pauses_between_looks
 from experiments import (
     ablate_conditioning,
     ablate_settings,
@@ -18,15 +20,15 @@ from experiments import (
     scale_width,
     transfer_lr,
 )
-from experiments.ledger import FINISHED, Ledger
 from experiments.preparing.made_from import Step, require_same
 from experiments.program import command_line
 from experiments.progress import SweepMonitor, console
-from experiments.runner import Job, State, read_states, run_missing
+from experiments.running.ledger import FINISHED, Ledger
+from experiments.running.runner import Job, State, read_states, run_missing
 from experiments.setting import Setting, short
 from experiments.study import Study
 from experiments.sweep import titles, unique_trials
-from experiments.workspace import Record, Workspace, find_record, load_record, save_record
+from experiments.workspace import Busy, Record, Workspace, find_record, load_record, save_record
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 
@@ -122,7 +124,17 @@ def run_jobs(
 
 
 def draw(workspace: Workspace, record: Record) -> None:
-    """CSV, figures and page from whatever trials are finished."""
+    """CSV, figures and page from whatever trials are finished, by one process at a time: others wait."""
+    for pause in pauses_between_looks():
+        try:
+            with workspace.claimed(".report.lock"):
+                _draw(workspace, record)
+            return
+        except Busy:
+            time.sleep(pause)
+
+
+def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.optima import Optimum, find_optima
     from experiments.report.page import write_report
     from experiments.report.plots import plot_overview, plot_sweep

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
+from data_pipelines.publishing.files import publish, write_file
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -81,7 +80,7 @@ def make_tokenizer(
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there
     that was made from other inputs, unless `replace` allows it.
     """
-    from data_pipelines.loading.frames import make_frame_loader
+    from data_pipelines.loading.frames import FrameLoader, make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
@@ -94,7 +93,7 @@ def make_tokenizer(
     if _in_place(workspace.tokenizer, made_from, replace):
         return
 
-    def frames(start: int, split: str = "train") -> Iterator[np.ndarray]:
+    def frames(start: int, split: str = "train") -> FrameLoader:
         return make_frame_loader(
             sources, config.image_size, train.batch, train.seed, start_step=start, tau=study.tau, split=split,
             **{name: getattr(settings, name) for name in HELD_OUT},
@@ -107,11 +106,13 @@ def make_tokenizer(
             config, train, frames, aside, provenance=to_dict(made_from),
             options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
+            records=lambda index: frames(0).describe(index),
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, frames(0, "val"))
     console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
     write_file(aside / QUALITY, json.dumps(quality))
-    _publish(aside, workspace.tokenizer, made_from)
+    made_from.save(aside)
+    publish(aside, workspace.tokenizer)
 
 
 def _in_place(place: Path, made_from: MadeFrom, replace: Step | None) -> bool:
@@ -158,18 +159,8 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
     aside = workspace.root / "tokenizer.adopted"
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
-    _publish(aside, place, made_from)
-
-
-def _publish(aside: Path, place: Path, made_from: MadeFrom) -> None:
-    """Puts a finished directory in place of whatever is there."""
     made_from.save(aside)
-    gone = place.with_name(f".{place.name}.removed")
-    shutil.rmtree(gone, ignore_errors=True)
-    if place.exists():
-        os.replace(place, gone)
-    os.replace(aside, place)
-    shutil.rmtree(gone, ignore_errors=True)
+    publish(aside, place)
 
 
 def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> dict[str, float]:

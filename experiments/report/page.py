@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from experiments.ledger import FINISHED
 from experiments.optima import Optimum
 from experiments.provenance import Provenance
 from experiments.report.pieces import card, frames, picture, pm, section, table
@@ -23,7 +22,8 @@ from experiments.report.plot_style import drawn_metrics
 from experiments.report.style import CSS
 from experiments.report.sweeps import GAINS, TITLES, describe
 from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve, load_result
-from experiments.runner import State
+from experiments.running.ledger import FINISHED
+from experiments.running.runner import State
 from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from experiments.trial import Trial, trial_id
 from experiments.workspace import Record, Workspace

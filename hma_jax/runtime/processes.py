@@ -8,12 +8,14 @@ users, docs/hosts.md says all of it.
 from __future__ import annotations
 
 import os
+import secrets
 import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -115,8 +117,21 @@ def start(asked: Processes) -> None:
             "same address and that process 0 can be reached there"
         ) from error
     if jax.process_count() > 1:
-        hosts = tell("host", socket.gethostname())
-        watchdog.watch(_state().client, jax.process_index(), hosts, _state().coordinator_address, asked.lost_after)
+        _watch(asked.lost_after)
+
+
+def _watch(lost_after: float) -> None:
+    me, hosts = jax.process_index(), tell("host", socket.gethostname())
+    word, host = secrets.token_hex(8), _state().coordinator_address.rpartition(":")[0]
+    if me == 0:
+        board = watchdog.Board(word)
+        from_writer("watchdog", f"{board.port} {word}")
+        exchange, port = board.exchange, board.port
+    else:
+        said, word = from_writer("watchdog", "").split()
+        port = int(said)
+        exchange = partial(watchdog.visit, host.strip("[]"), port, word)
+    watchdog.watch(me, hosts, exchange, f"{host}:{port}", lost_after)
 
 
 def end(error: BaseException | None = None, code: int = 0) -> None:

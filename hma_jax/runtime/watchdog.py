@@ -1,12 +1,14 @@
 """Several processes watch over each other: one that is lost, or fails, ends all of them, by name.
 
-A collective waits for ever for a process that is gone, on most platforms without a word. So every process leaves a
-sign of life with the coordinator (process 0) once a second and reads those of the others. A process
-whose sign has not changed for `lost_after` seconds is lost; so is the coordinator if it has not answered for as
-long, or refuses connections, which only a coordinator that has ended does. Who finds that out says whom it misses
-and ends with LOST: nothing of what was computed since the last checkpoint could be saved without the lost one.
+A collective waits for ever for a process that is gone, on most platforms without a word. So every process gives a
+sign of life to the coordinator (process 0) once a second, in a connection of its own, and is told those of the
+others. A process whose sign has not changed for `lost_after` seconds is lost; so is the coordinator if it has not
+answered for as long, or refuses connections, which only one that has ended does. Who finds that out says whom it
+misses and ends with Exit.LOST: nothing of what was computed since the last checkpoint could be saved without it.
 
-A cut of the network that is shorter than `lost_after` does nothing: connections go on when it is over.
+A cut of the network that is shorter than `lost_after` does nothing: connections go on when it is over. (JAX's own
+heartbeats name nobody, and its service closes connections that are silent in the middle of an answer for 20
+seconds: the less is said there, the longer a cut may last.)
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import json
 import os
 import signal
 import socket
+import socketserver
 import sys
 import threading
 import time
@@ -23,15 +26,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax
-
-LOST = 75
-"""Exit code of a process that misses another one (EX_TEMPFAIL of sysexits.h): start all of them again."""
+from hma_jax.runtime.exits import Exit
 
 EVERY = 1.0  # seconds between two signs of life
 GRACE = 2.0  # seconds: all may fail in the same way, and then each says so itself
-KEY = "hma/alive/"
+PATIENCE = 3.0  # seconds for one exchange of signs
+LONGEST = 2**12  # bytes of a sign
 DONE, FAILED = "done", "failed"
+
+Sign = list[Any]
+"""[count], [DONE] or [FAILED, message]."""
 
 
 @dataclass
@@ -43,7 +47,7 @@ class Signs:
     address: str  # of the coordinator
     lost_after: float  # seconds
     clock: Callable[[], float] = time.monotonic
-    last: dict[int, tuple[list[Any], float]] = field(default_factory=dict)  # of each process, and when it came
+    last: dict[int, tuple[Sign, float]] = field(default_factory=dict)  # of each process, and when it came
     answered: float = 0.0  # when the coordinator was heard of last
     refused: bool = False  # it takes no connections any more
 
@@ -51,7 +55,7 @@ class Signs:
         self.answered = self.clock()
         self.last = {p: ([], self.answered) for p in range(len(self.hosts))}
 
-    def hear(self, signs: dict[int, list[Any]]) -> None:
+    def hear(self, signs: dict[int, Sign]) -> None:
         """The coordinator answered with everybody's last sign."""
         now = self.answered = self.clock()
         self.refused = False
@@ -81,36 +85,75 @@ class Signs:
         return f"process {process} of {len(self.hosts)} on host {self.hosts[process]}"
 
 
-class Watchdog:
-    """Leaves this process's signs and judges those of the others, in threads of its own."""
+class Board(socketserver.ThreadingTCPServer):
+    """Where process 0 keeps everybody's last sign: whoever brings one, and the program's `word`, is told all of them."""
 
-    def __init__(self, client: Any, signs: Signs, leave: Callable[[str], None]):
-        """`client` is JAX's, of its coordination service; `leave` is told the verdict."""
-        self._client, self.signs, self._leave = client, signs, leave
-        self._count, self._over = 0, threading.Event()
+    daemon_threads, allow_reuse_address, request_queue_size = True, True, 1024
+
+    def __init__(self, word: str):
+        super().__init__(("", 0), _Visit)
+        self.word, self.signs = word, dict[int, Sign]()
+        threading.Thread(target=self.serve_forever, name="signs of life", daemon=True).start()
+
+    @property
+    def port(self) -> int:
+        return self.server_address[1]
+
+    def exchange(self, process: int, sign: Sign) -> dict[int, Sign]:
+        self.signs[process] = sign
+        return dict(self.signs)
+
+    def handle_error(self, *_: Any) -> None:
+        """A visitor that broke off comes again."""
+
+
+class _Visit(socketserver.StreamRequestHandler):
+    timeout = PATIENCE
+
+    def handle(self) -> None:
+        word, process, sign = json.loads(self.rfile.readline(LONGEST))
+        if word == self.server.word:
+            self.wfile.write(json.dumps([*self.server.exchange(process, sign).items()]).encode() + b"\n")
+
+
+def visit(host: str, port: int, word: str, process: int, sign: Sign) -> dict[int, Sign]:
+    """Brings a sign to the board there. Raises OSError; ConnectionRefusedError means that its process has ended."""
+    with socket.create_connection((host, port), timeout=PATIENCE) as line, line.makefile("rb") as answers:
+        line.sendall(json.dumps([word, process, sign]).encode() + b"\n")
+        answer = answers.readline()
+    if not answer.endswith(b"\n"):
+        raise ConnectionResetError("it broke off")
+    return {int(p): sign for p, sign in json.loads(answer)}
+
+
+class Watchdog:
+    """Gives this process's signs and judges those of the others, in threads of its own."""
+
+    def __init__(self, signs: Signs, exchange: Callable[[int, Sign], dict[int, Sign]], leave: Callable[[str], None]):
+        """`exchange(process, sign)` is `Board.exchange` or `visit`; `leave` is told the verdict."""
+        self.signs, self._exchange, self._leave = signs, exchange, leave
+        self._over = threading.Event()
         for work in (self._beat, self._judge):
             threading.Thread(target=work, name=f"watchdog{work.__name__}", daemon=True).start()
 
-    def end(self, *sign: str) -> None:
-        """The last sign of this process: (DONE,) or (FAILED, message). It judges no more."""
+    def end(self, sign: Sign) -> None:
+        """The last sign of this process, which judges no more."""
         self._over.set()
         try:
-            self._write(list(sign))
-        except jax.errors.JaxRuntimeError as error:  # the coordinator is gone: nobody is left to tell
+            self._exchange(self.signs.process, sign)
+        except OSError as error:
             print(f"note: the other processes could not be told ({error})", file=sys.stderr)
 
-    def _write(self, sign: list[Any]) -> None:
-        self._client.key_value_set(f"{KEY}{self.signs.process}", json.dumps(sign), allow_overwrite=True)
-
     def _beat(self) -> None:
+        count = 0
         while not self._over.is_set():
-            self._count += 1
+            count += 1
             try:
-                self._write([self._count])
-                found = self._client.key_value_dir_get(KEY)
-                self.signs.hear({int(key.rpartition("/")[2]): json.loads(sign) for key, sign in found})
-            except jax.errors.JaxRuntimeError:  # it cannot be reached: `_judge` counts for how long
-                self.signs.refused = _refuses(self.signs.address)
+                self.signs.hear(self._exchange(self.signs.process, [count]))
+            except ConnectionRefusedError:
+                self.signs.refused = True
+            except (OSError, ValueError):  # for now; `_judge` counts for how long
+                pass
             self._over.wait(EVERY)
 
     def _judge(self) -> None:
@@ -120,11 +163,11 @@ class Watchdog:
                 self._leave(verdict)
 
 
-def watch(client: Any, process: int, hosts: list[str], address: str, lost_after: float) -> None:
-    """From now on this process ends with LOST when another one of the program is lost."""
+def watch(process: int, hosts: list[str], exchange: Callable[..., dict[int, Sign]], address: str, seconds: float) -> None:
+    """From now on this process ends with Exit.LOST when another one has given no sign for `seconds`."""
     global _watchdog
     _keep_aborting_threads()
-    _watchdog = Watchdog(client, Signs(process, hosts, address, lost_after), _leave)
+    _watchdog = Watchdog(Signs(process, hosts, address, seconds), exchange, _leave)
 
 
 def finish(error: str | None = None, *, perhaps_lost: bool = False) -> None:
@@ -137,31 +180,20 @@ def finish(error: str | None = None, *, perhaps_lost: bool = False) -> None:
     if watchdog is None:
         return
     if error is None:
-        watchdog.end(DONE)
+        watchdog.end([DONE])
         return
     if perhaps_lost:
         time.sleep(watchdog.signs.lost_after + GRACE + EVERY)
-    watchdog.end(FAILED, error)
-    time.sleep(GRACE + EVERY)  # the others read it before the coordinator may be gone
+    watchdog.end([FAILED, error[: LONGEST // 8]])
+    time.sleep(GRACE + 2 * EVERY)  # the others read it before the coordinator may be gone
 
 
 _watchdog: Watchdog | None = None
 
 
 def _leave(verdict: str) -> None:
-    print(f"error: {verdict} (exit code {LOST})", file=sys.stderr, flush=True)
-    os._exit(LOST)  # threads wait inside of collectives and would hold up any other end
-
-
-def _refuses(address: str) -> bool:
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=2).close()
-    except ConnectionRefusedError:
-        return True
-    except OSError:
-        return False
-    return False
+    print(f"error: {verdict} (exit code {Exit.LOST})", file=sys.stderr, flush=True)
+    os._exit(Exit.LOST)  # threads wait inside of collectives and would hold up any other end
 
 
 def _keep_aborting_threads() -> None:

@@ -24,6 +24,7 @@ from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.network import from_pixels
 from hma_jax.tokenizers.quantizer import commitment, entropies, quantize
+from hma_jax.training.divergence import Records
 from hma_jax.training.loop import LoopOptions, Progress, Start, fit
 from hma_jax.training.state import FINITE, TrainState, all_finite, with_sharding
 
@@ -37,11 +38,12 @@ def train_tokenizer(
     provenance: dict[str, Any] | None = None,
     options: LoopOptions = LoopOptions(),
     progress: Progress | None = None,
+    records: Records = lambda index: (),
 ) -> AutoencoderTokenizer:
     """Trains, or goes on training, in `run_dir`; saves the tokenizer there and returns it.
 
     `make_batches(start)` yields uint8 images [B, image_size, image_size, 3] from step `start`
-    on; `provenance` says where they come from. Raises DivergedError, Interrupted, and
+    on; `provenance` says where they come from, `records` what a batch is made of. Raises DivergedError, Interrupted, and
     CheckpointError when `run_dir` holds a run of another configuration or other images.
     """
     declared = declare_tokenizer(config)
@@ -62,7 +64,7 @@ def train_tokenizer(
         make_batches,
         steps=train.steps,
         run_dir=run_dir,
-        about=Start(described, modernise=_modernise),
+        about=Start(described, modernise=_modernise, records=records),
         options=options,
         progress=progress,
     )

@@ -1,4 +1,4 @@
-"""One process trains in a run directory at a time."""
+"""One process trains in a run directory at a time, and one evaluates what is in it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.locks import Held, exclusive
+from hma_jax.runtime.locks import Held, Lock, exclusive
 
-NAME = ".lock"
+NAME, EVALUATION = ".lock", ".evaluation.lock"
 
 
 class RunBusy(Held):
-    """Another process trains in the directory."""
+    """Another process works in the directory."""
 
 
 def is_address(path: Path) -> bool:
@@ -23,9 +23,9 @@ def is_address(path: Path) -> bool:
 
 
 @contextmanager
-def claimed(run_dir: Path) -> Iterator[None]:
-    """Makes `run_dir` and holds it. Raises RunBusy naming the process that holds it already, and
-    ConfigError if it cannot be written."""
+def claimed(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
+    """Makes `run_dir` and holds it: to train in it or, with EVALUATION, to write the evaluation of its model.
+    Raises RunBusy naming the process that holds it already, and ConfigError if it cannot be written."""
     require(
         not is_address(run_dir),
         f"a run directory must be one of a file system, got the address {run_dir}; mount the bucket, or choose a disk "
@@ -34,11 +34,11 @@ def claimed(run_dir: Path) -> Iterator[None]:
     with ExitStack() as stack:
         try:
             run_dir.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(exclusive(run_dir / NAME))
+            lock = stack.enter_context(exclusive(run_dir / name))
         except Held as held:
+            what, how = ("evaluated", "") if name == EVALUATION else ("trained in", " (Ctrl-C saves first)")
             raise RunBusy(
-                f"{run_dir} is being trained in by {held.who}; wait for it or stop it (Ctrl-C saves first), or "
-                "choose another run directory",
+                f"{run_dir} is being {what} by {held.who}; wait for it or stop it{how}, or choose another run directory",
                 held.holder,
             ) from None
         except OSError as error:
@@ -46,4 +46,4 @@ def claimed(run_dir: Path) -> Iterator[None]:
                 f"cannot write to the run directory {run_dir}: {error.strerror}; choose another output directory "
                 "or fix its permissions"
             ) from error
-        yield
+        yield lock

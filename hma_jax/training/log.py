@@ -34,6 +34,8 @@ def open_log(run_dir: Path, start: int, steps: int, **how: Any) -> RunLog | List
 class Listener:
     """A log that writes nothing, of a process that is not the writer."""
 
+    run_dir = None
+
     def __init__(self, steps: int, progress: Progress | None):
         self.steps, self.progress = steps, progress
         self.losses: list[float] = []

@@ -11,12 +11,12 @@ Files of a run directory:
     execution.jsonl   one line per start of the run: from which step, how and on what it is computed
     tensorboard/      the same for TensorBoard
     checkpoints/      see `checkpoints`; damaged/ holds those that were passed over
+    diverged.json     of the last step that was not finite: its number, and the records of its batch
     .lock             held by the process that trains, see `claim`
 """
 
 from __future__ import annotations
 
-import math
 import signal
 import threading
 import time
@@ -28,19 +28,22 @@ from typing import Any
 
 import jax
 
+from hma_jax.runtime.exits import Exit
+from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer
-from hma_jax.training.checkpoints import Checkpoints, Description
+from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.claim import claimed
+from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Listener, Progress, RunLog, open_log
 from hma_jax.training.state import FINITE
 
 
-class DivergedError(RuntimeError):
-    """A loss, gradient or update became infinite or NaN. The last good checkpoint is kept."""
-
-
 class Interrupted(RuntimeError):
-    """The run was asked to stop (Ctrl-C, SIGTERM) and saved its state first."""
+    """The run was asked to stop (Ctrl-C, SIGTERM) and saved its state first. `exit` is the code to end with."""
+
+    def __init__(self, message: str, exit: Exit = Exit.INTERRUPTED):
+        super().__init__(message)
+        self.exit = exit
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class LoopOptions:
     """
 
     checkpoint_every: int = 0  # steps
-    checkpoint_minutes: float = 0.0  # since the last save
+    checkpoint_minutes: float = 10.0  # since the last save: what a kill loses at most
     keep_checkpoints: int = 2  # the newest ones
     skip_damaged: bool = False  # go on from the newest checkpoint that is whole
     log_every: int = 10  # steps between lines of timing.jsonl
@@ -77,6 +80,8 @@ class Start:
     execution: Mapping[str, Any] = field(default_factory=dict)  # how it is computed: recorded only
     # Brings a description that an earlier version wrote to today's form.
     modernise: Callable[[Description], Description] = lambda described: described
+    # Asked when a step was not finite.
+    records: Records = lambda index: ()
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ def fit(
     run_dir, clock = Path(run_dir), options.clock
     # One writer per run: the others of a program with several processes leave lock and log alone.
     with (
-        claimed(run_dir) if is_writer() else nullcontext(),
+        claimed(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
             run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise
         ) as checkpoints,
@@ -159,7 +164,7 @@ def fit(
                 if step < steps:
                     batch = put_batch(next(batches))
                 if pending is not None:
-                    _report(log, *pending)
+                    _report(log, *pending, about.records)
                 pending = (step, metrics)
                 checkpoints.raise_failure()
                 wanted = agreement.outcome(wish)
@@ -167,7 +172,7 @@ def fit(
                 to_watch = watch is not None and (last or step % watch.every == 0)
                 to_save = last or wanted or _is_due(step, options)
                 if to_watch or to_save:
-                    _report(log, *pending)  # a diverged step is neither watched nor saved
+                    _report(log, *pending, about.records)  # a diverged step is neither watched nor saved
                     pending = None
                 if to_watch:
                     before = clock()
@@ -176,13 +181,14 @@ def fit(
                     watching += clock() - before
                 if to_save:
                     log.flush()
+                    _require_held(lock, run_dir, step)
                     checkpoints.save(step, state)
                     saved = clock()
                 agreement.cast(wish)
                 if stopping and not last:
                     checkpoints.wait()
                     raise Interrupted(
-                        f"stopped at step {step} of {steps}; the same command resumes from {run_dir}"
+                        f"stopped at step {step} of {steps}; the same command resumes from {run_dir}", stop.exit
                     )
             jax.block_until_ready(state)
             seconds = clock() - began - watching
@@ -190,18 +196,20 @@ def fit(
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 
 
-def _report(log: RunLog | Listener, step: int, metrics: dict[str, jax.Array]) -> None:
-    """Writes a step's metrics. Raises DivergedError, and writes nothing, if it was not finite."""
-    read = jax.device_get(metrics)
-    values = {name: float(value) for name, value in read.items() if not name.startswith(FINITE)}
-    bad = [name.removeprefix(FINITE) for name, fine in read.items() if name.startswith(FINITE) and not fine]
-    advice = "lower the learning rate or lengthen the warm-up (the last checkpoint is kept)"
-    if not math.isfinite(values["loss"]):
-        raise DivergedError(f"the loss is {values['loss']} at step {step}; {advice}")
-    if bad:
-        which = " and the ".join(bad) + (" are" if len(bad) > 1 else " is")
-        raise DivergedError(f"the {which} not finite at step {step} (its loss is {values['loss']:.4g}); {advice}")
-    log.write(step, values)
+def _report(log: RunLog | Listener, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
+    """Writes a step's metrics. Raises DivergedError, and writes none of them, if it was not finite."""
+    values = {name: float(value) for name, value in jax.device_get(metrics).items()}
+    require_finite(step, values, log.run_dir, records)
+    log.write(step, {name: value for name, value in values.items() if not name.startswith(FINITE)})
+
+
+def _require_held(lock: Lock | None, run_dir: Path, step: int) -> None:
+    """Raises SaveError unless `run_dir` is still the directory that this process locked."""
+    if lock is not None and lock.lost():
+        raise SaveError(
+            f"{run_dir} is no longer there, or another directory is in its place: nothing was saved at step {step}. "
+            "Put it back, with the checkpoints that it has, and give the same command again: it goes on from the last"
+        )
 
 
 STOP, SAVE = 2, 1
@@ -231,10 +239,16 @@ def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+class _Stop(threading.Event):
+    """Set when the run is asked to stop; `exit` says how."""
+
+    exit = Exit.STOPPED  # of a process that another one tells
+
+
 @contextmanager
-def _stop_requests() -> Iterator[threading.Event]:
+def _stop_requests() -> Iterator[_Stop]:
     """An event set by SIGINT or SIGTERM; a second signal acts as usual."""
-    event = threading.Event()
+    event = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield event  # only the main thread may install handlers
         return
@@ -242,6 +256,7 @@ def _stop_requests() -> Iterator[threading.Event]:
 
     def request(number: int, frame: object) -> None:
         del frame
+        event.exit = Exit(128 + number)
         event.set()
         signal.signal(number, previous[number])
 

@@ -19,6 +19,7 @@ from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.sharding import audit_sharding, make_mesh, plan_sharding, put_batch
+from hma_jax.training.divergence import Records
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, Start, fit
 from hma_jax.training.runs import describe_run, modernise
 from hma_jax.training.state import init_state, state_shapes
@@ -40,6 +41,7 @@ def train_model(
     validation: Validation | None = None,
     progress: Progress | None = None,
     initial: Params | None = None,
+    records: Records = lambda index: (),
 ) -> FitResult:
     """Trains to `config.steps`, resuming what is in `run_dir`.
 
@@ -47,8 +49,8 @@ def train_model(
     `start` on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what
     data the batches come from; resuming on other data is refused, and `modernise_provenance` brings what
     an earlier version said to today's form before they are compared. `execution` says how it is computed,
-    `validation` on what it is watched: both may be others each time. Raises ConfigError, CheckpointError,
-    SaveError, DivergedError, Interrupted.
+    `validation` on what it is watched: both may be others each time. `records` names what a batch is made of,
+    for the message when its step is not finite. Raises ConfigError, CheckpointError, SaveError, DivergedError, Interrupted.
     """
     declared = declare_model(model, table, execution)
     mesh = execution.mesh
@@ -79,7 +81,7 @@ def train_model(
             make_batches,
             steps=config.steps,
             run_dir=run_dir,
-            about=Start(describe_run(model, config, table, provenance), to_dict(execution), modernised),
+            about=Start(describe_run(model, config, table, provenance), to_dict(execution), modernised, records),
             put_batch=put,
             options=replace(
                 options,

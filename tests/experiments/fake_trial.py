@@ -11,9 +11,9 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.children import settle
-from experiments.ledger import Ledger
-from experiments.runner import Job, run_missing
+from experiments.running.children import settle
+from experiments.running.ledger import Ledger
+from experiments.running.runner import Job, run_missing
 
 THREE = [Job(f"t{i}", f"trial {i}", {"steps": 8, "seconds": 0.05, "end": "result"}) for i in range(3)]
 

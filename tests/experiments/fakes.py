@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from experiments.commands.study import AXES, SCALING
-from experiments.ledger import Ledger
 from experiments.presets import SMOKE
 from experiments.provenance import Provenance
 from experiments.rows import Row, collect
-from experiments.runner import read_states
+from experiments.running.ledger import Ledger
+from experiments.running.runner import read_states
 from experiments.study import Study, TransferConfig
 from experiments.sweep import Sweep, titles, unique_trials
 from experiments.trial import Trial, write_samples

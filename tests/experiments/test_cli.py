@@ -15,9 +15,9 @@ import hma_jax
 from experiments import pipeline
 from experiments.cli.main import main
 from experiments.commands import study as commands
-from experiments.ledger import Ledger
 from experiments.preparing import windows
-from experiments.runner import read_states
+from experiments.running.ledger import Ledger
+from experiments.running.runner import read_states
 from experiments.setting import Where, make_setting
 from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of

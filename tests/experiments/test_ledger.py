@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.ledger import Ledger
+from experiments.running.ledger import Ledger
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.children import child_environment
-from experiments.ledger import Ledger
-from experiments.runner import Job, Monitor, read_states, run_missing
+from experiments.running.children import child_environment
+from experiments.running.ledger import Ledger
+from experiments.running.runner import Job, Monitor, read_states, run_missing
 from hma_jax.runtime.host_memory import KEPT_PAGES
 from tests.experiments import fake_trial
 

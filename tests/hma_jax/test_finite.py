@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import pytest
 
 from hma_jax.training import step as step_module
-from hma_jax.training.loop import DivergedError, LoopOptions
+from hma_jax.training.divergence import DivergedError
+from hma_jax.training.loop import LoopOptions
 from hma_jax.training.runs import load_run
 from hma_jax.training.train import train_model
 from tests.tiny import SMALLER, TABLE, batches, model_config, train_config

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from hma_jax.training.claim import RunBusy, claimed
-from hma_jax.training.loop import DivergedError, LoopOptions, Watch
+from hma_jax.training.divergence import DivergedError
+from hma_jax.training.loop import LoopOptions, Watch
 from hma_jax.training.reading import list_steps
 from tests.toy import fit_toy, toy_batches, toy_step
 

@@ -10,7 +10,8 @@ import pytest
 from hma_jax.config import ConfigError, ExecutionConfig, OptimizerConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.training.checkpoints import CheckpointError
-from hma_jax.training.loop import DivergedError, Interrupted, LoopOptions
+from hma_jax.training.divergence import DivergedError
+from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.runs import load_run
 from hma_jax.training.train import train_model
 from tests.tiny import TABLE, batches, model_config, train_config

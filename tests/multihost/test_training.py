@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from orbax.checkpoint import v1 as ocp
 
-from hma_jax.runtime.watchdog import LOST
+from hma_jax.runtime.exits import Exit
 from hma_jax.training.reading import find_damage, list_steps
 from tests.conftest import FAST_COMPILATION
 from tests.multihost.processes import Started, launch, run
@@ -137,7 +137,7 @@ def test_when_one_is_killed_the_other_ends_and_names_it(killed: int, tmp_path: P
     started[killed].process.send_signal(signal.SIGKILL)
     began = time.monotonic()
     code, said = started[1 - killed].wait()
-    assert code == LOST, said[-2000:]
+    assert code == Exit.LOST, said[-2000:]
     assert time.monotonic() - began < 25
     assert f"error: lost process {killed} of 2 on host " in said and "start all processes again" in said
     started[killed].process.wait()

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hma_jax.runtime.watchdog import LOST
+from hma_jax.runtime.exits import Exit
 from hma_jax.training.reading import list_steps
 from tests.conftest import FAST_COMPILATION
 from tests.multihost.processes import ROOT, Started, run
@@ -137,7 +137,7 @@ def measure(directory: Path, cut: float, lost_after: float) -> dict[str, float]:
             figures[f"{me}_ended_after_seconds"] = round(time.monotonic() - began, 1)
             message = [text for text in said.splitlines() if text.startswith("error: lost process")]
             print(f"{me} ended with {code}: {message}", flush=True)
-            assert code == LOST, f"{me} ended with {code}: {said[-2000:]}"
+            assert code == Exit.LOST, f"{me} ended with {code}: {said[-2000:]}"
             assert message and f"on host {other}" in message[0], said[-2000:]
             assert time.monotonic() - began < 120, "it took more than two minutes"
         saved, logged = list_steps(run_dir / "checkpoints")[-1], len(losses(run_dir))

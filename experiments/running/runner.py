@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.publishing.files import write_file
-from experiments.children import child_environment
-from experiments.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, STARTED, Ledger
-from experiments.trial_main import FAILURE, JOB, PROGRESS, RESULT, STOPPED
+from experiments.running.children import child_environment
+from experiments.running.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, STARTED, Ledger
+from experiments.running.trial_main import FAILURE, JOB, PROGRESS, RESULT, STOPPED
 
 GRACE_SECONDS = 60.0
 """How long a trial may take to save its state when the runner is interrupted."""
@@ -55,7 +55,7 @@ class Monitor:
 
 
 def trial_command(directory: Path) -> list[str]:
-    return [sys.executable, "-m", "experiments.trial_main", str(directory)]
+    return [sys.executable, "-m", "experiments.running.trial_main", str(directory)]
 
 
 def read_states(ids: Sequence[str], trials: Path, ledger: Ledger) -> dict[str, State]:

@@ -1,4 +1,4 @@
-"""The process of one trial: `python -m experiments.trial_main DIRECTORY`.
+"""The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
 the state and one message. The runner starts this; run it by hand to debug a trial.
@@ -12,10 +12,11 @@ import time
 import traceback
 from pathlib import Path
 
-from experiments.children import settle
+from experiments.running.children import settle
+from hma_jax.runtime.exits import Exit, terminated_like_interrupted
 
 RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
-STOPPED = 130
+STOPPED = Exit.STOPPED
 """Exit code of a trial that was asked to stop and saved its state."""
 
 
@@ -26,17 +27,19 @@ def main(directory: Path) -> int:
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
-    from experiments.ledger import DIVERGED, FAILED
+    from experiments.running.ledger import DIVERGED, FAILED
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
-    from hma_jax.training.loop import DivergedError, Interrupted
+    from hma_jax.training.divergence import DivergedError
+    from hma_jax.training.loop import Interrupted
 
     job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS)
     try:
         trial, execution = read_job(job)
-        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
+        with terminated_like_interrupted():  # also while it evaluates
+            run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
     except (Interrupted, KeyboardInterrupt):
         return STOPPED

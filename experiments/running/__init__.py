@@ -1,0 +1,1 @@
+"""Trials are run: which are missing, where each runs, and what became of it."""
