@@ -12,6 +12,7 @@ import secrets
 import socket
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -45,9 +46,7 @@ class Processes:
     process: int | None = None  # this one's number, from 0
     detect: bool = False
     start_timeout: float = 300.0  # seconds until all must have come
-    # Seconds without a sign of life after which a process is lost. TCP tries again ever more rarely: after a cut
-    # of 30 s it takes up to 57 s until connections are used again (measured).
-    lost_after: float = 90.0
+    lost_after: float = 90.0  # seconds without a sign of life after which a process is lost
 
     def __post_init__(self):
         require(self.start_timeout >= 1, f"--start-timeout must be at least 1 second, got {self.start_timeout}")
@@ -112,7 +111,7 @@ def start(asked: Processes) -> None:
     except (RuntimeError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())[:300]
         raise ConfigError(
-            f"the {asked.processes or ''} processes did not come together within {asked.start_timeout:.0f} s at "
+            f"the processes did not come together within {asked.start_timeout:.0f} s at "
             f"{asked.coordinator or 'the address that was detected'} ({reason}); see that all were started with the "
             "same address and that process 0 can be reached there"
         ) from error
@@ -134,15 +133,18 @@ def _watch(lost_after: float) -> None:
     watchdog.watch(me, hosts, exchange, f"{host}:{port}", lost_after)
 
 
-def end(error: BaseException | None = None, code: int = 0) -> None:
+def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
     """At the end of a process. Several end together if all is well; one that failed tells the others why, and
-    ends here with `code`: they may hang in a collective, which no ordinary end survives.
+    ends here with `code`, for a thread that hangs in a collective holds up any other end. `show`: prints where
+    the error comes from.
     """
     if jax.distributed.is_initialized() and jax.process_count() > 1:
         if error is None:
             tell("end", "")
             watchdog.finish()
             return
+        if show:
+            traceback.print_exception(error)
         broken = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error)
         watchdog.finish(" ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=broken)
         sys.stdout.flush()

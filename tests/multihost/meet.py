@@ -15,7 +15,7 @@ from hma_jax.runtime.sharding import make_mesh
 
 
 def main(path: str) -> None:
-    start(Processes(start_timeout=60).or_from(os.environ))
+    start(Processes(detect="SLURM_JOB_ID" in os.environ, start_timeout=120).or_from(os.environ))
     me = jax.process_index()
     with writer_first("file"):
         if is_writer():

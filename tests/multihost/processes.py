@@ -7,9 +7,10 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,22 +38,42 @@ def free_port() -> int:
         return taken.getsockname()[1]
 
 
+def by_address(processes: int) -> list[dict[str, str]]:
+    """The environment of each."""
+    port = free_port()
+    where = {"HMA_COORDINATOR": f"127.0.0.1:{port}", "HMA_PROCESSES": str(processes)}
+    return [where | {"HMA_PROCESS": str(p)} for p in range(processes)]
+
+
+def by_slurm(processes: int) -> list[dict[str, str]]:
+    """What srun says to each of its tasks on one node."""
+    step = {
+        "SLURM_JOB_ID": "7", "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": str(processes),
+        "SLURM_STEP_NUM_NODES": "1", "JAX_COORDINATOR_PORT": str(free_port()),
+    }  # fmt: skip
+    return [step | {"SLURM_PROCID": str(p), "SLURM_LOCALID": str(p)} for p in range(processes)]
+
+
 def launch(
-    module: str, arguments: Sequence[str], *, processes: int, devices: int = 1, flags: str | None = None
+    module: str,
+    arguments: Sequence[str],
+    *,
+    processes: int,
+    devices: int = 1,
+    flags: str | None = None,
+    said: Callable[[int], list[dict[str, str]]] = by_address,
 ) -> list[Started]:
     """`python -m module ARGUMENTS` as so many processes with so many CPU devices each; more of XLA_FLAGS in `flags`."""
     given = os.environ.get("XLA_FLAGS", "") if flags is None else flags
     environment = os.environ | {"XLA_FLAGS": f"{given} --xla_force_host_platform_device_count={devices}"}
-    if processes > 1:
-        environment |= {"HMA_COORDINATOR": f"127.0.0.1:{free_port()}", "HMA_PROCESSES": str(processes)}
     outputs = Path(tempfile.mkdtemp(prefix="hma-processes-"))
     started = []
-    for p in range(processes):
+    for p, own in enumerate(said(processes) if processes > 1 else [{}]):
         output = outputs / f"{p}.txt"
         with open(output, "w") as file:
             process = subprocess.Popen(
                 [sys.executable, "-u", "-m", module, *arguments],
-                env=environment | ({"HMA_PROCESS": str(p)} if processes > 1 else {}),
+                env=environment | own,
                 cwd=ROOT,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -61,7 +82,7 @@ def launch(
     return started
 
 
-def run(module: str, arguments: Sequence[str], **how: int | str) -> list[str]:
+def run(module: str, arguments: Sequence[str], **how: Any) -> list[str]:
     """What each of the processes said; all must end well."""
     ended = [one.wait() for one in launch(module, arguments, **how)]
     for p, (code, said) in enumerate(ended):

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import json
+import socket
+import threading
 from pathlib import Path
 
 import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.processes import Processes
-from hma_jax.runtime.watchdog import DONE, FAILED, Signs
-from tests.multihost.processes import run
+from hma_jax.runtime.watchdog import DONE, FAILED, Board, Signs, Watchdog, visit
+from tests.multihost.processes import by_address, by_slurm, run
 
 
-def test_two_processes_meet(tmp_path: Path):
-    first, second = (json.loads(said.splitlines()[-1]) for said in run(
-        "tests.multihost.meet", [str(tmp_path / "file")], processes=2
-    ))  # fmt: skip
+@pytest.mark.parametrize("said", [by_address, pytest.param(by_slurm, marks=pytest.mark.slow)])
+def test_two_processes_meet(said, tmp_path: Path):
+    ended = run("tests.multihost.meet", [str(tmp_path / "file")], processes=2, said=said)
+    first, second = (json.loads(text.splitlines()[-1]) for text in ended)
     assert first["rows"] == {"(-1, 1, 1)": [0, 1, 2, 3], "(1, 2, 1)": [0, 1, 2, 3], "(1, 1, 2)": [*range(8)]}
     assert second["rows"] == {"(-1, 1, 1)": [4, 5, 6, 7], "(1, 2, 1)": [4, 5, 6, 7], "(1, 1, 2)": [*range(8)]}
     for report in (first, second):
@@ -106,3 +108,36 @@ def test_an_error_elsewhere_is_told_unless_this_process_has_it_too():
     assert world.after(1, {0: [1], 1: [1], 2: [FAILED, "disk full"]}) is None  # it may be about to say so itself
     assert world.after(3, {0: [4]}) == "process 2 of 3 on host c ended with an error: disk full"
     assert World(2).after(9, {2: [FAILED, "disk full"], 0: [1], 1: [1]}) is None
+
+
+def test_signs_are_brought_to_the_board_and_those_of_all_come_back():
+    board = Board("word")
+    assert board.exchange(0, [1]) == {0: [1]}
+    assert visit("127.0.0.1", board.port, "word", 1, [7]) == {0: [1], 1: [7]}
+    with pytest.raises(ConnectionResetError):
+        visit("127.0.0.1", board.port, "of another program", 1, [8])
+    with socket.create_connection(("127.0.0.1", board.port)) as stranger:
+        stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+    assert visit("127.0.0.1", board.port, "word", 2, [1]) == {0: [1], 1: [7], 2: [1]}
+    board.shutdown()
+    board.server_close()
+    with pytest.raises(ConnectionRefusedError):
+        visit("127.0.0.1", board.port, "word", 1, [9])
+
+
+def test_a_watchdog_leaves_with_the_verdict_and_not_after_its_own_end():
+    heard, left = {1: [1]}, threading.Event()
+    verdicts: list[str] = []
+
+    def leave(verdict: str) -> None:
+        verdicts.append(verdict)
+        left.set()
+
+    def exchange(process: int, sign: list) -> dict[int, list]:
+        return heard | {process: sign}
+
+    dog = Watchdog(Signs(0, ["a", "b"], "a:1", lost_after=0.5), exchange, leave)
+    assert left.wait(10) and "lost process 1 of 2 on host b" in verdicts[0]
+    dog.end([DONE])
+    seen = len(verdicts)
+    assert not threading.Event().wait(1.5) and len(verdicts) == seen

@@ -123,7 +123,7 @@ def test_a_stop_that_one_is_asked_for_is_one_of_all(asked: int, tmp_path: Path):
     wait_for(started[1], "step 3\n")
     started[asked].process.send_signal(signal.SIGTERM)
     ended = [one.wait() for one in started]
-    assert [code for code, _ in ended] == [130, 130], ended
+    assert [code for code, _ in ended] == [Exit.STOPPED, Exit.STOPPED], ended
     [step] = list_steps(tmp_path / "checkpoints")
     assert 3 <= step < 30 and all(f"stopped at step {step} of 200" in said for _, said in ended)
     assert train(tmp_path, 2, 1, steps=step + 1)[0]["resumed_from"] == step
@@ -132,13 +132,13 @@ def test_a_stop_that_one_is_asked_for_is_one_of_all(asked: int, tmp_path: Path):
 @pytest.mark.parametrize("killed", [0, 1])
 def test_when_one_is_killed_the_other_ends_and_names_it(killed: int, tmp_path: Path):
     """The job that is started again loses nothing of what was saved."""
-    started = begin(tmp_path, 2, steps=200, pause=0.1, every=5, lost_after=10)
+    started = begin(tmp_path, 2, steps=200, pause=0.1, every=5, lost_after=20)
     wait_for(started[1], "step 12\n")
     started[killed].process.send_signal(signal.SIGKILL)
     began = time.monotonic()
     code, said = started[1 - killed].wait()
     assert code == Exit.LOST, said[-2000:]
-    assert time.monotonic() - began < 25
+    assert time.monotonic() - began < 60
     assert f"error: lost process {killed} of 2 on host " in said and "start all processes again" in said
     started[killed].process.wait()
     assert train(tmp_path, 2, 1, steps=25)[0]["resumed_from"] >= 10

@@ -29,7 +29,7 @@ from tests.tiny import SMALLER, TABLE, model_config, random_batch, train_config
 
 
 def main(run_dir: str, text: str) -> None:
-    asked = {"mesh": [-1, 1, 1], "steps": 5, "every": 0, "pause": 0.0, "lost_after": 30.0, "ema": 0.0, "minutes": 0.0}
+    asked = {"mesh": [-1, 1, 1], "steps": 5, "every": 0, "pause": 0.0, "lost_after": 120.0, "ema": 0.0, "minutes": 0.0}
     asked |= json.loads(text)
     start(Processes(lost_after=asked["lost_after"], start_timeout=120).or_from(os.environ))
     try:
@@ -37,7 +37,7 @@ def main(run_dir: str, text: str) -> None:
     except Interrupted as stopped:
         end()
         print(stopped)
-        sys.exit(130)
+        sys.exit(stopped.exit)
     except BaseException as error:
         print(f"{type(error).__name__}: {error}")
         end(error, 1)
