@@ -153,7 +153,8 @@ def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
     from hma_jax.training.runs import load_model
 
     trained = load_model(run, setting.study.execution, weights).run
-    with claimed(run, EVALUATION) if is_writer() else nullcontext():  # before the work: that its results can be written, and by nobody else
+    # Before the work: that its results can be written, and by nobody else.
+    with claimed(run, EVALUATION) if is_writer() else nullcontext():
         _evaluate(setting, run, trained)
 
 

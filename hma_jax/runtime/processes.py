@@ -30,8 +30,9 @@ COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCE
 """Environment variables for what is not given otherwise."""
 
 MARGIN = 20.0
-"""Seconds by which JAX's own patience exceeds `lost_after`: it ends a process without a word about whom it misses,
-and is left for the case that this process's watchdog is stuck."""
+"""Seconds by which JAX's own patience exceeds twice `lost_after`: it ends a process without a word about whom it
+misses, and is left for the case that this process's watchdog is stuck. Twice, for JAX gives a sign of its own after
+half its patience only, and counts from the last one."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ class Processes:
         if self.processes is not None and self.process is not None:
             require(
                 0 <= self.process < self.processes,
-                f"--process counts from 0 to {self.processes - 1} with --processes {self.processes}, got {self.process}",
+                f"--process counts from 0 to {self.processes - 1} with --processes {self.processes}, "
+                f"got {self.process}",
             )
 
     def or_from(self, environment: Mapping[str, str]) -> Processes:
@@ -105,7 +107,7 @@ def start(asked: Processes) -> None:
             asked.process,
             cluster_detection_method=None if asked.detect else "deactivate",
             initialization_timeout=int(asked.start_timeout),
-            heartbeat_timeout_seconds=int(asked.lost_after + MARGIN),
+            heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),
             shutdown_timeout_seconds=int(asked.lost_after),
         )
     except (RuntimeError, ValueError, TypeError) as error:
@@ -130,7 +132,7 @@ def _watch(lost_after: float) -> None:
         said, word = from_writer("watchdog", "").split()
         port = int(said)
         exchange = partial(watchdog.visit, host.strip("[]"), port, word)
-    watchdog.watch(me, hosts, exchange, f"{host}:{port}", lost_after)
+    watchdog.watch(watchdog.Signs(me, hosts, f"{host}:{port}", lost_after), exchange)
 
 
 def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
@@ -140,16 +142,24 @@ def end(error: BaseException | None = None, code: int = 0, show: bool = False) -
     """
     if jax.distributed.is_initialized() and jax.process_count() > 1:
         if error is None:
-            tell("end", "")
+            meet("end")
             watchdog.finish()
             return
         if show:
             traceback.print_exception(error)
-        broken = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error)
-        watchdog.finish(" ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=broken)
+        watchdog.finish(" ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=_of_others(error))
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+def _of_others(error: BaseException | None) -> bool:
+    """Whether an error may come of another process's end: what a collective or the coordination service says."""
+    while error is not None:
+        if isinstance(error, jax.errors.JaxRuntimeError):
+            return "RESOURCE_EXHAUSTED" not in str(error)
+        error = error.__cause__
+    return False
 
 
 def is_writer() -> bool:
@@ -171,6 +181,12 @@ def tell(name: str, text: str) -> list[str]:
     return [_wait_for(client, f"{key}/{p}")[1:] for p in range(jax.process_count())]
 
 
+def meet(name: str) -> None:
+    """Waits until all processes are here. Before a program runs for the first time: its collectives wait for those
+    that still compile it, on CPUs for 30 seconds only."""
+    tell(name, "")
+
+
 def from_writer(name: str, text: str) -> str:
     """What process 0 says; the others' `text` does not count. Called by all, as `tell`."""
     return tell(name, text if is_writer() else "")[0]
@@ -180,10 +196,10 @@ def from_writer(name: str, text: str) -> str:
 def writer_first(name: str) -> Iterator[None]:
     """Process 0 goes through the block before the others do: `with writer_first("data"): prepare()`."""
     if not is_writer():
-        tell(f"first/{name}", "")
+        meet(f"first/{name}")
     yield
     if is_writer():
-        tell(f"first/{name}", "")
+        meet(f"first/{name}")
 
 
 class Agreement:
@@ -199,7 +215,9 @@ class Agreement:
         if jax.process_count() > 1:
             mesh = Mesh(np.array(jax.devices()), ("devices",))
             self._each = NamedSharding(mesh, PartitionSpec("devices"))
-            self._count = jax.jit(lambda wishes: wishes.max(), out_shardings=NamedSharding(mesh, PartitionSpec()))
+            count = jax.jit(lambda wishes: wishes.max(), out_shardings=NamedSharding(mesh, PartitionSpec()))
+            shape = jax.ShapeDtypeStruct((jax.device_count(),), np.int32, sharding=self._each)
+            self._count = count.lower(shape).compile()
 
     def cast(self, wish: Callable[[], int]) -> None:
         """Once a step, by all."""

@@ -63,6 +63,11 @@ class Signs:
             if self.last[p][0] != sign:
                 self.last[p] = (sign, now)
 
+    def excuse(self, seconds: float) -> None:
+        """This process itself stood still for so long: nobody could be heard meanwhile."""
+        self.answered += seconds
+        self.last = {p: (sign, when + seconds) for p, (sign, when) in self.last.items()}
+
     def verdict(self) -> str | None:
         """Why this process must end; None: it need not."""
         now, others = self.clock(), {p: x for p, x in self.last.items() if p != self.process}
@@ -157,17 +162,21 @@ class Watchdog:
             self._over.wait(EVERY)
 
     def _judge(self) -> None:
+        looked = self.signs.clock()
         while not self._over.wait(EVERY / 2):
+            slept, looked = self.signs.clock() - looked, self.signs.clock()
+            if slept > 5 * EVERY:  # stopped, or a machine that was
+                self.signs.excuse(slept)
             verdict = self.signs.verdict()
             if verdict is not None and not self._over.is_set():
                 self._leave(verdict)
 
 
-def watch(process: int, hosts: list[str], exchange: Callable[..., dict[int, Sign]], address: str, seconds: float) -> None:
-    """From now on this process ends with Exit.LOST when another one has given no sign for `seconds`."""
+def watch(signs: Signs, exchange: Callable[[int, Sign], dict[int, Sign]]) -> None:
+    """From now on this process ends with Exit.LOST when another one is lost."""
     global _watchdog
     _keep_aborting_threads()
-    _watchdog = Watchdog(Signs(process, hosts, address, seconds), exchange, _leave)
+    _watchdog = Watchdog(signs, exchange, _leave)
 
 
 def finish(error: str | None = None, *, perhaps_lost: bool = False) -> None:

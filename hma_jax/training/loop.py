@@ -30,7 +30,7 @@ import jax
 
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.locks import Lock
-from hma_jax.runtime.processes import Agreement, is_writer
+from hma_jax.runtime.processes import Agreement, is_writer, meet
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.claim import claimed
 from hma_jax.training.divergence import Records, require_finite
@@ -149,12 +149,13 @@ def fit(
             began = clock()
             compiled = step_fn.lower(state, batch).compile()
             compile_seconds = clock() - began
+            agreement = Agreement()
+            meet("compiled")
 
             began = saved = clock()
             watching = 0.0  # seconds
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
-            agreement = Agreement()
 
             def wish() -> int:
                 return STOP if stop.is_set() else SAVE if _is_late(clock() - saved, options) else 0

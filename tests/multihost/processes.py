@@ -22,7 +22,7 @@ class Started:
     process: subprocess.Popen
     output: Path
 
-    def wait(self, timeout: float = 240) -> tuple[int, str]:
+    def wait(self, timeout: float = 600) -> tuple[int, str]:
         """(exit code, everything it said)."""
         try:
             code = self.process.wait(timeout)

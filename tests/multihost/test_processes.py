@@ -95,6 +95,15 @@ def test_after_a_cut_the_others_have_their_time_again():
     assert world.after(89, {0: [149], 1: [1], 2: [1]}) is None
 
 
+def test_a_process_that_stood_still_itself_blames_nobody():
+    world = World(1)
+    assert world.after(1, {0: [1], 1: [1], 2: [1]}) is None
+    world.now += 200
+    world.signs.excuse(200)
+    assert world.after(80) is None
+    assert "lost process 0" in world.after(20)
+
+
 def test_whoever_is_done_is_not_missed():
     world = World(1)
     assert world.after(1, {0: [DONE], 1: [1], 2: [DONE]}) is None

@@ -18,7 +18,7 @@ from hma_jax.training.reading import find_damage, list_steps
 from tests.conftest import FAST_COMPILATION
 from tests.multihost.processes import Started, launch, run
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 MODULE = "tests.multihost.train_together"
 FLAGS = " ".join(FAST_COMPILATION)
 
@@ -110,7 +110,7 @@ def test_a_damaged_file_is_refused_by_all_whoever_read_it(tmp_path: Path):
         assert code == 1 and file.name in said and "is damaged" in said
 
 
-def wait_for(started: Started, text: str, seconds: float = 120) -> None:
+def wait_for(started: Started, text: str, seconds: float = 600) -> None:
     deadline = time.monotonic() + seconds
     while text not in started.output.read_text():
         assert time.monotonic() < deadline and started.process.poll() is None, started.output.read_text()[-2000:]

@@ -63,7 +63,8 @@ def two_hosts() -> Iterator[Line]:
             table = [f"{address} {other}" for other, address in HOSTS.items()]
             (own / "hosts").write_text("\n".join(["127.0.0.1 localhost", *table]) + "\n")
         a, b = line.names.values()
-        ip("link", "add", line.ends["hosta"], "netns", a, "type", "veth", "peer", "name", line.ends["hostb"], "netns", b)
+        one, other = line.ends.values()
+        ip("link", "add", one, "netns", a, "type", "veth", "peer", "name", other, "netns", b)
         for host, name in line.names.items():
             ip("-n", name, "addr", "add", f"{HOSTS[host]}/24", "dev", line.ends[host])
             ip("-n", name, "link", "set", "lo", "up")
@@ -118,14 +119,14 @@ def measure(directory: Path, cut: float, lost_after: float) -> dict[str, float]:
     run_dir, how = directory / "run", {"every": EVERY, "pause": 0.2, "lost_after": lost_after}
     with two_hosts() as line:
         first = begin(line, directory, "1", steps=FOREVER, **how)
-        wait_for_step(first, 10, 240)
+        wait_for_step(first, 10, 600)
         print(f"cut for {cut:.0f} s", flush=True)
         line.cut()
         began = time.monotonic()
         time.sleep(cut)
         stood = max(map(last_step, first))
         line.mend()
-        wait_for_step(first, stood + 10, 90)
+        wait_for_step(first, stood + 10, 120)
         figures["steps_again_after_seconds"] = round(time.monotonic() - began - cut, 1)
         print(f"survived; steps went on {figures['steps_again_after_seconds']} s after the line was back", flush=True)
 
