@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from tyro.extras import SubcommandApp
 
 from experiments.cli import bench, convert, data, study, tokenizer
-from experiments.cli.fit import fit
+from experiments.cli.plan import plan
 from experiments.commands.study import TrialsFailed
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -33,7 +33,7 @@ app.command(data.data_app, name="data", help=data.HELP)
 app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)
 app.command(convert.convert_app, name="convert", help=convert.HELP)
 app.command(bench.bench_app, name="bench", help=bench.HELP)
-app.command(name="fit")(fit)
+app.command(name="plan")(plan)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -25,8 +25,10 @@ from hma_jax.evaluation.windows import WindowTable, join
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
+from hma_jax.runtime.audit import param_shardings
+from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.rows import lay_out
-from hma_jax.runtime.sharding import RULES, batch_sharding, constrain, make_mesh, param_shardings
+from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain
 
 T = TypeVar("T")
 ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
@@ -159,7 +161,7 @@ def held(clip: np.ndarray, real: np.ndarray) -> np.ndarray:
 
 def batch_ways(mesh: Mesh) -> int:
     """Devices that share a batch."""
-    return int(np.prod([mesh.shape[axis] for axis in RULES["B"]]))
+    return int(np.prod([mesh.shape[axis] for axis in BATCH]))
 
 
 def plan_groups(rows: int, at_once: int, ways: int) -> tuple[int, int]:
@@ -196,7 +198,7 @@ def _on_each_device(function: Callable[..., Any], mesh: Mesh) -> Callable[..., A
     """
     if batch_ways(mesh) == 1:
         return function
-    whole, rows = PartitionSpec(), PartitionSpec(RULES["B"])
+    whole, rows = PartitionSpec(), PartitionSpec(BATCH)
     return jax.shard_map(function, mesh=mesh, in_specs=(whole, rows, rows), out_specs=rows)
 
 

@@ -12,6 +12,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec
+
+from hma_jax.runtime.sharding import BATCH, Layouts, batch_ways, is_split, mesh_axes, pinned
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
@@ -61,41 +64,85 @@ def _copied(x: jax.Array) -> jax.Array:
 # --- One weight per robot ------------------------------------------------------------------------
 
 
-def per_robot(x: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+def per_robot(x: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
     """x [B, ..., in] times each example's own slice of w [E, in, out], slice_B [B] -> [B, ..., out].
 
-    The slices are copied to their examples in the type of w. A copy is small beside the example's
-    activations: D^2 numbers where those are T P D.
+    `layouts` are those of w on a mesh. The slices are copied to their examples in the type of w. A copy is small
+    beside the example's activations: D^2 numbers where those are T P D.
     """
-    y = _per_robot(x.reshape(x.shape[0], -1, x.shape[-1]), w, slice_B)
+    y = _per_robot(x.reshape(x.shape[0], -1, x.shape[-1]), w, slice_B, layouts)
     return y.reshape(*x.shape[:-1], y.shape[-1])
 
 
-@jax.custom_vjp
-def _per_robot(x_BRi: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
-    return jnp.einsum("bri,bio->bro", x_BRi, jnp.take(w, slice_B, axis=0))
+@partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _per_robot(x_BRi: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+    return jnp.einsum("bri,bio->bro", x_BRi, _to_examples(w, slice_B, layouts))
 
 
-def _per_robot_backward(saved: tuple[jax.Array, ...], dy: jax.Array) -> tuple[jax.Array, jax.Array, None]:
+def _per_robot_backward(
+    layouts: Layouts | None, saved: tuple[jax.Array, ...], dy: jax.Array
+) -> tuple[jax.Array, jax.Array, None]:
     x, w, slice_B = saved
-    dx = jnp.einsum("bro,bio->bri", dy, jnp.take(w, slice_B, axis=0))
+    dx = jnp.einsum("bro,bio->bri", dy, _to_examples(w, slice_B, layouts))
     each = jax.vmap(_product_over_rows)(x, dy)
-    return dx, sum_by_robot(each, slice_B, len(w)), None
+    return dx, _from_examples(each, slice_B, len(w), layouts), None
 
 
-_per_robot.defvjp(lambda *args: (_per_robot(*args), args), _per_robot_backward)
+_per_robot.defvjp(lambda *args: (_per_robot(*args), args[:3]), _per_robot_backward)
 
 
-@jax.custom_vjp
-def take_by_robot(w: jax.Array, slice_B: jax.Array) -> jax.Array:
-    """w [E, ...] -> [B, ...]: each example's own slice."""
-    return jnp.take(w, slice_B, axis=0)
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def take_by_robot(w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
+    """w [E, ...] -> [B, ...]: each example's own slice. `layouts` are those of w on a mesh."""
+    return _to_examples(w, slice_B, layouts)
 
 
 take_by_robot.defvjp(
-    lambda w, slice_B: (take_by_robot(w, slice_B), (w, slice_B)),
-    lambda saved, dy: (sum_by_robot(dy, saved[1], len(saved[0])), None),
+    lambda *args: (take_by_robot(*args), args[:2]),
+    lambda layouts, saved, dy: (_from_examples(dy, saved[1], len(saved[0]), layouts), None),
 )
+
+
+TO_EXAMPLES, FROM_EXAMPLES = "robots_to_examples", "examples_to_robots"
+"""Names that what is sent for these two bears in a compiled program."""
+
+
+def _to_examples(w: jax.Array, slice_B: jax.Array, layouts: Layouts | None) -> jax.Array:
+    """w [E, ...] -> [B, ...], on a mesh: from where w is stored to the devices that have the examples.
+
+    Few robots are gathered whole. If a device has fewer examples than there are robots, each part of w sends
+    every example its own slice only.
+    """
+    if layouts is None:
+        return jnp.take(w, slice_B, axis=0)
+    storage, compute = layouts
+    with jax.named_scope(TO_EXAMPLES):
+        if _few(len(w), slice_B):
+            each = jnp.take(pinned(w, None, *compute[1:]), slice_B, axis=0)
+        else:
+            each = pinned(jnp.take(w, pinned(slice_B, None), axis=0), _left(storage), *storage[1:])
+        return pinned(each, BATCH, *compute[1:])
+
+
+def _from_examples(each: jax.Array, slice_B: jax.Array, robots: int, layouts: Layouts | None) -> jax.Array:
+    """The way back, of gradients: [B, ...] -> [E, ...], the sum over each robot's examples."""
+    if layouts is None:
+        return sum_by_robot(each, slice_B, robots)
+    storage, _ = layouts
+    with jax.named_scope(FROM_EXAMPLES):
+        if not _few(robots, slice_B):
+            each = pinned(each, _left(storage), *storage[1:])
+        return pinned(sum_by_robot(each, slice_B, robots), None, *storage[1:])
+
+
+def _left(storage: PartitionSpec) -> tuple[str, ...]:
+    """The mesh axes of the batch that examples' slices still have where the width is split as in storage."""
+    used = {name for part in storage[1:] for name in mesh_axes(part)}
+    return tuple(name for name in BATCH if name not in used)
+
+
+def _few(robots: int, slice_B: jax.Array) -> bool:
+    return robots * batch_ways() <= len(slice_B)
 
 
 CHUNK = 32
@@ -132,14 +179,14 @@ def _in_chunks(x: jax.Array, axis: int) -> jax.Array:
     return jnp.pad(x, padding).reshape(*x.shape[:axis], count, CHUNK, *x.shape[axis + 1 :])
 
 
-def per_robot_from_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+def per_robot_from_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
     """`per_robot` for w [E, U, out], by `from_actions`."""
-    return jax.vmap(from_actions)(x, take_by_robot(w, slice_B))
+    return jax.vmap(from_actions)(x, take_by_robot(w, slice_B, layouts))
 
 
-def per_robot_to_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array) -> jax.Array:
+def per_robot_to_actions(x: jax.Array, w: jax.Array, slice_B: jax.Array, layouts: Layouts | None = None) -> jax.Array:
     """`per_robot` for w [E, in, U], by `to_actions`."""
-    return jax.vmap(to_actions)(x, take_by_robot(w, slice_B))
+    return jax.vmap(to_actions)(x, take_by_robot(w, slice_B, layouts))
 
 
 def sum_by_robot(x: jax.Array, slice_B: jax.Array, robots: int) -> jax.Array:
@@ -147,6 +194,8 @@ def sum_by_robot(x: jax.Array, slice_B: jax.Array, robots: int) -> jax.Array:
     if robots == 1:
         return jnp.sum(x, axis=0, keepdims=True)
     mine = (jnp.arange(robots)[:, None] == slice_B).astype(x.dtype)
+    if is_split():  # a split dimension must stay one of its own
+        return jnp.tensordot(mine, x, 1)
     return (mine @ x.reshape(len(x), -1)).reshape(robots, *x.shape[1:])
 
 

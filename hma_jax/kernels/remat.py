@@ -13,8 +13,9 @@ import jax
 from jax.ad_checkpoint import checkpoint_name
 
 from hma_jax.config.execution import Remat
+from hma_jax.runtime.sharding import is_split
 
-PRODUCT, ATTENTION, INPUT = "product", "attention", "input"
+PRODUCT, ATTENTION, INPUT, GATHERED = "product", "attention", "input", "gathered"
 
 
 def product(x: jax.Array) -> jax.Array:
@@ -32,14 +33,23 @@ def block_input(x: jax.Array) -> jax.Array:
     return checkpoint_name(x, INPUT)
 
 
+def gathered(w: jax.Array) -> jax.Array:
+    """Marks a weight that was put together out of several devices' parts: never kept, it is gathered again."""
+    return checkpoint_name(w, GATHERED)
+
+
 def checkpointed(block: Callable[..., Any], remat: Remat, scanned: bool) -> Callable[..., Any]:
     """`block` (carry, xs) -> (carry, ys), one of many, keeping what `remat` says.
 
     `scanned`: it is the body of a loop, in which XLA cannot merge a second computation with the first.
     """
-    if remat == "none":
-        return block
     policies = jax.checkpoint_policies
+    if remat == "none":
+        if not is_split():
+            return block
+        return jax.checkpoint(
+            block, prevent_cse=not scanned, policy=policies.save_anything_except_these_names(GATHERED)
+        )
     policy = {
         "products": policies.save_from_both_policies(_fused, policies.save_only_these_names(PRODUCT, ATTENTION)),
         "attention": policies.save_from_both_policies(_fused, policies.save_only_these_names(ATTENTION)),

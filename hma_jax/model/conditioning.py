@@ -19,7 +19,7 @@ from hma_jax.kernels.pointwise import layer_norm, over_tokens, scaled, shifted
 from hma_jax.model.attention import attention_scale
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, own
-from hma_jax.model.params import bias, ones, param, used
+from hma_jax.model.params import bias, layouts_of, ones, param, used
 
 
 class ActionFeature(NamedTuple):
@@ -116,7 +116,7 @@ class CrossAttention(nnx.Module):
         return jnp.where(some[:, :, None, None], self.out(y, slice_B), 0), new
 
     def _map(self, x: jax.Array, kernel: nnx.Param, slice_B: jax.Array) -> jax.Array:
-        return per_robot(x, kernel.astype(x.dtype), slice_B)
+        return per_robot(x, kernel.astype(x.dtype), slice_B, layouts_of(kernel))
 
     def _heads(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """[B, ..., D] -> [B, ..., H, I], a layer norm over each head."""

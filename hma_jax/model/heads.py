@@ -20,7 +20,7 @@ from hma_jax.kernels.pointwise import layer_norm, shifted
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.initial import readout_init
 from hma_jax.model.layers import FINE_EPS, EmbodimentLinear, LayerNorm, Linear
-from hma_jax.model.params import bias, normal, param, stack, used, xavier_uniform, zeros
+from hma_jax.model.params import bias, layouts_of, normal, param, stack, used, xavier_uniform, zeros
 
 TIME_FEATURES = 256
 
@@ -128,7 +128,11 @@ class ActionDenoiser(nnx.Module):
         """Normalised, noised chunks -> float32 [B, T, 2 U], noise first. `time_BT` may have axes of size 1."""
         time_BT = jnp.broadcast_to(time_BT, (len(x_BTU), time_BT.shape[1]))
         graphdef, params = nnx.split(self.robots)
-        own = jax.tree.map(lambda p: take_by_robot(p.astype(self.dtype), slice_B), params)
+
+        def taken(p: nnx.Param) -> nnx.Param:
+            return p.replace(take_by_robot(p.astype(self.dtype), slice_B, layouts_of(p)))
+
+        own = jax.tree.map(taken, params, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
         return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)
 
 

@@ -147,4 +147,4 @@ def declare_model(
     config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
 ) -> Declared:
     """The model's declarations, which do not depend on how it is executed; see `params.Declared`."""
-    return declare(lambda: HMA(config, table, execution))
+    return declare(lambda: HMA(config, table, execution), execution.mesh.min_shard_size)

@@ -16,7 +16,8 @@ from hma_jax.kernels.dense import (
     take_by_robot,
 )
 from hma_jax.kernels.pointwise import layer_norm, scaled, shifted
-from hma_jax.model.params import Initializer, Role, bias, ones, param
+from hma_jax.model.params import Initializer, Role, bias, layouts_of, ones, param
+from hma_jax.runtime.sharding import Layouts
 
 BLOCK_EPS = 1e-5
 FINE_EPS = 1e-6  # modulation, diffusion heads and the norms around the continuous trunk
@@ -73,10 +74,11 @@ class EmbodimentLinear(nnx.Module):
 
     def __call__(self, x: jax.Array, slice_B: jax.Array) -> jax.Array:
         """x [B, ..., in] -> [B, ..., out]."""
-        return shifted(self.map(x, self.kernel.astype(x.dtype), slice_B), own(self.bias, slice_B, x))
+        y = self.map(x, self.kernel.astype(x.dtype), slice_B, layouts_of(self.kernel))
+        return shifted(y, own(self.bias, slice_B, x))
 
 
-def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
+def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array, Layouts | None], jax.Array]:
     """What multiplies each example with its robot's matrix. What a robot gets must not depend on U, which
     other robots decide."""
     if axes[0] == "U":
@@ -86,5 +88,5 @@ def find_map(axes: tuple[str, str]) -> Callable[[jax.Array, jax.Array, jax.Array
 
 def own(vectors: nnx.Param, slice_B: jax.Array, like: jax.Array) -> jax.Array:
     """Each example's own vector [E, D] -> [B, 1, ..., D], to meet `like` [B, ..., D]."""
-    taken = take_by_robot(vectors.get_value(), slice_B)
+    taken = take_by_robot(vectors.get_value(), slice_B, layouts_of(vectors))
     return taken.reshape(len(taken), *(1,) * (like.ndim - 2), -1)

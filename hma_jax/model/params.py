@@ -19,9 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
+from jax.sharding import PartitionSpec
 
-from hma_jax.config import require
-from hma_jax.runtime.sharding import place
+from hma_jax.config import MeshConfig, require
+from hma_jax.kernels import remat
+from hma_jax.runtime.sharding import Layouts, find_layouts, for_compute, is_split, place
 
 Params = Any
 """A nested dict of arrays, the structure of `Declared.specs`."""
@@ -144,6 +146,7 @@ class Declared:
 
     graphdef: nnx.GraphDef
     specs: Params  # nested dict of ParamSpec
+    min_shard_size: int = MeshConfig.min_shard_size
 
     def init(self, seed: int, shardings: Params | None = None) -> Params:
         """Arrays for every declaration, laid out by `shardings` (default: on the default device).
@@ -170,8 +173,23 @@ class Declared:
         return jax.tree.map(describe, self.specs, *given, is_leaf=is_spec)
 
     def merge(self, params: Params) -> nnx.Module:
-        """The module around `params`; call it inside the traced function."""
-        return merge(self.graphdef, params)
+        """The module around `params`; call it inside the traced function.
+
+        On a mesh, what a module has once goes to its layout for computing here; what every layer has goes
+        there inside the loop over layers (`layer_for_compute`), and what every robot has with the examples.
+        """
+        specs = nnx.traversals.flatten_mapping(self.specs)
+        flat = {
+            tuple(int(k) if k.isdigit() else k for k in path): self._variable(specs[path], value)
+            for path, value in nnx.traversals.flatten_mapping(params).items()
+        }
+        return nnx.merge(self.graphdef, nnx.from_flat_state(flat))
+
+    def _variable(self, spec: ParamSpec, value: jax.Array) -> nnx.Param:
+        layouts = find_layouts(spec.axes, spec.shape, self.min_shard_size)
+        if layouts and spec.embodiment_axis is None and LAYER_AXIS not in spec.axes:
+            value = for_compute(value, layouts)
+        return nnx.Param(value, axes=spec.axes, role=spec.role, layouts=layouts)
 
     def leaves(self) -> dict[str, ParamSpec]:
         """'path/of/parameter' -> spec, in a fixed order."""
@@ -182,12 +200,12 @@ class Declared:
         return sum(spec.size for spec in self.leaves().values())
 
 
-def declare(make: Callable[[], nnx.Module]) -> Declared:
+def declare(make: Callable[[], nnx.Module], min_shard_size: int = MeshConfig.min_shard_size) -> Declared:
     """Traces `make` abstractly (no arrays are allocated) and reads its declarations."""
     graphdef, state, _ = nnx.split(nnx.eval_shape(make), nnx.Param, ...)
     # List indices become strings: checkpoints keep dictionaries with string keys only.
     flat = {tuple(map(str, path)): _spec(variable) for path, variable in nnx.to_flat_state(state)}
-    return Declared(graphdef, nnx.traversals.unflatten_mapping(flat))
+    return Declared(graphdef, nnx.traversals.unflatten_mapping(flat), min_shard_size)
 
 
 def is_spec(leaf: Any) -> bool:
@@ -195,13 +213,25 @@ def is_spec(leaf: Any) -> bool:
     return isinstance(leaf, ParamSpec)
 
 
-def merge(graphdef: nnx.GraphDef, params: Params) -> nnx.Module:
-    """A module from its static structure and a nested dict of arrays."""
-    flat = {
-        tuple(int(k) if k.isdigit() else k for k in path): nnx.Param(value)
-        for path, value in nnx.traversals.flatten_mapping(params).items()
-    }
-    return nnx.merge(graphdef, nnx.from_flat_state(flat))
+def layer_for_compute(layer: nnx.State, dtype: jnp.dtype) -> nnx.State:
+    """One layer's slices of stacked parameters as they are computed with on the current mesh: matrices are sent
+    in `dtype`, which they would be cast to anyway. Without a mesh, `layer`."""
+    if not is_split():
+        return layer
+
+    def sent(variable: nnx.Param) -> nnx.Param:
+        w, (storage, compute) = variable.get_value(), variable.layouts
+        layouts = PartitionSpec(*storage[1:]), PartitionSpec(*compute[1:])
+        if EMBODIMENT_AXIS not in variable.axes:
+            w = remat.gathered(for_compute(w, layouts, None if variable.role == "vector" else dtype))
+        return nnx.Param(w, axes=variable.axes[1:], role=variable.role, layouts=layouts)
+
+    return jax.tree.map(sent, layer, is_leaf=lambda leaf: isinstance(leaf, nnx.Variable))
+
+
+def layouts_of(variable: nnx.Param) -> Layouts | None:
+    """Of a parameter that every robot has, inside a merged module; None without a mesh."""
+    return variable.get_metadata().get("layouts")
 
 
 def inference_params(declared: Declared, params: Params, dtype: str) -> Params:

@@ -14,7 +14,7 @@ from hma_jax.model.attention import Attention, Past
 from hma_jax.model.conditioning import ActionFeature, make_conditioning
 from hma_jax.model.initial import trunk_init
 from hma_jax.model.layers import LayerNorm, Linear
-from hma_jax.model.params import stack
+from hma_jax.model.params import layer_for_compute, stack
 from hma_jax.runtime.sharding import constrain
 
 UNROLLED = 4
@@ -97,6 +97,7 @@ class Trunk(nnx.Module):
         def body(x, xs):
             layer, layer_past = xs
             x = remat.block_input(x)
+            layer = layer_for_compute(layer, x.dtype)
             x, new = nnx.merge(block_def, layer)(x, action, slice_B, visible, layer_past)
             new = jax.tree.map(lambda y: y[:, :remember], new) if remember else None
             return _by_example(x), new

@@ -9,7 +9,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 from hma_jax.config import MeshConfig, require
-from hma_jax.runtime.sharding import batch_sharding, make_mesh, place
+from hma_jax.runtime.mesh import make_mesh
+from hma_jax.runtime.sharding import batch_sharding, place
 
 
 def own_rows(mesh: Mesh | MeshConfig, batch: int) -> np.ndarray:

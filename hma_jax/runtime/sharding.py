@@ -1,151 +1,151 @@
-"""One mesh, one table from logical axes to mesh axes, and a record of every decision.
+"""Two tables from logical axes to mesh axes: how arrays are stored, and how they are computed with.
 
-Mesh axes: `data` splits the batch, `fsdp` splits the batch and the width of parameters,
-`tensor` splits heads, mlp width and vocabulary. Model code names logical axes at most.
+Parameters, their moments and gradients lie as `STORAGE` says, activations as `COMPUTE` does. A parameter goes
+from the one layout to the other where it is used (`for_compute`), a layer's inside the loop over layers, and
+its gradient comes back (`hma_jax.kernels.dense` for what every robot has of its own). Model code names
+logical axes at most; the mesh is made in `mesh`, decisions are printed and audited in `audit`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, Sharding
+from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
 
-from hma_jax.config import ConfigError, MeshConfig
+Axes = tuple[str | None, ...]
+"""A name in the dimension letters for each dimension of an array; None: it has none."""
 
-RULES: dict[str, str | tuple[str, ...]] = {
-    "B": ("data", "fsdp"),
-    "D": "fsdp",
-    "W": "fsdp",
-    "D_out": "tensor",
-    "H": "tensor",
-    "F": "tensor",
-    "V": "tensor",
-}
-"""Logical axis -> mesh axis (or axes). An axis that is not listed is replicated."""
+Rules = tuple[tuple[str, tuple[str, ...]], ...]
+"""(logical axis, mesh axes), in order: mesh axes split the first dimension so named that they divide, once."""
+
+BATCH = ("data", "fsdp")
+"""The mesh axes over which examples are split."""
+
+STORAGE: Rules = (
+    ("H", ("tensor",)),
+    ("F", ("tensor",)),
+    ("V", ("tensor",)),
+    ("D_out", ("tensor",)),
+    # Widths first. A step takes its robots' slices out of arrays that hold all robots: where these are split
+    # by width, every device takes its part and nothing is sent. E comes last, for what has no width that divides.
+    ("D", ("fsdp",)),
+    ("W", ("fsdp",)),
+    ("F", ("fsdp",)),
+    ("D_out", ("fsdp",)),
+    ("V", ("fsdp",)),
+    ("U", ("fsdp",)),
+    ("C", ("fsdp",)),
+    ("P", ("fsdp",)),
+    ("S", ("fsdp",)),
+    ("E", ("fsdp",)),
+)
+
+COMPUTE: Rules = (
+    ("B", BATCH),
+    ("H", ("tensor",)),
+    ("F", ("tensor",)),
+    ("V", ("tensor",)),
+    ("D_out", ("tensor",)),
+)
 
 
-def make_mesh(config: MeshConfig, devices: list[jax.Device] | None = None) -> Mesh:
-    """The mesh of `config` over `devices` (default: all). Raises ConfigError if they do not fit."""
-    devices = jax.devices() if devices is None else devices
-    sizes = [config.data, config.fsdp, config.tensor]
-    given = math.prod(s for s in sizes if s != -1)
-    if -1 in sizes and len(devices) % given == 0:
-        sizes[sizes.index(-1)] = len(devices) // given
-    if math.prod(sizes) != len(devices):
-        raise ConfigError(
-            f"a mesh of data={config.data}, fsdp={config.fsdp}, tensor={config.tensor} does not "
-            f"fit {len(devices)} device(s); set one axis to -1 or change the sizes"
-        )
-    return Mesh(
-        np.array(devices).reshape(sizes), ("data", "fsdp", "tensor"), axis_types=(AxisType.Auto,) * 3
-    )
-
-
-def partition(axes: tuple[str | None, ...], shape: tuple[int, ...], mesh: Mesh) -> PartitionSpec:
-    """Mesh axes for an array's logical axes; a dimension that does not divide stays whole."""
-    spec: list[Any] = []
-    for axis, size in zip(axes, shape, strict=True):
-        target = RULES.get(axis) if axis else None
-        names = (target,) if isinstance(target, str) else target or ()
+def partition(axes: Axes, shape: tuple[int, ...], mesh: Any, rules: Rules = COMPUTE) -> PartitionSpec:
+    """Mesh axes for each dimension of an array. What divides nothing is not used: the array is whole along it."""
+    split: list[tuple[str, ...]] = [()] * len(shape)
+    for axis, names in rules:
         ways = math.prod(mesh.shape[name] for name in names)
-        spec.append(target if ways > 1 and size % ways == 0 else None)
-    return PartitionSpec(*spec)
+        if ways == 1 or any(name in used for name in names for used in split):
+            continue
+        for place, (own, size) in enumerate(zip(axes, shape, strict=True)):
+            if own == axis and size % (ways * math.prod(mesh.shape[name] for name in split[place])) == 0:
+                split[place] = (*split[place], *names)
+                break
+    return PartitionSpec(*[names if len(names) > 1 else names[0] if names else None for names in split])
 
 
-def constrain(x: jax.Array, axes: tuple[str | None, ...]) -> jax.Array:
+Layouts = tuple[PartitionSpec, PartitionSpec]
+"""Of one parameter: how it is stored, and how it is computed with."""
+
+
+def find_layouts(axes: Axes, shape: tuple[int, ...], smallest: int) -> Layouts | None:
+    """Of a parameter of that shape under the current mesh; None without one."""
+    if not is_split():
+        return None
+    mesh = jax.sharding.get_abstract_mesh()
+    return stored(axes, shape, mesh, smallest), partition(axes, shape, mesh)
+
+
+def stored(axes: Axes, shape: tuple[int, ...], mesh: Any, smallest: int) -> PartitionSpec:
+    """The layout of a parameter and its moments; with fewer than `smallest` elements it is on every device."""
+    if math.prod(shape) < smallest:
+        return PartitionSpec(*[None] * len(shape))
+    return partition(axes, shape, mesh, STORAGE)
+
+
+def constrain(x: jax.Array, axes: Axes) -> jax.Array:
     """Pins an activation's layout under the current mesh (`jax.set_mesh`); without one, x."""
     if not is_split():
         return x
+    return pinned(x, *partition(axes, x.shape, jax.sharding.get_abstract_mesh()))
+
+
+def pinned(x: jax.Array, *split: str | tuple[str, ...] | None) -> jax.Array:
+    """x laid out so on the current mesh; along dimensions that do not divide it is whole."""
     mesh = jax.sharding.get_abstract_mesh()
-    return jax.lax.with_sharding_constraint(x, partition(axes, x.shape, mesh))
+    ways = [math.prod(mesh.shape[name] for name in mesh_axes(part)) for part in split]
+    fitting = [part if size % n == 0 else None for part, size, n in zip(split, x.shape, ways, strict=True)]
+    return jax.lax.with_sharding_constraint(x, PartitionSpec(*fitting))
+
+
+def mesh_axes(part: str | tuple[str, ...] | None) -> tuple[str, ...]:
+    """The mesh axes that split one dimension, of its entry in a PartitionSpec."""
+    return (part,) if isinstance(part, str) else part or ()
 
 
 def is_split() -> bool:
-    """Whether what is traced runs under a mesh of several devices."""
+    """Whether what is traced runs under a mesh of several devices; what `shard_map` runs on each does not."""
     mesh = jax.sharding.get_abstract_mesh()
-    return not mesh.empty and math.prod(mesh.shape.values()) > 1
+    return math.prod(mesh.shape[axis] for axis in mesh.auto_axes) > 1
 
 
-class Spec(Protocol):
-    """What a layout depends on, of one array (`model.params.ParamSpec`)."""
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
-    @property
-    def axes(self) -> tuple[str | None, ...]: ...
-    @property
-    def size(self) -> int: ...
+def batch_ways() -> int:
+    """How many parts examples come in under the current mesh."""
+    if not is_split():
+        return 1
+    mesh = jax.sharding.get_abstract_mesh()
+    return math.prod(mesh.shape[name] for name in BATCH)
 
 
-class Declarations(Protocol):
-    """Specs as a tree and by name (`model.params.Declared`)."""
-
-    @property
-    def specs(self) -> Any: ...
-    def leaves(self) -> Mapping[str, Spec]: ...
+GATHER, SCATTER = "gather_parameters", "scatter_gradients"
+"""Names that what is sent for `for_compute` bears in a compiled program."""
 
 
-@dataclass(frozen=True)
-class Decision:
-    """How one parameter lies on the mesh, and why if it is whole on every device."""
+def for_compute(w: jax.Array, layouts: Layouts, dtype: Any = None) -> jax.Array:
+    """w as it is computed with, from how it is stored; its gradient goes the other way.
 
-    name: str
-    spec: Spec
-    partition: PartitionSpec
-    reason: str
-
-    @property
-    def replicated(self) -> bool:
-        return all(p is None for p in self.partition)
-
-
-def plan_sharding(declared: Declarations, mesh: Mesh, config: MeshConfig) -> list[Decision]:
-    """One decision per parameter, in the order of `declared.leaves()`."""
-    decisions = []
-    for name, spec in declared.leaves().items():
-        if spec.size < config.min_shard_size:
-            layout, reason = PartitionSpec(*[None] * len(spec.shape)), "small"
-        else:
-            layout = partition(spec.axes, spec.shape, mesh)
-            whole = all(p is None for p in layout)
-            reason = "no axis divides" if whole else "by its axes"
-        decisions.append(Decision(name, spec, layout, reason))
-    return decisions
-
-
-def audit_sharding(decisions: list[Decision], mesh: Mesh, limit: float = 0.02) -> None:
-    """Raises ConfigError when more than `limit` of all parameters is replicated, naming them.
-
-    Only a mesh that splits parameters (fsdp or tensor above 1) is audited.
+    It is sent in `dtype` (default: its own), which is then its type; the gradient of w has the type of w.
     """
-    if mesh.shape["fsdp"] * mesh.shape["tensor"] == 1:
-        return
-    total = sum(d.spec.size for d in decisions)
-    whole = sum(d.spec.size for d in decisions if d.replicated)
-    if whole > limit * total:
-        worst = sorted((d for d in decisions if d.replicated), key=lambda d: -d.spec.size)[:5]
-        raise ConfigError(
-            f"{whole / total:.1%} of the parameters would be replicated on every device (limit "
-            f"{limit:.0%}): " + ", ".join(f"{d.name} {d.spec.shape} ({d.reason})" for d in worst)
-        )
+    return _for_compute(w, layouts, w.dtype if dtype is None else dtype, w.dtype)
 
 
-def describe_sharding(decisions: list[Decision]) -> str:
-    """A table of all decisions, for people and for tests."""
-    rows = [f"{d.name:48} {str(d.spec.shape):24} {d.partition}  {d.reason}" for d in decisions]
-    return "\n".join(rows)
+@partial(jax.custom_vjp, nondiff_argnums=(1, 2, 3))
+def _for_compute(w: jax.Array, layouts: Layouts, sent_as: Any, own: Any) -> jax.Array:
+    storage, compute = layouts
+    w = pinned(w, *storage).astype(sent_as)
+    with jax.named_scope(GATHER):
+        return pinned(w, *compute)
 
 
-def param_shardings(declared: Declarations, mesh: Mesh, config: MeshConfig) -> Any:
-    """A tree of NamedSharding with the structure of the parameters."""
-    layouts = {d.name: NamedSharding(mesh, d.partition) for d in plan_sharding(declared, mesh, config)}
-    treedef = jax.tree.structure(declared.specs, is_leaf=lambda leaf: hasattr(leaf, "axes"))
-    return jax.tree.unflatten(treedef, list(layouts.values()))
+def _for_compute_backward(layouts: Layouts, sent_as: Any, own: Any, _: None, dw: jax.Array) -> tuple[jax.Array]:
+    with jax.named_scope(SCATTER):
+        return (pinned(dw, *layouts[0]).astype(own),)
+
+
+_for_compute.defvjp(lambda *args: (_for_compute(*args), None), _for_compute_backward)
 
 
 def place(array: np.ndarray, sharding: Sharding | None) -> jax.Array:
@@ -158,7 +158,7 @@ def place(array: np.ndarray, sharding: Sharding | None) -> jax.Array:
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
     """The leading axis of every array of a batch, over data and fsdp together."""
-    return NamedSharding(mesh, PartitionSpec(RULES["B"]))
+    return NamedSharding(mesh, PartitionSpec(BATCH))
 
 
 def put_batch(batch: Any, mesh: Mesh) -> Any:

@@ -20,7 +20,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hma_jax.config import ConfigError, MeshConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.model.params import Declared, Params, path_name
-from hma_jax.runtime.sharding import RULES, make_mesh
+from hma_jax.runtime.mesh import make_mesh
+from hma_jax.runtime.sharding import BATCH
 from hma_jax.tokenizers.base import PIECE, in_pieces
 
 
@@ -202,7 +203,7 @@ class BaseTokenizer(abc.ABC):
         """`function` compiled; every device applies it to its own rows of the batch."""
         if self._mesh.size == 1:
             return jax.jit(function)
-        whole, rows = PartitionSpec(), PartitionSpec(RULES["B"])
+        whole, rows = PartitionSpec(), PartitionSpec(BATCH)
         # One program per device, of the shape that a single one has: the same rounding on any number.
         return jax.jit(jax.shard_map(function, mesh=self._mesh, in_specs=(whole, rows), out_specs=rows))
 

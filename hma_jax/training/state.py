@@ -15,7 +15,8 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hma_jax.config import MeshConfig
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Params
-from hma_jax.runtime.sharding import param_shardings, place
+from hma_jax.runtime.audit import param_shardings
+from hma_jax.runtime.sharding import place
 from hma_jax.training.optimizer import init_adam
 
 FINITE = "finite/"

@@ -18,7 +18,9 @@ from hma_jax.model.flops import train_flops_per_window
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.runtime.devices import peak_flops
-from hma_jax.runtime.sharding import audit_sharding, make_mesh, plan_sharding, put_batch
+from hma_jax.runtime.audit import audit_sharding, plan_sharding
+from hma_jax.runtime.mesh import check_mesh, make_mesh
+from hma_jax.runtime.sharding import put_batch
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, Start, fit
 from hma_jax.training.runs import describe_run, modernise
@@ -55,6 +57,7 @@ def train_model(
     declared = declare_model(model, table, execution)
     mesh = execution.mesh
     device_mesh = make_mesh(mesh)
+    check_mesh(device_mesh, model, config.batch, execution.accumulate)
     audit_sharding(plan_sharding(declared, device_mesh, mesh), device_mesh)
     shapes = state_shapes(declared, table, device_mesh, mesh, average=config.ema_decay > 0)
 

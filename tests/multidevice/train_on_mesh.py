@@ -1,4 +1,4 @@
-"""Trains a tiny model of ids or latents on the mesh given as "data,fsdp,tensor"; prints a JSON line."""
+"""Trains a tiny model on the mesh given as "data,fsdp,tensor"; prints a JSON line."""
 
 import json
 import sys
@@ -6,18 +6,15 @@ from pathlib import Path
 
 import jax
 
-from hma_jax.config import DiffusionConfig, ExecutionConfig, MeshConfig
+from hma_jax.config import ExecutionConfig, MeshConfig
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
 from tests.tiny import TABLE, batches, model_config, train_config
 
-LATENTS = DiffusionConfig(channels=2, patch=1, width=64, depth=2, steps=20)
 
-
-def main(mesh: str, run_dir: str, steps: str, kind: str) -> None:
+def main(mesh: str, run_dir: str, steps: str) -> None:
     data, fsdp, tensor = map(int, mesh.split(","))
-    # Action heads of so small a model are a large part of it, and have no axis that splits eight ways.
-    model = model_config() if kind == "ids" else model_config(diffusion=LATENTS, action_heads=False)
+    model = model_config()
     result = train_model(
         model,
         TABLE,

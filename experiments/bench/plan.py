@@ -1,49 +1,60 @@
-"""Does a model fit? The real training step, compiled for devices that need not be there.
+"""How a model would train: the real training step, compiled for devices that need not be there.
 
 For a TPU topology XLA compiles ahead of time on any machine (extra `tpu`), and says what every
-device would hold. The same report comes from the devices at hand.
+device would hold and send. The same report comes from the devices at hand.
 """
 
 from __future__ import annotations
 
-import re
 import time
-from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
+from experiments.bench.collectives import Collective, Sent, find_collectives
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, ModelConfig, TrainConfig
 from hma_jax.kernels.attention import backend_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_window
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared
-from hma_jax.runtime.sharding import audit_sharding, batch_sharding, make_mesh, plan_sharding
+from hma_jax.runtime.audit import Decision, audit_sharding, plan_sharding
+from hma_jax.runtime.mesh import check_mesh, make_mesh
+from hma_jax.runtime.sharding import batch_sharding
 from hma_jax.training.state import TrainState, state_shapes
 from hma_jax.training.step import make_train_step
 
-COLLECTIVES = ("all-gather", "all-reduce", "reduce-scatter", "all-to-all", "collective-permute")
 LOCAL = "local"
 
 
 @dataclass(frozen=True)
-class Fit:
-    """What one device holds while it trains; bytes. Without memory figures it does not fit."""
+class Plan:
+    """How a model lies on a mesh, and what one device holds while it trains; bytes. Without memory figures it
+    does not fit."""
 
-    parameters: int
+    decisions: tuple[Decision, ...]
     devices: int
-    mesh: tuple[int, int, int]
+    mesh: Mapping[str, int]
     compile_seconds: float
     flops_per_step: float  # of the model, by formula, all devices together
     arguments: int = 0  # parameters, moments and this device's rows
     temporary: int = 0
     peak: int = 0
-    collectives: tuple[tuple[str, int], ...] = ()  # in the program's text; a scan's body counts once
+    collectives: Mapping[Collective, Sent] = field(default_factory=dict)
     refusal: str = ""  # the compiler's words when it does not fit
+
+    @property
+    def parameters(self) -> int:
+        return sum(d.spec.size for d in self.decisions)
+
+    @property
+    def stored(self) -> int:
+        """Of the parameters, in float32; the two moments are twice that."""
+        return 4 * sum(d.device_size for d in self.decisions)
 
 
 def find_devices(topology: str) -> list[Any]:
@@ -65,24 +76,26 @@ def find_devices(topology: str) -> list[Any]:
         ) from error
 
 
-def check_fit(
+def make_plan(
     model: ModelConfig, table: EmbodimentTable, train: TrainConfig, execution: ExecutionConfig, devices: list[Any]
-) -> Fit:
-    """Compiles the training step for `devices`. Raises ConfigError if the mesh does not suit them."""
+) -> Plan:
+    """Compiles the training step for `devices`.
+
+    Raises ConfigError if the mesh does not suit them or the model, or leaves large parameters whole.
+    """
     if execution.attention == "auto":  # of those devices, not of this machine's
         execution = replace(execution, attention=backend_of(devices[0].platform))
     declared = declare_model(model, table, execution)
     mesh_config = execution.mesh
     mesh = make_mesh(mesh_config, devices)
-    audit_sharding(plan_sharding(declared, mesh, mesh_config), mesh)
-    split = mesh.shape["data"] * mesh.shape["fsdp"]
-    if train.batch % split:
-        raise ConfigError(f"a batch of {train.batch} does not divide over {split} devices; change --batch or --mesh")
+    check_mesh(mesh, model, train.batch, execution.accumulate)
+    decisions = plan_sharding(declared, mesh, mesh_config)
+    audit_sharding(decisions, mesh)
     state, batch = abstract_inputs(declared, table, model, train, mesh_config, mesh)
     facts = dict(
-        parameters=declared.count(),
+        decisions=tuple(decisions),
         devices=len(devices),
-        mesh=tuple(mesh.shape.values()),
+        mesh=dict(mesh.shape),
         flops_per_step=train.batch * train_flops_per_window(model, table),
     )
     began = time.perf_counter()
@@ -99,15 +112,15 @@ def check_fit(
         except jax.errors.JaxRuntimeError as error:
             if "exceed" not in str(error) and "RESOURCE_EXHAUSTED" not in str(error):
                 raise
-            return Fit(**facts, compile_seconds=time.perf_counter() - began, refusal=_refusal(str(error)))
+            return Plan(**facts, compile_seconds=time.perf_counter() - began, refusal=_refusal(str(error)))
     memory = compiled.memory_analysis()
-    return Fit(
+    return Plan(
         **facts,
         compile_seconds=time.perf_counter() - began,
         arguments=int(memory.argument_size_in_bytes),
         temporary=int(memory.temp_size_in_bytes),
         peak=int(memory.peak_memory_in_bytes),
-        collectives=count_collectives(compiled.as_text()),
+        collectives=find_collectives(compiled.as_text(), mesh.shape),
     )
 
 
@@ -132,13 +145,6 @@ def abstract_inputs(
     }
     lying = batch_sharding(mesh)
     return state, {name: jax.ShapeDtypeStruct(*of, sharding=lying) for name, of in rows.items()}
-
-
-def count_collectives(text: str) -> tuple[tuple[str, int], ...]:
-    """How often each kind of communication stands in a compiled program's text."""
-    pattern = rf"= [^=]*? ({'|'.join(COLLECTIVES)})(?:-start)?\("
-    found = Counter(match.group(1) for match in re.finditer(pattern, text))
-    return tuple((name, found[name]) for name in COLLECTIVES if found[name])
 
 
 def _refusal(message: str) -> str:

@@ -1,0 +1,129 @@
+"""How every parameter lies on a mesh, for people and for tests; and an audit of what is left whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from typing import Any, Protocol
+
+import jax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from hma_jax.config import ConfigError, MeshConfig
+from hma_jax.runtime.sharding import Axes, mesh_axes, partition, stored
+
+
+class Spec(Protocol):
+    """What a layout depends on, of one array (`model.params.ParamSpec`)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+    @property
+    def axes(self) -> tuple[str | None, ...]: ...
+    @property
+    def size(self) -> int: ...
+
+
+class Declarations(Protocol):
+    """Specs as a tree and by name (`model.params.Declared`)."""
+
+    @property
+    def specs(self) -> Any: ...
+    def leaves(self) -> Mapping[str, Spec]: ...
+
+
+@dataclass(frozen=True)
+class Decision:
+    """How one parameter lies on a mesh, and why if it is not split."""
+
+    name: str
+    spec: Spec
+    storage: PartitionSpec
+    compute: PartitionSpec
+    device_size: int  # elements that each device stores
+    whole: bool  # not split along `fsdp`, or along `tensor` where that is the only one that splits parameters
+    reason: str  # why it is whole; "" if it is not
+
+    @property
+    def shape(self) -> str:
+        """'N 32, D 256': each dimension with its logical axis."""
+        return ", ".join(f"{axis or '-'} {size}" for axis, size in zip(self.spec.axes, self.spec.shape, strict=True))
+
+
+SMALL = "small"
+
+LISTED: Mapping[str, str] = {}
+"""Large parameters that may be whole on every device, by name (or a pattern of `fnmatch`), and why: none."""
+
+
+def plan_sharding(declared: Declarations, mesh: Any, config: MeshConfig) -> list[Decision]:
+    """One decision per parameter, in the order of `declared.leaves()`. Of `mesh` only the shape is read."""
+    splitting = "fsdp" if mesh.shape["fsdp"] > 1 else "tensor"
+    decisions = []
+    for name, spec in declared.leaves().items():
+        storage = stored(spec.axes, spec.shape, mesh, config.min_shard_size)
+        ways = math.prod(mesh.shape[axis] for axis in _mesh_axes(storage))
+        whole = splitting not in _mesh_axes(storage)
+        reason = ""
+        if whole:
+            reason = SMALL if spec.size < config.min_shard_size else "no axis divides"
+        compute = partition(spec.axes, spec.shape, mesh)
+        decisions.append(Decision(name, spec, storage, compute, spec.size // ways, whole, reason))
+    return decisions
+
+
+def audit_sharding(
+    decisions: list[Decision], mesh: Any, limit: float = 0.02, listed: Collection[str] = tuple(LISTED)
+) -> None:
+    """Raises ConfigError when more than `limit` of all parameters is whole and not `listed`, naming them.
+
+    Only a mesh that splits parameters (fsdp or tensor above 1) is audited. Parameters that are whole because
+    they are small (`MeshConfig.min_shard_size`) do not count.
+    """
+    if mesh.shape["fsdp"] * mesh.shape["tensor"] == 1:
+        return
+    total = sum(d.spec.size for d in decisions)
+    large = [d for d in decisions if d.whole and d.reason != SMALL]
+    whole = [d for d in large if not any(fnmatch(d.name, pattern) for pattern in listed)]
+    share = sum(d.spec.size for d in whole) / total
+    if share > limit:
+        worst = sorted(whole, key=lambda d: -d.spec.size)[:5]
+        raise ConfigError(
+            f"{share:.1%} of the parameters would be replicated on every device (limit {limit:.0%}): "
+            + ", ".join(f"{d.name} {d.spec.shape}" for d in worst)
+            + "; no mesh axis divides them: choose sizes of fsdp and tensor that do"
+        )
+
+
+def describe_sharding(decisions: Iterable[Decision]) -> str:
+    """One line per parameter: where it lies, and what one device stores of it in float32."""
+    return "\n".join(
+        f"{d.name} [{d.shape}]: stored {_words(d.storage)}, computed with {_words(d.compute)}, "
+        f"{size_of(4 * d.device_size)}{f', {d.reason}' if d.whole else ''}"
+        for d in decisions
+    )
+
+
+def size_of(count: int) -> str:
+    """'1.83 GiB' of a number of bytes."""
+    power = 0 if count < 2**10 else 1 if count < 2**20 else 2 if count < 2**30 else 3
+    return f"{count / 2 ** (10 * power):,.{2 if power else 0}f} {('B', 'KiB', 'MiB', 'GiB')[power]}"
+
+
+def param_shardings(declared: Declarations, mesh: Mesh, config: MeshConfig) -> Any:
+    """A tree of NamedSharding with the structure of the parameters: where they are stored."""
+    layouts = [NamedSharding(mesh, d.storage) for d in plan_sharding(declared, mesh, config)]
+    treedef = jax.tree.structure(declared.specs, is_leaf=lambda leaf: hasattr(leaf, "axes"))
+    return jax.tree.unflatten(treedef, layouts)
+
+
+def _mesh_axes(layout: PartitionSpec) -> list[str]:
+    return [name for part in layout for name in mesh_axes(part)]
+
+
+def _words(layout: PartitionSpec) -> str:
+    """'(fsdp, -)'; 'whole' where nothing is split."""
+    parts = ["+".join(mesh_axes(part)) or "-" for part in layout]
+    return f"({', '.join(parts)})" if set(parts) - {"-"} else "whole"

@@ -1,0 +1,76 @@
+"""The mesh: which device stands where on the axes `data`, `fsdp` and `tensor`.
+
+`data` splits the batch, `fsdp` the batch and the storage of parameters, `tensor` what is computed of one
+example. `tensor` communicates most and takes neighbours, `data` least and goes across slices of a machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jax.experimental import mesh_utils
+from jax.sharding import AxisType, Mesh
+
+from hma_jax.config import ConfigError, MeshConfig, ModelConfig, require
+
+AXES = ("data", "fsdp", "tensor")
+
+
+def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """The mesh of `config` over `devices` (default: those of all processes). Raises ConfigError if they do not fit."""
+    devices = jax.devices() if devices is None else devices
+    sizes = [config.data, config.fsdp, config.tensor]
+    given = math.prod(s for s in sizes if s != -1)
+    if -1 in sizes and len(devices) % given == 0:
+        sizes[sizes.index(-1)] = len(devices) // given
+    require(
+        math.prod(sizes) == len(devices),
+        f"a mesh of data={config.data}, fsdp={config.fsdp}, tensor={config.tensor} does not "
+        f"fit {len(devices)} device(s); set one axis to -1 or change the sizes",
+    )
+    return Mesh(arrange(sizes, devices), AXES, axis_types=(AxisType.Auto,) * 3)
+
+
+def arrange(sizes: Sequence[int], devices: Sequence[jax.Device]) -> np.ndarray:
+    """Devices as an array of `sizes` in which neighbours on an axis are neighbours in the machine.
+
+    Slices (of TPUs, or of GPUs without NVLink between them) are joined along `data` as far as it goes, then
+    along `fsdp`, then along `tensor`. Raises ConfigError for slices of unequal size.
+    """
+    slices = len({getattr(device, "slice_index", 0) for device in devices})
+    if slices == 1:
+        return mesh_utils.create_device_mesh(sizes, devices, allow_split_physical_axes=True)
+    outer = split_over_slices(sizes, slices)
+    inner = [size // ways for size, ways in zip(sizes, outer, strict=True)]
+    try:
+        return mesh_utils.create_hybrid_device_mesh(inner, outer, devices, allow_split_physical_axes=True)
+    except ValueError as error:
+        raise ConfigError(f"the {len(devices)} devices of {slices} slices make no mesh: {error}") from error
+
+
+def split_over_slices(sizes: Sequence[int], slices: int) -> list[int]:
+    """How many of the slices stand along each axis; their product is `slices`, which divides that of `sizes`."""
+    outer = []
+    for size in sizes:
+        outer.append(math.gcd(size, slices))
+        slices //= outer[-1]
+    return outer
+
+
+def check_mesh(mesh: Mesh, model: ModelConfig, batch: int, accumulate: int = 1) -> None:
+    """Raises ConfigError if a batch, or what `tensor` splits of the model, does not divide over the mesh."""
+    ways, tensor = mesh.shape["data"] * mesh.shape["fsdp"], mesh.shape["tensor"]
+    parts = f" in {accumulate} micro-batches" if accumulate > 1 else ""
+    require(
+        batch % (ways * accumulate) == 0,
+        f"a batch of {batch}{parts} does not divide over data={mesh.shape['data']} x fsdp={mesh.shape['fsdp']} "
+        f"devices; make it a multiple of {ways * accumulate}, or change the mesh",
+    )
+    for name, size in (("heads", model.heads), ("mlp_width", model.mlp_width)):
+        require(
+            size % tensor == 0,
+            f"tensor={tensor} does not divide the model's {name} of {size}; choose a tensor axis that does",
+        )
