@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from experiments.progress import tidy_table
-from experiments.provenance import Provenance
+from experiments.running.provenance import Provenance
 from experiments.study import Study
 from experiments.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
 from experiments.trial import Trial, trial_id
@@ -23,7 +23,7 @@ from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
 
-UNKNOWN = Provenance("", "", "", "")
+UNKNOWN = Provenance("", "", "")
 """Stands in where only the trials' own fields matter."""
 
 

@@ -16,7 +16,7 @@ from experiments.preparing.store import make_store
 from experiments.preparing.suite import make_suite
 from experiments.preparing.tokenizer import adopt_tokenizer, make_tokenizer
 from experiments.preparing.windows import freeze_windows, require_same_windows
-from experiments.provenance import Provenance
+from experiments.running.provenance import Provenance
 from experiments.study import Study
 from experiments.workspace import Workspace
 

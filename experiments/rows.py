@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import json
 import math
 import os
 from collections import defaultdict
@@ -17,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.provenance import Provenance
 from experiments.running.ledger import FINISHED
+from experiments.running.provenance import Provenance, read_record
 from experiments.running.runner import State
+from experiments.running.sealed import read_result
 from experiments.sweep import POINT, Point, Sweep
 from experiments.trial import trial_id
-from hma_jax.config import ConfigError
 
 OVERALL = "overall"
 """The scope that averages over all datasets of a sweep, each counting equally."""
@@ -41,14 +40,15 @@ class Row:
     """One number with its standard error, and where it comes from.
 
     It is a mean over `n` windows of `episodes` episodes, which the error counts (the training loss: over
-    `n` steps, `episodes` 0). A trial without a result has one row per sweep, with `metric` empty.
+    `n` steps, `episodes` 0). A trial without a result has one row per sweep, with `metric` empty. Fields with a
+    default are missing in tables of earlier versions.
     """
 
     sweep: str
     x: float
-    label: str  # the name of x, on an axis of names
+    label: str = ""  # the name of x, on an axis of names
     role: str  # one of `sweep`, or UNTRAINED
-    series: str  # the curve, in a sweep of several
+    series: str = ""  # the curve, in a sweep of several
     seed: int
     trial: str
     status: str  # a state of `ledger`
@@ -63,16 +63,8 @@ class Row:
     store: str
     manifest: str
     tokenizer: str
-    code: str
-
-
-def load_result(trials: Path, id: str) -> dict[str, Any]:
-    """What `run_trial` wrote. Raises ConfigError if it cannot be read."""
-    path = trials / id / "result.json"
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: unreadable ({error}); delete its directory to run it again") from error
+    results: int = 0  # version of what trials compute (`results_version`); 0 before they were numbered
+    code: str = ""  # hash of the sources that the trial ran (`closure`)
 
 
 def collect(
@@ -84,13 +76,15 @@ def collect(
         for point in sweep.points:
             id = trial_id(point.trial, provenance)
             state = states[id].event
-            result = load_result(trials, id) if state == FINISHED else None
-            rows += _rows(sweep, point, id, state, result, provenance)
+            result = read_result(trials / id) if state == FINISHED else None
+            record = read_record(trials / id) if result else None
+            origin = {**dataclasses.asdict(provenance), "code": record.code if record else ""}
+            rows += _rows(sweep, point, id, state, result, origin)
     return rows
 
 
 def _rows(
-    sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, provenance: Provenance
+    sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, origin: dict[str, Any]
 ) -> list[Row]:
     from hma_jax.evaluation.statistics import Stat, mean_and_sem
     from hma_jax.evaluation.summary import Summary
@@ -102,7 +96,7 @@ def _rows(
             scope=scope, metric=metric, **dataclasses.asdict(stat),
             parameters=result["parameters"] if result else 0,
             train_flops=result["train_flops"] if result else 0.0,
-            **dataclasses.asdict(provenance),
+            **origin,
         )  # fmt: skip
 
     if result is None:
@@ -132,7 +126,8 @@ def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
 
 
 def read_csv(path: Path) -> list[Row]:
-    kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int}
+    """The rows of a table that this or an earlier version wrote."""
+    kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int, "results": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
     with open(path, newline="") as file:
         return [Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}) for record in csv.DictReader(file)]

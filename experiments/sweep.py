@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from experiments.provenance import Provenance
+from experiments.running.provenance import Provenance
 from experiments.study import Study
 from experiments.trial import Trial, trial_id
 

@@ -5,12 +5,12 @@ A trial's directory holds
     run/            the training run (`hma_jax.training`): log, checkpoints
     samples.npz     true and predicted frames of a few windows per dataset
     windows.csv.gz  every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
-    result.json     written last: a trial with this file is finished
+    provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
+    result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
 """
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -18,9 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from data_pipelines.publishing.files import write_file
-from experiments.provenance import Provenance
+from experiments.machine import describe_machine
 from experiments.run_options import UNWATCHED, RunOptions
+from experiments.running.provenance import Provenance, record_end
 from experiments.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, TrainConfig
 from hma_jax.config.json import stable_hash, to_dict
@@ -242,7 +242,7 @@ def run_trial(
     import jax
 
     from data_pipelines.loading.selection import training_table
-    from experiments.machine import describe_machine
+    from experiments.running.sealed import write_result
     from hma_jax.model.flops import train_flops_per_window
     from hma_jax.model.hma import declare_model
     from hma_jax.runtime.processes import is_writer
@@ -278,7 +278,8 @@ def run_trial(
     }
     if is_writer():
         write_evaluation(directory, evaluation)
-        write_file(directory / "result.json", json.dumps(result, indent=1))
+        record_end(directory)
+        write_result(directory, result)
     return result
 
 

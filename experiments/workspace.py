@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from data_pipelines.publishing.files import write_file
+from experiments.former import modernise
 from experiments.program import PROGRAM
-from experiments.provenance import Provenance
+from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
@@ -124,13 +125,21 @@ def save_record(workspace: Workspace, record: Record) -> None:
 
 
 def find_record(workspace: Workspace) -> Record | None:
-    """The study that lives there; None without any. Raises ConfigError if its file cannot be read."""
+    """The study that lives there, as this or an earlier version recorded it; None without any.
+
+    Raises ConfigError if its file cannot be read.
+    """
     path = workspace.record
     try:
-        return from_dict(Record, json.loads(path.read_text()))
+        values = json.loads(path.read_text())
+        study, execution = modernise(values["study"])
+        values["study"] = study | {"execution": study.get("execution", {}) | execution}
+        if values.get("provenance"):
+            values["provenance"] = to_dict(inputs_of(values["provenance"]))
+        return from_dict(Record, values)
     except FileNotFoundError:
         return None
-    except ValueError as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{path} is damaged or of another version ({error}); delete it and run the study's command again"
         ) from error

@@ -199,7 +199,7 @@ def _published(final: Path, plan: Manifest) -> Manifest | None:
 
 
 def _changes(there: Manifest, plan: Manifest) -> list[str]:
-    inputs = ("spec", "tokenizer", "settings", "source")
+    inputs = ("spec", "tokenizer", "settings", "source", "recipe")
     n, asked = len(there.train.episodes) + len(there.val.episodes) + there.lost, plan.settings
     own = replace(asked, max_val_fraction=there.settings.max_val_fraction)
     if own.count_held_out(n) == asked.count_held_out(n):  # the limit differs, and changes nothing here

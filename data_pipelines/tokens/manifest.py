@@ -46,6 +46,10 @@ LATER = (
 )
 """Fields that stores of earlier versions lack, and what holds for those: their hash stays what it was."""
 
+RECIPE = 1
+"""Raise it when a change to the code alters what `tokenize_job` stores of the same source: tokens of an earlier
+number are then refused where new ones are asked for."""
+
 FORMAT, READ = 3, (2, 3)
 """Of the store's layout, and those that are read. 1 had one file per split, 2 the columns as JSON."""
 
@@ -141,6 +145,7 @@ class Manifest:
     action_quantiles: tuple[tuple[float, ...], ...] = ()  # one row per `row_sample.QUANTILES`
     skipped: tuple[LostEpisodes, ...] = ()  # what was left out
     runs: tuple[EpisodeRun, ...] = ()  # names of all episodes of the source, by number; (): they have no other
+    recipe: int = 1  # RECIPE of the code that made it; 1 for stores that do not say
     format: int = FORMAT
 
     def stride_at(self, rate: float | None = FRAME_RATE) -> int:
@@ -237,6 +242,8 @@ class Manifest:
         for name in ("runs", "action_quantiles"):
             if not values[name]:
                 del values[name]
+        if values["recipe"] == 1:
+            del values["recipe"]
         for group, field, as_before in LATER:
             if values[group][field] == as_before:
                 del values[group][field]

@@ -30,6 +30,7 @@ from data_pipelines.tokens.dataset_writer import PART_SIZE, Progress, cut_parts,
 from data_pipelines.tokens.encoder import Encoder
 from data_pipelines.tokens.episode_record import StoredEpisode, token_dtype
 from data_pipelines.tokens.manifest import (
+    RECIPE,
     JobSettings,
     LostEpisodes,
     Manifest,
@@ -142,6 +143,7 @@ def plan_dataset(
         train=SplitFacts(),
         val=SplitFacts(),
         runs=source.runs,
+        recipe=RECIPE,
     )
 
 

@@ -1,4 +1,4 @@
-"""Our stages beside the official release's: two processes that take turns, so that a slow spell hits both."""
+"""Our stages beside the official release's: processes that take turns, so that a slow spell hits all."""
 
 from __future__ import annotations
 
@@ -63,23 +63,37 @@ def time_beside(
     unknown = sorted(set(names) - set(RELEASED))
     require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASED)}")
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
-    # As text: started from its file, it would find our modules beside it before those of the standard library.
-    script = Path(__file__).with_name("released.py").read_text()
-    order = list(dict.fromkeys(turn for name in names for turn in ((THEIRS, RELEASED[name]), (OURS, name))))
-    as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
-    seconds: dict[tuple[str, str], list[float]] = {turn: [] for turn in order}
-    with ExitStack() as stack:
-        workers = {
-            THEIRS: stack.enter_context(Worker([str(python), "-c", script], **as_its_users)),
-            OURS: stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"], **KEPT_PAGES)),
-        }
-        for turn in range(-1, turns):  # the first one compiles and warms up
-            for whose, stage in order:
-                progress(f"{whose}{stage}", max(turn, 0))
-                took = workers[whose].run(stage)
-                if turn >= 0:
-                    seconds[whose, stage].append(took)
-    stages = [Stage(f"{whose}{stage}", 1, summarise(taken)) for (whose, stage), taken in seconds.items()]
+    seconds: dict[str, list[float]] = {}
+    for theirs in dict.fromkeys(RELEASED[name] for name in names):
+        ours = [name for name in names if RELEASED[name] == theirs]
+        seconds |= _take_turns(release, python, theirs, ours, turns, progress)
+    stages = [Stage(stage, 1, summarise(taken)) for stage, taken in seconds.items()]
     median = {stage.name: stage.timing.median for stage in stages}
     ratios = {f"{name}, times faster": median[THEIRS + RELEASED[name]] / median[OURS + name] for name in names}
     return stages, ratios
+
+
+def _take_turns(
+    release: Path, python: Path, theirs: str, ours: Sequence[str], turns: int, progress: Callable[[str, int], None]
+) -> dict[str, list[float]]:
+    """Seconds of every turn, of one stage of the release and those of ours that give the same.
+
+    Every stage has a process of its own, as its users have: among others it would meet memory that those
+    left in pieces, and a training step then takes a quarter longer.
+    """
+    # As text: started from its file, it would find our modules beside it before those of the standard library.
+    script = Path(__file__).with_name("released.py").read_text()
+    as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
+    with ExitStack() as stack:
+        workers = {THEIRS + theirs: (theirs, stack.enter_context(Worker([str(python), "-c", script], **as_its_users)))}
+        for name in ours:
+            worker = stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"], **KEPT_PAGES))
+            workers[OURS + name] = (name, worker)
+        seconds: dict[str, list[float]] = {stage: [] for stage in workers}
+        for turn in range(-1, turns):  # the first one compiles and warms up
+            for label, (stage, worker) in workers.items():
+                progress(label, max(turn, 0))
+                took = worker.run(stage)
+                if turn >= 0:
+                    seconds[label].append(took)
+    return seconds

@@ -20,6 +20,9 @@ class How:
     """Trials at a time, each in its own process with its share of the cores."""
     retry_failed: Annotated[FlagCreatePairsOff[bool], arg(name="retry-failed"), UNSET] = False
     """Run trials again that failed or diverged; otherwise they stay as they are, and visible."""
+    accept_code: Annotated[FlagCreatePairsOff[bool], arg(name="accept-code"), UNSET] = False
+    """Go on though the code changed since trials of the study ran; the page then counts the sources.
+    For changes that alter no result."""
     dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False
     """Print trials, parameters, FLOPs and expected time, and stop."""
 

@@ -57,9 +57,12 @@ def _run(command: str, where: Where, how: How, remake: Remake, axes: tuple[str, 
     commands.run_study(
         setting,
         axes,
-        again=setting.command(command, "--workers", str(how.workers), "--retry-failed"),
+        again=setting.command(
+            command, "--workers", str(how.workers), "--retry-failed", *["--accept-code"] * how.accept_code
+        ),
         workers=how.workers,
         retry_failed=how.retry_failed,
+        accept_code=how.accept_code,
         replace=remake.replace,
     )
 

@@ -6,8 +6,9 @@ Every command ends by saying what it wrote and what to run next.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.text import Text
 
@@ -23,14 +24,18 @@ from experiments import (
 from experiments.preparing.made_from import Step, require_same
 from experiments.program import command_line
 from experiments.progress import SweepMonitor, console
+from experiments.running.closure import Closure
 from experiments.running.ledger import FINISHED, Ledger
 from experiments.running.runner import Job, State, read_states, run_missing
 from experiments.setting import Setting, short
 from experiments.study import Study
-from experiments.sweep import titles, unique_trials
+from experiments.sweep import Sweep, titles, unique_trials
 from experiments.workspace import Busy, Record, Workspace, find_record, load_record, save_record
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
+
+if TYPE_CHECKING:
+    from experiments.rows import Row
 
 AXES = {
     "datasets": scale_datasets.plan,
@@ -55,21 +60,30 @@ def dry_run(study: Study, axes: Sequence[str]) -> None:
 
 
 def run_study(
-    setting: Setting, axes: Sequence[str], *, again: str, workers: int, retry_failed: bool, replace: Step | None
+    setting: Setting,
+    axes: Sequence[str],
+    *,
+    again: str,
+    workers: int,
+    retry_failed: bool,
+    accept_code: bool,
+    replace: Step | None,
 ) -> None:
     """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end.
 
     `again` is the command that tries failed trials once more. Raises ConfigError, before anything is done, if the
-    directory holds another study, unless `replace` allows it.
+    directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
+    changed, or if trials ran other sources than there are now and nobody accepts that.
     """
     from experiments.pipeline import prepare
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
+    from experiments.running.provenance import trial_closure
 
     study, workspace = setting.study, setting.workspace
     if not setting.data:
         require_simulated(study.dataset_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
-    sweeps = [AXES[axis](study) for axis in axes]
+    sweeps, sources = [AXES[axis](study) for axis in axes], trial_closure()  # a later change is refused by the trials
     with workspace.claimed():
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
@@ -80,9 +94,10 @@ def run_study(
             console.print(what, markup=False, soft_wrap=True)
         all_axes = tuple(dict.fromkeys([*(earlier.axes if earlier else ()), *axes]))
         record = Record(study, setting.data, all_axes, command_line(), provenance)
-        save_record(workspace, record)
         trials = unique_trials(sweeps, provenance)
-        common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution)}
+        require_agreement(workspace, record, trials, sources, accept_code)
+        save_record(workspace, record)
+        common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
         # The widest take longest: first, so that no worker is left with one at the end.
         ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
         names = titles(sweeps, provenance)
@@ -90,6 +105,20 @@ def run_study(
         states = run_jobs(jobs, workspace, workers, retry_failed)
         draw(workspace, record)
     complain(jobs, states, again)
+
+
+def require_agreement(
+    workspace: Workspace, record: Record, asked: Collection[str], sources: Closure, accept_code: bool
+) -> None:
+    """Raises ConfigError if a finished trial of the study is not what it was, or if its trials, with those to be run
+    of the ids that are `asked` for, ran different sources and nobody accepts that."""
+    from experiments.running.agreement import check_finished, require_one_closure
+    from experiments.running.sealed import RESULT
+
+    shown = unique_trials([AXES[axis](record.study) for axis in record.axes], record.provenance)
+    check_finished(workspace.trials, shown)
+    complete = all((workspace.trials / id / RESULT).exists() for id in asked)
+    require_one_closure(workspace.trials, shown, None if complete else sources, accept_code)
 
 
 def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Record | None:
@@ -137,7 +166,6 @@ def draw(workspace: Workspace, record: Record) -> None:
 def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.optima import Optimum, find_optima
     from experiments.report.page import write_report
-    from experiments.report.plots import plot_overview, plot_sweep
     from experiments.rows import Row, collect, read_csv, write_csv
 
     provenance = record.provenance
@@ -147,10 +175,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
     write_csv(workspace.results, Row, collect(sweeps, provenance, workspace.trials, states))
     rows = read_csv(workspace.results)  # figures show what the file says
-    workspace.figures.mkdir(exist_ok=True)
-    for sweep in sweeps:
-        plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
-    plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")
+    draw_figures(workspace, sweeps, rows)
     tables = [workspace.results]
     optima = find_optima(rows, sweeps)
     if optima:
@@ -158,6 +183,16 @@ def _draw(workspace: Workspace, record: Record) -> None:
         tables.append(workspace.optima)
     write_report(workspace, record, sweeps, rows, optima, states, provenance)
     wrote(*tables, workspace.figures, workspace.report)
+
+
+def draw_figures(workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row]) -> None:
+    """A figure for each sweep, and one of the scaling ones together."""
+    from experiments.report.plots import plot_overview, plot_sweep
+
+    workspace.figures.mkdir(exist_ok=True)
+    for sweep in sweeps:
+        plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
+    plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")
 
 
 def complain(jobs: Sequence[Job], states: dict[str, State], again: str) -> None:
@@ -200,6 +235,19 @@ def train_tokenizer(setting: Setting, replace: Step | None) -> None:
 
 
 def draw_again(out: Path) -> None:
-    """Report of a study that ran before, without touching its data or trials."""
+    """Report of a study that ran before, without touching its data or trials.
+
+    Where its trials are not, as with results that are kept for the record, its figures are drawn from its table,
+    and table and page stay as they are.
+    """
+    from experiments.rows import read_csv
+
     workspace = Workspace(out.absolute())
-    draw(workspace, load_record(workspace))
+    record = load_record(workspace)
+    if workspace.trials.exists() or not workspace.results.exists():
+        draw(workspace, record)
+        return
+    sweeps = [AXES[axis](record.study) for axis in record.axes]
+    draw_figures(workspace, sweeps, read_csv(workspace.results))
+    console.print(f"no trials in {short(workspace.root)}: drawn from its table, as it is; the page stays as it is")
+    wrote(workspace.figures)

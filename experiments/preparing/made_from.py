@@ -1,22 +1,23 @@
 """What a prepared thing was made from, and who may make it again in its place.
 
-Two kinds of facts are written beside what is made. *Inputs* are settings and data. A thing that is there and
-was made from other inputs is refused, never replaced, unless the user asked for that. What is only *recorded*
-(the hash of the sources, the temperature of the mixture) changes with every edit of the code or with settings
-that are meant for something else: a difference is said, and the thing that is there stays in use. Otherwise
-a corrected comment would destroy a tokenizer of hours. To have it made by the new sources, remove it.
+Three kinds of facts are written beside what is made, none of them a path or a time. *Inputs* are settings and data,
+by content. A thing that is there and was made from other inputs is refused, never replaced, unless the user asked for
+that. What is *recorded*, the hash of the sources that made it, changes with many an edit that alters nothing: a
+difference is said, and the thing that is there stays in use. To have it made by the new sources, remove it. The
+*machine* is for people.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from data_pipelines.publishing.files import write_file
 from experiments.progress import console
+from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
 
@@ -35,6 +36,9 @@ STAMP = "made_from.json"
 OLD_STAMP = "made_from.txt"
 """Of earlier versions: a hash, from which nobody can tell what differs."""
 
+FORMERLY_RECORDED = ("tau", "order")
+"""Inputs that stamps of earlier versions have as recorded only."""
+
 ORIGIN = "origin"
 """The input that decides which others there are."""
 
@@ -45,11 +49,15 @@ class MadeFrom:
 
     inputs: dict[str, Any]
     recorded: dict[str, Any] = field(default_factory=dict)
+    machine: dict[str, Any] = field(default_factory=dict)
+
+    def identity(self) -> dict[str, Any]:
+        """Equal for things that are made in the same way by the same sources, as JSON."""
+        return {"inputs": self.inputs, "recorded": self.recorded}
 
     @property
     def id(self) -> str:
-        """Equal for things that are made in the same way by the same sources."""
-        return stable_hash(self)
+        return stable_hash(self.identity())
 
     def save(self, directory: Path) -> None:
         write_file(directory / STAMP, json.dumps(to_dict(self), indent=1))
@@ -58,13 +66,17 @@ class MadeFrom:
 def read_stamp(directory: Path) -> MadeFrom | None:
     """What the thing in `directory` was made from; None if it is not written down there."""
     try:
-        return from_dict(MadeFrom, json.loads((directory / STAMP).read_text()))
+        there = from_dict(MadeFrom, json.loads((directory / STAMP).read_text()))
     except (OSError, ValueError):  # ConfigError is a ValueError
         return None
+    moved = {name: there.recorded[name] for name in FORMERLY_RECORDED if name in there.recorded}
+    recorded = {name: value for name, value in there.recorded.items() if name not in moved}
+    return replace(there, inputs=moved | there.inputs, recorded=recorded)
 
 
 def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str]:
-    """Lines 'setting: old -> new' for inputs that differ."""
+    """Lines 'setting: old -> new' for inputs that differ. What an earlier version did not write down of a dataset is
+    not compared."""
     if there.get(ORIGIN) != wanted.get(ORIGIN):
         return [f"{ORIGIN}: {there.get(ORIGIN)} -> {wanted.get(ORIGIN)}"]
     old, new = dict(there), dict(wanted)
@@ -72,7 +84,8 @@ def differences(there: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
     lines = dataset_differences(*names)
     data = old.pop("data", {}), new.pop("data", {})
     for name in [n for n in data[0] if n in data[1]]:
-        lines += diff(data[0][name], data[1][name], f"data of {name}")
+        known = {fact: value for fact, value in data[1][name].items() if fact in data[0][name]}
+        lines += diff(data[0][name], known, f"data of {name}")
     return diff(old, new) + lines
 
 
@@ -84,11 +97,6 @@ def dataset_differences(there: Sequence[str], wanted: Sequence[str]) -> list[str
     new = [n for n in wanted if n not in there]
     parts = [f"without {few(gone)}"] * bool(gone) + [f"with {few(new)}"] * bool(new)
     return [f"datasets: {len(there)} -> {len(wanted)}, {' and '.join(parts) or 'in another order'}"]
-
-
-def few(names: Sequence[str]) -> str:
-    """The first names of a list that may be long."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def may_replace(step: Step, asked: Step | None) -> bool:
@@ -116,8 +124,8 @@ def require_same(step: Step, place: Path, lines: Sequence[str], asked: Step | No
 
 
 def say_recorded(what: str, place: Path, there: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Tells that something stays in use although other sources would make it now."""
-    lines = diff(dict(there), dict(now))
+    """Tells that something stays in use although other sources would make it now; of what both say."""
+    lines = [line for name in there.keys() & now.keys() for line in diff(there[name], now[name], name)]
     if lines:
         console.print(
             f"note: {what} in {place} was made with other {'; '.join(lines)}. It stays in use; remove it to have "

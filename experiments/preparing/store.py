@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.preparing.made_from import Step, few, may_replace, require_same
+from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import Pace, step
 from experiments.study import Study
+from experiments.words import few
 from experiments.workspace import Workspace
 from hma_jax.config.json import to_dict
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_pipelines.publishing.files import publish, write_file
+from experiments.machine import describe_machine
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -24,8 +25,8 @@ from experiments.preparing.made_from import (
 )
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import console, step
-from experiments.provenance import source_hash
 from experiments.run_options import CHECKPOINTS
+from experiments.running.closure import closure_hash, trace
 from experiments.study import Study
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, TokenizerConfig, require
@@ -41,14 +42,20 @@ QUALITY_FRAMES = 1024
 HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
 """Settings of the store that say which episodes no tokenizer is trained on."""
 
+OF_FRAMES = ("image_key", "split", "val_split")
+"""Facts of a registry entry that say which frames a dataset has for a tokenizer."""
+
+SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames")
+"""The modules that train it; what they import follows (`running.closure`)."""
+
 TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
 
 
 def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     """What the tokenizer of a study is trained from, under the names that --set has for it.
 
-    Steps, batch or objective of the model are no part of it. Of the mixture's temperature, which is set for the
-    model's sake, the frames depend a little: it is recorded only.
+    Steps, batch or objective of the model are no part of it; the mixture's temperature is, and what the registry says
+    of where a dataset's frames are.
     """
     from data_pipelines.sampling.order import ORDER
 
@@ -56,8 +63,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     data = {
         spec.name: {
             "shards": open_source((spec, path), settings).fingerprint(),
-            "split": spec.split,
-            "image_key": spec.image_key,
+            **{name: getattr(spec, name) for name in OF_FRAMES},
         }
         for spec, path in sources
     }
@@ -66,10 +72,12 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
         "tokenizer": to_dict(study.tokenizer),
         "tokenizer_train": to_dict(study.tokenizer_train),
         "store": {name: getattr(settings, name) for name in HELD_OUT},
+        "tau": study.tau,
+        "order": ORDER,
         "datasets": list(data),
         "data": data,
     }
-    return MadeFrom(inputs, {"tau": study.tau, "order": ORDER, "sources": source_hash(("hma_jax/tokenizers",))})
+    return MadeFrom(inputs, {"code": closure_hash(trace(SOURCES))}, describe_machine())
 
 
 def make_tokenizer(
@@ -103,7 +111,7 @@ def make_tokenizer(
     aside = workspace.root / f"tokenizer.{made_from.id}"  # never resumed with other inputs
     with step("train the tokenizer") as update:
         tokenizer = train_tokenizer(
-            config, train, frames, aside, provenance=to_dict(made_from),
+            config, train, frames, aside, provenance=made_from.identity(),
             options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
             records=lambda index: frames(0).describe(index),

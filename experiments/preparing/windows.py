@@ -7,10 +7,11 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from data_pipelines.publishing.files import write_file
-from experiments.preparing.made_from import Step, dataset_differences, few, require_same
+from experiments.preparing.made_from import Step, dataset_differences, require_same
 from experiments.progress import console
-from experiments.provenance import Provenance, source_hash
+from experiments.running.provenance import Provenance
 from experiments.study import StoreConfig, Study
+from experiments.words import few
 from experiments.workspace import Workspace
 from hma_jax.config import require
 
@@ -62,7 +63,7 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
             soft_wrap=True,
         )
     (identity,) = {store.manifest(name).tokenizer.identity for name in names}
-    return Provenance(store.hash(names), manifest.hash(), identity, source_hash())
+    return Provenance(store.hash(names), manifest.hash(), identity)
 
 
 def windows_are_frozen(study: Study, workspace: Workspace) -> bool:

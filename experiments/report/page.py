@@ -16,14 +16,17 @@ from typing import Any
 import numpy as np
 
 from experiments.optima import Optimum
-from experiments.provenance import Provenance
 from experiments.report.pieces import card, frames, picture, pm, section, table
 from experiments.report.plot_style import drawn_metrics
 from experiments.report.style import CSS
 from experiments.report.sweeps import GAINS, TITLES, describe
-from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve, load_result
+from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve
+from experiments.running.agreement import describe as describe_sources
+from experiments.running.agreement import group_by_sources
 from experiments.running.ledger import FINISHED
+from experiments.running.provenance import Provenance
 from experiments.running.runner import State
+from experiments.running.sealed import read_result
 from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from experiments.trial import Trial, trial_id
 from experiments.workspace import Record, Workspace
@@ -48,7 +51,7 @@ def write_report(
     finished = [id for id, state in states.items() if state.event == FINISHED]
     shown = reference in finished
     witness = reference if shown else next(iter(finished), None)
-    result = load_result(workspace.trials, witness) if witness else None
+    result = read_result(workspace.trials / witness) if witness else None
     body = [
         _headline(workspace, record, sweeps, rows, states, home, result),
         *_curves(workspace, sweeps, rows, optima),
@@ -57,7 +60,7 @@ def write_report(
         )) if shown else "",
         section("Reference trial by dataset", _dataset_table(rows, home, workspace)) if shown else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance)),
-        section("How to repeat it", _origin(workspace, record, provenance, result)),
+        section("How to repeat it", _origin(workspace, record, provenance, finished, result)),
     ]  # fmt: skip
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -214,7 +217,7 @@ def _trial_table(
         state = states[id]
         cells = ["–", "–", "–", "–"]
         if state.event == FINISHED:
-            result = load_result(workspace.trials, id)
+            result = read_result(workspace.trials / id)
             run, losses = result["run"], result["losses"]
             cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
                      f"{losses[-1]:.3f}"]  # fmt: skip
@@ -227,9 +230,15 @@ def _trial_table(
 
 
 def _origin(
-    workspace: Workspace, record: Record, provenance: Provenance, result: dict[str, Any] | None
+    workspace: Workspace,
+    record: Record,
+    provenance: Provenance,
+    finished: Sequence[str],
+    result: dict[str, Any] | None,
 ) -> str:
     machine = result["run"]["machine"] if result else {}
+    ran = group_by_sources(workspace.trials, finished)
+    counted = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
     facts = {
         "command": record.command,
         "data": ", ".join(record.data)
@@ -237,7 +246,8 @@ def _origin(
         "token store": provenance.store,
         "evaluation manifest": provenance.manifest,
         "tokenizer": provenance.tokenizer,
-        "sources": provenance.code,
+        "version of the results": str(provenance.results),
+        "sources": counted + "; ".join(describe_sources(ran)) if ran else "unknown",
         "commit": machine.get("commit") or "unknown",
         "processor": f"{machine.get('processor', 'unknown')}, {machine.get('cores', '?')} cores",
         "devices": ", ".join(machine.get("devices", [])) or "unknown",

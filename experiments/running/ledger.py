@@ -17,6 +17,8 @@ from typing import Any
 from hma_jax.config import ConfigError
 
 STARTED, FINISHED, FAILED, DIVERGED = "started", "finished", "failed", "diverged"
+REFUSED = "refused"
+"""Its sources are not those that the sweep was started with: it did not run, and may the next time."""
 MISSING, INTERRUPTED = "missing", "interrupted"
 """States that no line states: no line at all, and started without an end."""
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from data_pipelines.publishing.files import write_file
 from experiments.running.children import child_environment
-from experiments.running.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, STARTED, Ledger
+from experiments.running.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, REFUSED, STARTED, Ledger
 from experiments.running.trial_main import FAILURE, JOB, PROGRESS, RESULT, STOPPED
 
 GRACE_SECONDS = 60.0
@@ -93,7 +93,7 @@ def run_missing(
     monitor = monitor or Monitor()
     ids = [job.id for job in jobs]
     before = read_states(ids, trials, ledger)
-    again = {MISSING, INTERRUPTED} | ({FAILED, DIVERGED} if retry_failed else set())
+    again = {MISSING, INTERRUPTED, REFUSED} | ({FAILED, DIVERGED} if retry_failed else set())
     waiting = [job for job in jobs if before[job.id].event in again]
     running: dict[int, _Running] = {}
     recorded = {id for id, record in ledger.states().items() if record["event"] == FINISHED}
@@ -119,6 +119,8 @@ def run_missing(
                 details = {"message": state.message} if state.message else {}
                 ledger.append(child.job.id, state.event, seconds=round(seconds, 1), **details)
                 monitor.ended(child.job, state, seconds)
+                if state.event == REFUSED:  # as every other one would be
+                    waiting.clear()
     finally:
         _stop([child.process for child in running.values()])
     return read_states(ids, trials, ledger)

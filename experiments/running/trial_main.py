@@ -1,7 +1,8 @@
 """The process of one trial: `python -m experiments.running.trial_main DIRECTORY`.
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
-the state and one message. The runner starts this; run it by hand to debug a trial.
+the state and one message. A trial whose sources are not those that job.json names is refused before any work.
+The runner starts this; run it by hand to debug a trial.
 """
 
 from __future__ import annotations
@@ -21,23 +22,29 @@ STOPPED = Exit.STOPPED
 
 
 def main(directory: Path) -> int:
-    """0: finished; 1: failed or diverged (see failure.json); STOPPED: will resume."""
+    """0: finished; 1: failed or diverged (see failure.json); 2: refused, the sources changed; STOPPED: will resume."""
     settle()  # before anything imports JAX
+
+    job = json.loads((directory / JOB).read_text())
+    closure = _load_sources(directory, job.get("code"))
+    if closure is None:
+        return Exit.REFUSED
 
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
     from experiments.job import read_job
     from experiments.running.ledger import DIVERGED, FAILED
+    from experiments.running.provenance import inputs_of, record_start
     from experiments.trial import run_trial
     from experiments.workspace import Workspace
     from hma_jax.config import ConfigError
     from hma_jax.training.divergence import DivergedError
     from hma_jax.training.loop import Interrupted
 
-    job = json.loads((directory / JOB).read_text())
     report = _ProgressFile(directory / PROGRESS)
     try:
         trial, execution = read_job(job)
+        record_start(directory, inputs_of(job["provenance"]), closure)
         with terminated_like_interrupted():  # also while it evaluates
             run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
         return 0
@@ -50,6 +57,19 @@ def main(directory: Path) -> int:
         state = DIVERGED if isinstance(error, DivergedError) else FAILED
         write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
         return 1
+
+
+def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, str] | None:
+    """The closure of what is run, imported; None if it is not what was given, of which failure.json is left."""
+    from data_pipelines.publishing.files import write_file
+    from experiments.running.ledger import REFUSED
+    from experiments.running.provenance import CodeChanged, load_sources
+
+    try:
+        return load_sources(given)
+    except CodeChanged as error:
+        write_file(directory / FAILURE, json.dumps({"state": REFUSED, "message": str(error)}))
+        return None
 
 
 class _ProgressFile:

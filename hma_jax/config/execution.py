@@ -26,6 +26,10 @@ Remat = Literal["none", "products", "attention", "everything", "offload"]
 Attention = Literal["auto", "plain", "cpu", "cudnn", "splash"]
 """What computes attention (`hma_jax.kernels`); `auto` takes what suits the platform and the shapes."""
 
+FORMER_FIELDS = {"model": ("compute_dtype", "remat", "attention"), "train": ("accumulate",)}
+"""Fields of configurations that earlier versions wrote there and that say how a run was computed, not what it is;
+they are not compared."""
+
 
 @dataclass(frozen=True)
 class MeshConfig:

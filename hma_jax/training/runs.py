@@ -9,16 +9,13 @@ from typing import Any
 import jax
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, Weights, require
+from hma_jax.config.execution import FORMER_FIELDS
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params, inference_params
 from hma_jax.runtime.devices import default_device
 from hma_jax.training.reading import CheckpointError, has_item, list_steps, load_items, read_description
-
-FORMER_FIELDS = {"model": ("compute_dtype", "remat", "attention"), "train": ("accumulate",)}
-"""Fields of descriptions that earlier versions wrote and that say how a run was computed, not what it
-is (`config.execution`); they are not compared."""
 
 
 @dataclass(frozen=True)

@@ -11,16 +11,19 @@ import numpy as np
 
 from experiments.commands.study import AXES, SCALING
 from experiments.presets import SMOKE
-from experiments.provenance import Provenance
 from experiments.rows import Row, collect
 from experiments.running.ledger import Ledger
+from experiments.running.provenance import Provenance, Start, TrialRecord
 from experiments.running.runner import read_states
+from experiments.running.sealed import write_result
 from experiments.study import Study, TransferConfig
 from experiments.sweep import Sweep, titles, unique_trials
 from experiments.trial import Trial, write_samples
 from experiments.workspace import Record, Workspace
+from hma_jax.config.json import to_dict
 
-PROVENANCE = Provenance(store="5708e", manifest="3a41f", tokenizer="70c3", code="c0de")
+PROVENANCE = Provenance(store="5708e", manifest="3a41f", tokenizer="70c3")
+RECORD = TrialRecord(PROVENANCE, {"c0de": {"experiments.trial": "1"}}, {}, (Start("c0de", {"commit": "abc"}),))
 STUDY = replace(
     SMOKE,
     datasets=("arm", "rover", "pusher"),
@@ -55,8 +58,11 @@ def finished_study(
             ledger.append(id, state, message="the loss is <nan> at step 2")
             continue
         ledger.append(id, "finished")
-        (directory / "result.json").write_text(json.dumps(result_of(trial, without)))
+        (directory / "job.json").write_text(json.dumps({"trial": to_dict(trial), "provenance": to_dict(PROVENANCE),
+                                                        "execution": to_dict(study.execution)}))  # fmt: skip
+        (directory / "provenance.json").write_text(json.dumps(to_dict(RECORD)))
         write_samples(directory / "samples.npz", samples_of(trial))
+        write_result(directory, result_of(trial, without))
     return workspace
 
 

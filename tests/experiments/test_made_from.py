@@ -8,10 +8,17 @@ import pytest
 
 from data_pipelines.registry import get_spec
 from data_pipelines.suite import generate as suite_generator
-from experiments import provenance
+from data_pipelines.tokens import tokenize_job
 from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
-from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
+from experiments.preparing.made_from import (
+    OLD_STAMP,
+    STAMP,
+    dataset_differences,
+    differences,
+    may_replace,
+)
+from experiments.running.closure import trace
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 
@@ -78,11 +85,11 @@ def test_settings_that_nothing_prepared_depends_on_ask_for_nothing(setting, hma,
 
 def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
     shutil.rmtree(out / "tokenizer")
-    publish = tokenizer_step._publish
-    monkeypatch.setattr(tokenizer_step, "_publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    publish = tokenizer_step.publish
+    monkeypatch.setattr(tokenizer_step, "publish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     assert hma("tokenize")[0] == 130
     (aside,) = out.glob("tokenizer.*")
-    monkeypatch.setattr(tokenizer_step, "_publish", publish)
+    monkeypatch.setattr(tokenizer_step, "publish", publish)
     trained = (aside / "metrics.jsonl").stat().st_mtime_ns
     assert hma("tokenize")[0] == 0
     assert not aside.exists() and (out / "tokenizer" / "metrics.jsonl").stat().st_mtime_ns >= trained
@@ -95,6 +102,7 @@ def test_interrupted_work_of_the_same_inputs_goes_on(hma, out, monkeypatch):
     ("arguments", "step", "line"),
     [
         (["--set", "tokenizer_train.steps=3"], "tokenizer", "tokenizer_train.steps: 5 -> 3"),
+        (["--set", "tau=2"], "tokenizer", "tau: 3.0 -> 2.0"),
         (["--set", "tokenizer.channels=8"], "tokenizer", "tokenizer.channels: 16 -> 8"),
         (["--set", "store.min_val=1"], "tokenizer", "store.min_val: 2 -> 1"),
         (["--set", "store.frame_step=1"], "tokens", "store.frame_step: 3 -> 1 (berkeley_gnm_cory_hall, "),
@@ -168,20 +176,73 @@ def test_the_tokenizer_that_is_there_can_be_given(hma, out):
 
 def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypatch):
     before = contents(out)
-    monkeypatch.setattr(tokenizer_step, "source_hash", lambda *_: "edited")
-    code, said = hma("tokenize", "--set", "tau=2")
-    assert code == 0 and "made with other sources: " in said and "-> 'edited'" in said and "tau: 3.0 -> 2.0" in said
+    monkeypatch.setattr(tokenizer_step, "closure_hash", lambda _: "edited")
+    code, said = hma("tokenize")
+    assert code == 0 and "made with other code: " in said and "-> 'edited'" in said
     assert contents(out) == before
     assert hma("tokenize", "--replace", "suite")[0] == 0
     assert contents(out) == before  # nothing that was asked for differs
     shutil.rmtree(out / "tokenizer")
-    assert hma("tokenize")[0] == 0 and "other sources" not in hma("tokenize")[1]
+    assert hma("tokenize")[0] == 0 and "other code" not in hma("tokenize")[1]
 
 
 def test_sources_of_the_tokenizer_are_its_own():
-    everything, own = provenance.source_hash(), provenance.source_hash(("hma_jax/tokenizers",))
-    assert everything != own == provenance.source_hash(("hma_jax/tokenizers",))
-    assert provenance.source_hash(("experiments/trial.py",)) not in (everything, own)
+    names = trace(tokenizer_step.SOURCES)
+    assert {"hma_jax.tokenizers.lfq", "data_pipelines.sources.rlds.images", "hma_jax.training.loop"} <= names.keys()
+    assert not [name for name in names if name.startswith(("experiments", "hma_jax.model.trunk"))]
+
+
+def test_a_stamp_of_an_earlier_version_is_read_in_place(hma, out):
+    stamp = json.loads((out / "tokenizer" / STAMP).read_text())
+    inputs = stamp["inputs"]
+    recorded = {name: inputs.pop(name) for name in ("tau", "order")} | {"sources": "0123456789abcdef"}
+    for facts in inputs["data"].values():
+        del facts["val_split"]
+    (out / "tokenizer" / STAMP).write_text(json.dumps({"inputs": inputs, "recorded": recorded}))
+    before = contents(out)
+    code, said = hma("tokenize")
+    assert code == 0 and "other code" not in said and contents(out) == before
+    code, said = hma("tokenize", "--set", "tau=2")
+    assert code == 2 and "\n  tau: 3.0 -> 2.0" in said and contents(out) == before
+
+
+def test_a_corrected_image_key_does_not_keep_a_tokenizer_of_the_wrong_camera(hma, out, monkeypatch):
+    before, wrong = contents(out), "steps/observation/wrist"
+    stamp = json.loads((out / "tokenizer" / STAMP).read_text())
+    stamp["inputs"]["data"][ARM.name]["image_key"] = wrong
+    (out / "tokenizer" / STAMP).write_text(json.dumps(stamp))
+    code, said = hma("tokenize")
+    assert code == 2 and f"data of {ARM.name}.image_key: '{wrong}' -> '{ARM.image_key}'" in said
+    assert "--replace tokenizer" in said and f"--tokenizer {out / 'tokenizer'}" in said
+    assert contents(out).keys() == before.keys()
+
+
+def test_tokenizer_and_windows_copied_to_another_place_are_those_of_the_study(hma, out, made, tmp_path):
+    """Small files of content alone: no path, no time."""
+    here = tmp_path / "elsewhere"
+    (here / "tokenizer").mkdir(parents=True)
+    for name in (STAMP, "tokenizer.json", "weights.npz"):
+        (here / "tokenizer" / name).write_bytes((out / "tokenizer" / name).read_bytes())
+    (here / "eval_manifest.json").write_bytes((out / "eval_manifest.json").read_bytes())
+    copied = contents(here)
+    assert not [name for name, data in copied.items() if str(out).encode() in data or str(made[0]).encode() in data]
+    assert sum(map(len, copied.values())) < 100_000
+    command = ["tokenize", *SMOKE, "--out", str(here), *made[1], "--set", "tokenizer_train.steps=5"]
+    assert main(command) == 0
+    again = contents(here)
+    assert {name: again[name] for name in copied} == copied
+    tokens = {name: data for name, data in contents(out).items() if name.startswith("tokens/")}
+    assert tokens and {name: data for name, data in again.items() if name.startswith("tokens/")} == tokens
+
+
+def test_tokens_that_earlier_code_would_make_otherwise_are_refused_and_stay(hma, out, monkeypatch):
+    before = contents(out)
+    monkeypatch.setattr(tokenize_job, "RECIPE", tokenize_job.RECIPE + 1)
+    code, said = hma("tokenize")
+    assert code == 2 and f"recipe: {tokenize_job.RECIPE - 1} -> {tokenize_job.RECIPE} ({ARM.name}" in " ".join(said.split())
+    assert "--replace tokens" in said and contents(out) == before
+    assert hma("tokenize", "--replace", "tokens")[0] == 0 and hma("tokenize")[0] == 0
+    assert contents(out) != before
 
 
 @pytest.mark.parametrize("old", [True, False])
@@ -278,5 +339,6 @@ def test_the_stamp_holds_the_inputs(made):
     stamp = json.loads((made[0] / "tokenizer" / STAMP).read_text())
     assert stamp["inputs"]["tokenizer_train"]["steps"] == 5
     assert stamp["inputs"]["datasets"] == [ARM.name, "dlr_edan_shared_control_converted_externally_to_rlds"]
-    assert set(stamp["recorded"]) == {"tau", "order", "sources"}
+    assert stamp["inputs"]["tau"] == 3.0 and set(stamp["recorded"]) == {"code"} and "commit" in stamp["machine"]
+    assert stamp["inputs"]["data"][ARM.name]["image_key"] == ARM.image_key
     assert BASE.name not in stamp["inputs"]["data"]

@@ -29,7 +29,7 @@ def test_rows_carry_hashes_and_average_over_the_scope(drawn):
     assert [r.scope for r in each] == ["arm", "rover"]  # the reference knows three, the axis judges two
     assert first.mean == pytest.approx(sum(r.mean for r in each) / 2)
     assert first.sem == pytest.approx(0.2 / math.sqrt(2)) and (first.n, first.episodes) == (20, 8)
-    assert (first.store, first.code) == (PROVENANCE.store, PROVENANCE.code)
+    assert (first.store, first.results, first.code) == (PROVENANCE.store, PROVENANCE.results, "c0de")
 
 
 def test_csv_reads_back_what_was_written(drawn, tmp_path):

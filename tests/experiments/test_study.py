@@ -9,7 +9,7 @@ import pytest
 from experiments import scale_datasets, scale_trajectories, scale_width
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
-from experiments.provenance import Provenance
+from experiments.running.provenance import Provenance
 from experiments.setting import Preset
 from experiments.study import on_user_data, override
 from experiments.sweep import reference_trial, unique_trials
@@ -18,7 +18,7 @@ from hma_jax.config import ConfigError, MeshConfig
 from hma_jax.config.json import from_dict, to_dict
 
 PLANS = (scale_datasets.plan, scale_trajectories.plan, scale_width.plan)
-PROVENANCE = Provenance("store", "manifest", "tokenizer", "code")
+PROVENANCE = Provenance("store", "manifest", "tokenizer")
 
 
 @pytest.mark.parametrize("study", PRESETS.values(), ids=PRESETS)
@@ -64,7 +64,8 @@ def test_id_changes_with_everything_that_determines_a_trial():
         replace(trial, shuffle_actions=True),
     ]
     ids = {trial_id(t, PROVENANCE) for t in [trial, *changed]}
-    ids |= {trial_id(trial, replace(PROVENANCE, **{f: "other"})) for f in ("store", "manifest", "tokenizer", "code")}
+    ids |= {trial_id(trial, replace(PROVENANCE, **{f: "other"})) for f in ("store", "manifest", "tokenizer")}
+    ids.add(trial_id(trial, replace(PROVENANCE, results=PROVENANCE.results + 1)))
     assert len(ids) == 1 + len(changed) + 4
     same = from_dict(type(trial), to_dict(trial))  # through job.json
     assert trial_id(same, PROVENANCE) == trial_id(trial, PROVENANCE)

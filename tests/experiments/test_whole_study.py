@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from experiments.rows import curve, read_csv
+from experiments.running.closure import closure_hash
+from experiments.running.provenance import read_record, trial_closure
 
 
 def hma(*arguments: str) -> list[str]:
@@ -36,6 +38,9 @@ def test_one_command_goes_from_nothing_to_a_page(tmp_path):
     assert untrained.mean == pytest.approx(256, rel=0.02)  # the vocabulary of the smoke tokenizer
     page = (tmp_path / "report.html").read_text()
     assert page.count("data:image/png") == 1 + 3 * 3
+    closures = [record for path in (tmp_path / "trials").iterdir() if (record := read_record(path))]
+    assert {record.code for record in closures} == {closure_hash(trial_closure())} == {r.code for r in rows}
+    assert [record.besides for record in closures] == [{}, {}]  # the closure is all that was imported
 
 
 @pytest.mark.slow

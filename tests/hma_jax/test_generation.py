@@ -80,7 +80,7 @@ def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
     "decode, prompt, alignment",
     [
         pytest.param(DecodeConfig(1), 1, "released", marks=pytest.mark.slow),
-        (DecodeConfig(2), 3, "released"),
+        pytest.param(DecodeConfig(2), 3, "released", marks=pytest.mark.slow),
         (DecodeConfig(3, 1.0), 3, "causal"),
         pytest.param(DecodeConfig(4, order="confidence"), 1, "causal", marks=pytest.mark.slow),
     ],
@@ -118,7 +118,7 @@ def test_the_cached_rollout_is_exact_with_hidden_actions(conditioning: str):
 
 
 @pytest.mark.exact
-@pytest.mark.parametrize("conditioning", ["cross_attention", *some(["concat+modulate"])])
+@pytest.mark.parametrize("conditioning", some(["cross_attention", "concat+modulate"]))
 def test_actions_that_are_all_hidden_make_no_difference(conditioning: str):
     config = model_config(conditioning=conditioning)
     declared, params = lively_params(config)
@@ -373,13 +373,12 @@ def test_one_to_twenty_four_frames_of_different_robots_equal_the_oracle_s(condit
     start, actions = batch["tokens"][:, :1], batch["actions"]
     naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, actions, robots, keys, decode))
     want = np.asarray(naive(params))
-    for new in (1, 4, NEW) if decode == SAMPLED else (NEW,):
+    for new in (1, NEW) if decode == SAMPLED else (NEW,):
         chunks = actions[:, None, : 1 + new]
         fast = jax.jit(lambda p, a=chunks: rollout(declared.merge(p), start, a, robots, keys, decode)[:, 0])
         np.testing.assert_array_equal(fast(params), want[:, :new])
 
 
-@pytest.mark.exact
 def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions():
     hidden = np.random.default_rng(0).random((2, LONG)) < 0.5
     got, want = whole_rollouts(model_config(diffusion=DIFFUSION), DecodeConfig(2, sampler=SAMPLER), 4, hidden)

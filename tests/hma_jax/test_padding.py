@@ -26,9 +26,9 @@ CONTINUOUS = replace(MODEL, diffusion=DIFFUSION)
 LENGTHS = np.array([5, 2, 3, 4])
 REAL = np.arange(FRAMES) < LENGTHS[:, None]
 KINDS = [
-    pytest.param(MODEL, "forward", id="forward"),
+    pytest.param(MODEL, "forward", id="forward", marks=pytest.mark.slow),
     pytest.param(MODEL, "full", id="full"),
-    pytest.param(MODEL, "inverse", id="inverse"),
+    pytest.param(MODEL, "inverse", id="inverse", marks=pytest.mark.slow),
     pytest.param(replace(MODEL, action_alignment="causal"), "policy", id="policy", marks=pytest.mark.slow),
     pytest.param(CONTINUOUS, "full", id="continuous", marks=pytest.mark.slow),
 ]

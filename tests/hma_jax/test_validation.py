@@ -57,8 +57,11 @@ def test_validation_changes_nothing_of_the_run_and_is_no_part_of_it(tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("changes", "masking"),
-    [({}, MaskingConfig()), ({}, MaskingConfig(setting="full")), ({"diffusion": DIFFUSION}, MaskingConfig())],
-    ids=["discrete", "full", "continuous"],
+    [
+        pytest.param({}, MaskingConfig(), id="discrete"),
+        pytest.param({}, MaskingConfig(setting="full"), id="full", marks=pytest.mark.slow),
+        pytest.param({"diffusion": DIFFUSION}, MaskingConfig(), id="continuous", marks=pytest.mark.slow),
+    ],
 )
 def test_points_are_comparable_and_rows_that_fill_up_do_not_count(changes, masking):
     model = model_config(**SMALLER, **changes)

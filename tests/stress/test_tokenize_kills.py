@@ -15,6 +15,7 @@ from tests.stress import tokenize_kills
 from tests.stress.tokenize_process import Work, read, tokenize
 
 
+@pytest.mark.slow
 def test_kills_among_processes_leave_no_trace(tmp_path):
     outcome = tokenize_kills.run(tmp_path, kills=3, processes=3, datasets=1)
     assert outcome.good and outcome.kills >= 3, outcome

@@ -67,7 +67,13 @@ def test_training_goes_on_from_a_converted_run(tmp_path):
     assert 0 < moved < 0.01
 
 
-@pytest.mark.parametrize("changes", [{}, {"diffusion": DIFFUSION}], ids=["discrete", "continuous"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        pytest.param({}, id="discrete", marks=pytest.mark.slow),
+        pytest.param({"diffusion": DIFFUSION}, id="continuous"),
+    ],
+)
 def test_safetensors_bring_everything_back(changes, tmp_path):
     run = small_run(**changes)
     write_neutral(run, tmp_path / "out")

@@ -1,0 +1,106 @@
+"""Whether the trials of a sweep are what they are taken for: named by what they hold, run by the same sources."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.job import read_job
+from experiments.running.closure import Closure, changed, closure_hash
+from experiments.running.provenance import CodeChanged, inputs_of, read_record
+from experiments.running.sealed import RESULT, read_result
+from experiments.trial import trial_id
+from experiments.words import few
+from hma_jax.config import ConfigError, require
+
+
+@dataclass
+class Sources:
+    """Trials that ran the same sources."""
+
+    code: str  # hash of the closure of the first of them
+    modules: dict[str, str]  # of all of them, by name
+    trials: list[str]
+    commits: list[str]
+
+
+def check_finished(trials: Path, ids: Iterable[str]) -> None:
+    """Raises ConfigError if a trial that has a result is not whole, or not the one that its name says.
+
+    It may have run here or have been copied from anywhere.
+    """
+    for id in ids:
+        directory = trials / id
+        if (directory / RESULT).exists():
+            read_result(directory)
+            try:
+                job = json.loads((directory / "job.json").read_text())
+                found = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
+            except (OSError, ValueError, KeyError) as error:
+                raise ConfigError(
+                    f"{directory}: the finished trial does not say what it is ({error}). Copy it "
+                    "again from where it ran, or remove the directory to run it again"
+                ) from error
+            require(
+                found == id,
+                f"{directory}: its job.json describes trial {found}: it was renamed or edited. Remove the directory "
+                "to run the trial again",
+            )
+
+
+def group_by_sources(trials: Path, ids: Iterable[str]) -> list[Sources]:
+    """The trials that began, by what they ran; one that went on under other sources is in several groups."""
+    groups: list[Sources] = []
+    for id in ids:
+        record = read_record(trials / id)
+        if record is not None and _began(trials / id):
+            for code, modules in record.sources().items():
+                commits = {start.machine.get("commit", "") for start in record.starts if start.code == code}
+                _join(groups, Sources(code, modules, [id], sorted(commits - {""})))
+    return groups
+
+
+def require_one_closure(trials: Path, ids: Iterable[str], now: Closure | None, accept: bool) -> None:
+    """Raises CodeChanged, unless the user accepts it, if trials ran other sources than each other or than those of
+    `now` (None: no trial is to be run)."""
+    groups = group_by_sources(trials, ids)
+    if now is not None and not any(not changed(group.modules, now) for group in groups):
+        groups.append(Sources(closure_hash(now), dict(now), [], []))
+    if len(groups) > 1 and not accept:
+        raise CodeChanged(
+            "trials of this study would stand beside each other that ran different sources:\n  "
+            + "\n  ".join(describe(groups))
+            + "\nNothing was run. If the change alters no result, add --accept-code: the page then counts the "
+            "sources. If it does, raise RESULTS_VERSION (experiments/running/results_version.py): trials of the "
+            "earlier version then run again. Or go back to the earlier sources"
+        )
+
+
+def describe(groups: list[Sources]) -> list[str]:
+    """A line for each; from the second on, what differs from the first."""
+    lines = []
+    for group in groups:
+        count = f"{len(group.trials)} trial(s)" if group.trials else "to be run"
+        where = f" (commit {', '.join(group.commits)})" if group.commits else ""
+        names = changed(groups[0].modules, group.modules)
+        differs = f"; differs in {few(names)}" if names else ""
+        lines.append(f"{group.code}: {count}{where}{differs}")
+    return lines
+
+
+def _began(directory: Path) -> bool:
+    """Whether something of what was computed is kept."""
+    return (directory / RESULT).exists() or any((directory / "run" / "checkpoints").glob("*"))
+
+
+def _join(groups: list[Sources], one: Sources) -> None:
+    """Adds the sources of one trial to the first group that has none of its modules in another form."""
+    group = next((group for group in groups if not changed(group.modules, one.modules)), None)
+    if group is None:
+        groups.append(one)
+        return
+    group.modules |= one.modules
+    group.trials += [id for id in one.trials if id not in group.trials]
+    group.commits += [commit for commit in one.commits if commit not in group.commits]

@@ -1,0 +1,142 @@
+"""What a trial's numbers depend on besides its configuration, and what is recorded of how they were made.
+
+A trial is named by its configuration and its `Provenance`: inputs by their content, and one number that is raised
+when a change to the code alters results. Nothing else is part of the name, neither the bytes of a source file nor a
+machine, so that a trial is the same trial wherever it ran. What it ran with is recorded beside its numbers, in the
+trial's provenance.json, at every start of its process. The command that starts trials gives each the hashes of
+the sources that it found; a trial whose own differ refuses to run, so that no change of the code in the middle of a
+sweep goes unnoticed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from data_pipelines.publishing.files import write_file
+from experiments.machine import describe_machine
+from experiments.running.closure import Closure, changed, closure_hash, imported_modules, trace
+from experiments.running.results_version import RESULTS_VERSION
+from experiments.words import few
+from hma_jax.config import ConfigError
+from hma_jax.config.json import from_dict, to_dict
+
+FILE = "provenance.json"
+
+ROOTS = ("experiments.running.trial_main", "experiments.trial")
+"""The modules whose closure is what a trial runs."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The identity of each input, by its content; a trial with another one is another trial."""
+
+    store: str  # of the token store
+    manifest: str  # of the frozen evaluation windows
+    tokenizer: str
+    results: int = RESULTS_VERSION  # 0 for records of earlier versions, which knew no such number
+
+
+class CodeChanged(ConfigError):
+    """The sources are not those that a sweep was started with."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a process of the trial ran with. A start that is like the one before is not recorded again."""
+
+    code: str  # hash of its closure
+    machine: dict[str, Any]  # commit, versions, processor (`machine`)
+
+
+@dataclass(frozen=True)
+class TrialRecord:
+    """The provenance.json of a trial."""
+
+    inputs: Provenance
+    closures: dict[str, dict[str, str]] = field(default_factory=dict)  # {hash: {module: hash}}, of every start
+    besides: dict[str, str] = field(default_factory=dict)  # modules imported later on, that are in no closure
+    starts: tuple[Start, ...] = ()
+
+    @property
+    def code(self) -> str:
+        """The closure of the process that finished it."""
+        return self.starts[-1].code if self.starts else ""
+
+    def sources(self) -> dict[str, dict[str, str]]:
+        """Every module that it ran, for the hash of each closure."""
+        return {code: closure | self.besides for code, closure in self.closures.items()}
+
+
+def trial_closure() -> dict[str, str]:
+    """The sources that a trial started now would run. Raises CodeChanged while they cannot be read."""
+    try:
+        return trace(ROOTS)
+    except (OSError, SyntaxError, ValueError) as error:  # in the middle of a `git pull`, say
+        raise CodeChanged(f"the sources cannot be read ({error}); try again when they are whole") from error
+
+
+def load_sources(given: Closure | None) -> dict[str, str]:
+    """Imports all that a trial runs, and returns the closure that was imported. To be called before any work.
+
+    Raises CodeChanged if it is not the one that was `given` by whoever started the trial (None: nobody did), or if
+    files changed meanwhile. From then on nothing but what the trial's record names as `besides` is read from disk.
+    """
+    closure = trial_closure()
+    _require_same(closure if given is None else given, closure)
+    for name in closure:
+        import_module(name)
+    _require_same(closure, trial_closure())
+    return closure
+
+
+def _require_same(given: Closure, found: Closure) -> None:
+    names = changed(given, found) + sorted(given.keys() ^ found.keys())
+    if names:
+        raise CodeChanged(
+            f"the sources changed since this sweep was started: {few(names)}. The trial was not run. Run the command "
+            "again: trials that have run under the earlier sources are then counted apart"
+        )
+
+
+def record_start(directory: Path, inputs: Provenance, closure: Closure) -> None:
+    """Notes in a trial's directory with what it starts, or goes on. Raises ConfigError for a damaged record there."""
+    known = read_record(directory) or TrialRecord(inputs)
+    start = Start(closure_hash(closure), describe_machine())
+    starts = known.starts if known.starts[-1:] == (start,) else (*known.starts, start)
+    _save(directory, replace(known, closures=known.closures | {start.code: dict(closure)}, starts=starts))
+
+
+def record_end(directory: Path) -> None:
+    """Notes what the process has imported besides, on branches that few trials take."""
+    known = read_record(directory)
+    if known is not None:
+        own = known.closures[known.code]
+        later = {name: hash for name, hash in imported_modules().items() if name not in own}
+        _save(directory, replace(known, besides=known.besides | later))
+
+
+def read_record(directory: Path) -> TrialRecord | None:
+    """None where there is none. Raises ConfigError for one that cannot be read."""
+    path = directory / FILE
+    try:
+        return from_dict(TrialRecord, json.loads(path.read_text()))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:  # ConfigError is one
+        raise ConfigError(f"{path}: not a record of a trial ({error}); remove {directory} to run it again") from error
+
+
+def inputs_of(values: Mapping[str, Any]) -> Provenance:
+    """As it is written today or was by earlier versions, which had a hash of all sources in it."""
+    if "code" in values:
+        values = {name: value for name, value in values.items() if name != "code"} | {"results": 0}
+    return from_dict(Provenance, dict(values))
+
+
+def _save(directory: Path, record: TrialRecord) -> None:
+    write_file(directory / FILE, json.dumps(to_dict(record), indent=1))

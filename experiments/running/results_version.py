@@ -1,0 +1,11 @@
+"""The version of what trials compute, which is part of every trial's name."""
+
+CHANGES = {
+    1: "the first that is numbered; before, the bytes of the sources were part of a trial's name",
+}
+"""What each number changed. Add one when a change to the code alters the numbers of a trial whose configuration and
+inputs stay as they are: finished trials of the number before are then other trials, which nobody mistakes for these.
+Not for what changes tokenizers, tokens or windows: these are named by their content. A change that alters nothing
+beyond rounding leaves the number; the sources that each trial ran are recorded beside it (`provenance`)."""
+
+RESULTS_VERSION = max(CHANGES)

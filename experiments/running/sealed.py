@@ -1,0 +1,56 @@
+"""The result of a trial, sealed: it says of which files it was computed, and holds a hash of itself.
+
+So a finished trial can be copied from one machine to another, as files, and what was cut off or edited on the way
+is found. It is no protection from somebody who means to deceive and computes the hashes again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from data_pipelines.publishing.files import write_file
+from experiments.running import provenance
+from hma_jax.config import ConfigError, require
+from hma_jax.config.json import stable_hash
+from hma_jax.evaluation.windows import FILE as WINDOWS
+
+RESULT, SAMPLES = "result.json", "samples.npz"
+
+SEALED = (WINDOWS, SAMPLES, "run/metrics.jsonl", provenance.FILE)
+"""Files beside a result that it vouches for, where they are. Checkpoints are not among them: no number is read from
+them again, and a copy may leave them out."""
+
+
+def write_result(directory: Path, result: dict[str, Any]) -> None:
+    """Writes result.json, the last file of a trial, in the directory that bears its id."""
+    files = {name: _digest(directory / name) for name in SEALED if (directory / name).is_file()}
+    values = json.loads(json.dumps({**result, "trial": directory.name, "files": files}))
+    write_file(directory / RESULT, json.dumps({"hash": stable_hash(values), **values}, indent=1))
+
+
+def read_result(directory: Path) -> dict[str, Any]:
+    """Raises ConfigError unless result.json and the files it was computed with are as they were written."""
+    try:
+        values = json.loads((directory / RESULT).read_text())
+        stated = values.pop("hash")
+        require(stable_hash(values) == stated, f"{RESULT} was changed, it does not match its hash {stated}")
+        require(values["trial"] == directory.name, f"{RESULT} is of trial {values['trial']}")
+        for name, digest in values["files"].items():
+            path = directory / name
+            require(path.is_file(), f"{name} is missing")
+            require(_digest(path) == digest, f"{name} was changed, or cut off, after {RESULT} was written")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"no {error} in {RESULT}" if isinstance(error, KeyError) else error
+        raise ConfigError(
+            f"{directory / RESULT}: the finished trial is not whole: {reason}. Copy it again from where it ran, or remove "
+            "its directory to run it again"
+        ) from error
+    return values
+
+
+def _digest(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
