@@ -62,7 +62,7 @@ def test_processes_train_as_one_does_and_write_one_log(processes: int, devices: 
     reports = train(tmp_path, processes, devices, steps=20, every=10, validate=True, ema=0.9)
     assert global_batches(reports) == global_batches([one])
     for report in reports:
-        np.testing.assert_allclose(report["losses"], one["losses"], rtol=1e-9)  # more than float32 promises
+        np.testing.assert_allclose(report["losses"], one["losses"], rtol=1e-6)  # a few units of float32
     assert [record["step"] for record in read(tmp_path)] == list(range(1, 21))
     assert [record["step"] for record in read(tmp_path, "validation.jsonl")] == list(range(2, 21, 2))
     for name in ("metrics.jsonl", "validation.jsonl"):

@@ -154,9 +154,9 @@ def measure(directory: Path, cut: float, lost_after: float) -> dict[str, float]:
     asked = json.dumps({"steps": saved + 10})
     run(MODULE, [str(directory / "alone"), asked], processes=1, devices=2, flags=" ".join(FAST_COMPILATION))
     one, two = losses(directory / "alone"), losses(run_dir)
-    assert len(one) == len(two) == saved + 10
+    assert len(one) == len(two) == saved + 10, (len(one), len(two), saved)
     figures["largest_relative_difference_of_losses"] = float(np.max(np.abs(np.array(one) / np.array(two) - 1)))
-    assert figures["largest_relative_difference_of_losses"] < 1e-5
+    assert figures["largest_relative_difference_of_losses"] < 1e-5, figures
     return figures
 
 
