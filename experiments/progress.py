@@ -13,8 +13,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
-from experiments.running.runner import Job, Monitor, State
+from experiments.running.runner import Job, Monitor
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)
@@ -107,22 +108,25 @@ class SweepMonitor(Monitor):
     def __exit__(self, *exc: object) -> None:
         self.bars.stop()
 
-    def started(self, job: Job, resumed: bool) -> None:
-        note = "resumed" if resumed else "starting"
+    def launched(self, job: Job, resumed: bool) -> None:
+        note = "resuming" if resumed else "starting"
         self.tasks[job.id] = self.bars.add_task(f"  {job.title}", total=None, note=note)
 
     def progressed(self, job: Job, phase: str, done: int, total: int) -> None:
         self.bars.update(self.tasks[job.id], completed=done, total=total, note=phase)
 
-    def ended(self, job: Job, state: State, seconds: float) -> None:
-        self.bars.remove_task(self.tasks.pop(job.id))
-        self.ended_count += 1
-        self.bars.update(self.all, completed=self.ended_count)
-        colour = "green" if state.event == FINISHED else "red"
+    def ended(self, job: Job, state: State, seconds: float, again: bool) -> None:
+        if job.id in self.tasks:  # otherwise an earlier command started it
+            self.bars.remove_task(self.tasks.pop(job.id))
+        if not again:
+            self.ended_count += 1
+            self.bars.update(self.all, completed=self.ended_count)
+        colour = "green" if state.event == FINISHED else "yellow" if again else "red"
         message = f": {escape(state.message)}" if state.message else ""
+        more = "; it goes on from its last checkpoint" if again else ""
         self.bars.console.print(
             f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {job.title} "
-            f"[dim]({_clock(seconds)})[/]{message}"
+            f"[dim]({_clock(seconds)})[/]{message}{more}"
         )
 
 

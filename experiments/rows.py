@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
-from experiments.running.runner import State
 from experiments.running.sealed import read_result
 from experiments.sweep import POINT, Point, Sweep
 from experiments.trial import trial_id

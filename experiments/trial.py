@@ -138,10 +138,11 @@ def train_trial(
     store, loader = materials.store, loader_of(trial)
     table = table or training_table(store, loader, trial.train.action_scale)
     checkpoint_every, validate_every = options.steps_between(trial.train.steps)
+    lost = {"lost": {name: store.manifest(name).lost for name in trial.datasets}}  # damaged episodes, left out
 
     def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
         before = {"order": 1} | provenance["loader"]  # of versions that did not say in which order they drew
-        return provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
+        return lost | provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
 
     def report(step: int, steps: int, values: dict[str, float]) -> None:
         held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
@@ -160,6 +161,7 @@ def train_trial(
             "store": store.hash(trial.datasets),
             "tokenizer": materials.tokenizer.identity,
             "loader": to_dict(loader),
+            **lost,
             **({"origin": origin} if origin else {}),
         },
         modernise_provenance=modernise,

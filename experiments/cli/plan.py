@@ -47,8 +47,8 @@ def plan(
         os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # programs for absent devices cannot be written
     from experiments.bench.collectives import count_kinds
-    from experiments.bench.plan import find_devices, make_plan
     from experiments.bench.models import make_shape
+    from experiments.bench.plan import find_devices, make_plan
 
     config, table = make_shape(model, robots)
     execution = ExecutionConfig(dtype, remat, mesh=MeshConfig(*mesh))

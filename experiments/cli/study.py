@@ -13,6 +13,7 @@ from experiments.commands import model as model_commands
 from experiments.commands import study as commands
 from experiments.commands import tokenize as tokenize_commands
 from experiments.run_options import RunOptions
+from experiments.running.launchers.registry import Launching
 from experiments.setting import UNSET, Where, make_setting
 from hma_jax.config import ConfigError, Weights
 
@@ -49,7 +50,7 @@ def sweep(
 
 def _run(command: str, where: Where, how: How, remake: Remake, axes: tuple[str, ...]) -> None:
     setting = make_setting(where)
-    if how.workers < 1:
+    if how.workers is not None and how.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {how.workers}")
     if how.dry_run:
         commands.dry_run(setting.study, axes)
@@ -57,10 +58,8 @@ def _run(command: str, where: Where, how: How, remake: Remake, axes: tuple[str, 
     commands.run_study(
         setting,
         axes,
-        again=setting.command(
-            command, "--workers", str(how.workers), "--retry-failed", *["--accept-code"] * how.accept_code
-        ),
-        workers=how.workers,
+        again=setting.command(command, *how.words(), "--retry-failed", *["--accept-code"] * how.accept_code),
+        launcher=Launching(how.launcher, how.workers, how.launcher_set),
         retry_failed=how.retry_failed,
         accept_code=how.accept_code,
         replace=remake.replace,

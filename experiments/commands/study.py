@@ -24,9 +24,11 @@ from experiments import (
 from experiments.preparing.made_from import Step, require_same
 from experiments.program import command_line
 from experiments.progress import SweepMonitor, console
+from experiments.running.attempts import State, read_states
 from experiments.running.closure import Closure
+from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import FINISHED, Ledger
-from experiments.running.runner import Job, State, read_states, run_missing
+from experiments.running.runner import Job, run_missing
 from experiments.setting import Setting, short
 from experiments.study import Study
 from experiments.sweep import Sweep, titles, unique_trials
@@ -64,7 +66,7 @@ def run_study(
     axes: Sequence[str],
     *,
     again: str,
-    workers: int,
+    launcher: Launching,
     retry_failed: bool,
     accept_code: bool,
     replace: Step | None,
@@ -102,7 +104,7 @@ def run_study(
         ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
         names = titles(sweeps, provenance)
         jobs = [Job(id, names[id], {"trial": to_dict(trial), **common}) for id, trial in ordered]
-        states = run_jobs(jobs, workspace, workers, retry_failed)
+        states = run_jobs(jobs, workspace, launcher, retry_failed)
         draw(workspace, record)
     complain(jobs, states, again)
 
@@ -138,7 +140,7 @@ def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Re
 
 
 def run_jobs(
-    jobs: Sequence[Job], workspace: Workspace, workers: int, retry_failed: bool
+    jobs: Sequence[Job], workspace: Workspace, launching: Launching, retry_failed: bool
 ) -> dict[str, State]:
     """Runs what is missing, visibly."""
     ledger = Ledger(workspace.ledger)
@@ -146,9 +148,11 @@ def run_jobs(
     kept = sum(state.event == FINISHED for state in before.values())
     if kept:
         console.print(f"{kept} of {len(jobs)} trials are finished already")
-    with SweepMonitor(len(jobs), kept) as monitor:
+    if kept == len(jobs):
+        return before
+    with launching.launcher(workspace.root) as launcher, SweepMonitor(len(jobs), kept) as monitor:
         return run_missing(
-            jobs, workspace.trials, ledger, workers=workers, retry_failed=retry_failed, monitor=monitor
+            jobs, workspace.trials, ledger, launcher, retry_failed=retry_failed, monitor=monitor
         )
 
 

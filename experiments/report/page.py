@@ -23,9 +23,9 @@ from experiments.report.sweeps import GAINS, TITLES, describe
 from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve
 from experiments.running.agreement import describe as describe_sources
 from experiments.running.agreement import group_by_sources
+from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance
-from experiments.running.runner import State
 from experiments.running.sealed import read_result
 from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from experiments.trial import Trial, trial_id

@@ -14,30 +14,38 @@ import threading
 import time
 from pathlib import Path
 
+from experiments.running.slots import Slot
 from hma_jax.runtime.host_memory import KEPT_PAGES, keep_freed_memory
 
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
 _PR_SET_PDEATHSIG = 1
 
+CHOSEN = {"XLA_PYTHON_CLIENT_MEM_FRACTION"}
+"""Of what a slot says, what the user may say instead. Which accelerators are the slot's is not among it: they are
+a part of those that the user allows."""
 
-def child_environment(slot: int, workers: int, compile_cache: Path | None = None) -> dict[str, str]:
-    """The environment of the child in `slot` of `workers`: 1/workers of cores and accelerator."""
+
+def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str]:
+    """The environment of a child that has `slot` for itself. What the user says there stays as it is."""
     environment = {**KEPT_PAGES, **os.environ}
     environment[_PARENT] = str(os.getpid())
-    if workers > 1 and hasattr(os, "sched_getaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        share = cores[slot::workers] or [cores[slot % len(cores)]]
-        environment[_CORES] = ",".join(map(str, share))
-    if workers > 1:
-        environment.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 / workers:.3f}")
-    if compile_cache is not None:
-        environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(compile_cache))
-        environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    environment.pop(_CORES, None)
+    if slot.cores:
+        environment[_CORES] = ",".join(map(str, slot.cores))
+    share = slot.environment()
+    for name in CHOSEN & set(share) & set(environment):
+        del share[name]
+    environment |= share
+    environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(compile_cache))
+    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     return environment
 
 
 def settle() -> None:
-    """Called first in a child: takes its cores and arranges to die with its parent."""
+    """Called first in a child: takes its cores, arranges to die with its parent and to end in order when asked to."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
+    for number in (signal.SIGUSR1, signal.SIGUSR2):  # Slurm's, for the process above
+        signal.signal(number, signal.SIG_IGN)
     cores = os.environ.get(_CORES)
     if cores:
         os.sched_setaffinity(0, {int(c) for c in cores.split(",")})

@@ -1,8 +1,9 @@
 """The ledger: an append-only record of what happened to every trial.
 
 One JSON object per line, on disk before `append` returns. A process killed while it writes
-leaves a torn last line, which the next writer cuts off. There must be one writer at a time:
-see `Workspace.claimed`.
+leaves a torn last line, which the next writer cuts off. There is one writer, the command that
+holds the study's directory (`Workspace.claimed`), wherever its trials run: what a trial's process
+has to say stands in the trial's own directory (`attempts`).
 """
 
 from __future__ import annotations
@@ -16,11 +17,19 @@ from typing import Any
 
 from hma_jax.config import ConfigError
 
-STARTED, FINISHED, FAILED, DIVERGED = "started", "finished", "failed", "diverged"
+RUNNING, FINISHED, DIVERGED, FAILED = "running", "finished", "diverged", "failed"
+LOST, PREEMPTED = "lost", "preempted"
+"""Ended without a result, through no fault of its own: its process is gone (killed, out of memory, a machine
+that died), or it was asked to stop and has saved. Both go on from the last checkpoint."""
+
 REFUSED = "refused"
 """Its sources are not those that the sweep was started with: it did not run, and may the next time."""
-MISSING, INTERRUPTED = "missing", "interrupted"
-"""States that no line states: no line at all, and started without an end."""
+
+MISSING = "missing"
+"""The state of a trial without a line: it has not run."""
+
+FORMER = {"started": RUNNING, "interrupted": PREEMPTED}
+"""Events as earlier versions wrote them."""
 
 
 class Ledger:
@@ -46,11 +55,13 @@ class Ledger:
         return records
 
     def states(self) -> dict[str, dict[str, Any]]:
-        """The last record of each trial, by id, with its `event` read as a state."""
+        """The last record of each trial, by id; its `event` is a state.
+
+        Whether one that is RUNNING still runs, the ledger cannot know: see `attempts.read_states`.
+        """
         last = {record["trial"]: dict(record) for record in self.records()}
         for record in last.values():
-            if record["event"] == STARTED:
-                record["event"] = INTERRUPTED
+            record["event"] = FORMER.get(record["event"], record["event"])
         return last
 
     def append(self, trial: str, event: str, **details: Any) -> None:

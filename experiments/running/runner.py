@@ -1,30 +1,44 @@
-"""Runs the trials that are missing, each in its own process, and survives what happens to them.
+"""Runs the trials that are missing, wherever a launcher puts them, and survives what happens to them.
 
-A trial that crashes is recorded with its message and the others go on. The runner itself may
-be interrupted or killed at any point: its children die with it, and the next run finishes the
-trial that was cut short, from its checkpoint.
+A trial that crashes is recorded with its message and the others go on. One whose process is lost or asked to stop
+is tried again and goes on from its checkpoint. The runner itself may be interrupted or killed at any point: the
+next run goes on with what is there, and waits for trials that still run on other machines.
 """
 
 from __future__ import annotations
 
 import json
 import shutil
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from data_pipelines.publishing.files import write_file
-from experiments.running.children import child_environment
-from experiments.running.ledger import DIVERGED, FAILED, FINISHED, INTERRUPTED, MISSING, REFUSED, STARTED, Ledger
-from experiments.running.trial_main import FAILURE, JOB, PROGRESS, RESULT, STOPPED
+from experiments.running.attempts import (
+    FAILURE,
+    JOB,
+    PROGRESS,
+    RUN,
+    STARTED,
+    Ended,
+    State,
+    is_alive,
+    outcome,
+    read_progress,
+    read_start,
+    read_states,
+)
+from experiments.running.launchers.base import Launcher
+from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
 
-GRACE_SECONDS = 60.0
-"""How long a trial may take to save its state when the runner is interrupted."""
+TRIES = 3
+"""How often in one command a trial may be lost: what kills it may be its own size."""
+
+LOOK_EVERY = 5.0
+"""Seconds between two looks at trials that an earlier runner started elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -36,166 +50,161 @@ class Job:
     record: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class State:
-    """Where a trial stands: one of the states of `ledger`, with a message when it failed."""
-
-    event: str
-    message: str = ""
-
-
 class Monitor:
     """Hears what the runner does; the default says nothing."""
 
-    def started(self, job: Job, resumed: bool) -> None: ...
+    def launched(self, job: Job, resumed: bool) -> None: ...
 
     def progressed(self, job: Job, phase: str, done: int, total: int) -> None: ...
 
-    def ended(self, job: Job, state: State, seconds: float) -> None: ...
-
-
-def trial_command(directory: Path) -> list[str]:
-    return [sys.executable, "-m", "experiments.running.trial_main", str(directory)]
-
-
-def read_states(ids: Sequence[str], trials: Path, ledger: Ledger) -> dict[str, State]:
-    """The state of each trial. A result on disk is the truth; the ledger may lag behind it."""
-    recorded = ledger.states()
-    states = {}
-    for id in ids:
-        record = recorded.get(id, {})
-        if (trials / id / RESULT).exists():
-            states[id] = State(FINISHED)
-        elif not record or record["event"] == FINISHED:  # its directory was deleted: run it again
-            states[id] = State(MISSING)
-        else:
-            states[id] = State(record["event"], record.get("message", ""))
-    return states
+    def ended(self, job: Job, state: State, seconds: float, again: bool) -> None:
+        """`again`: it will be tried once more."""
 
 
 def run_missing(
     jobs: Sequence[Job],
     trials: Path,
     ledger: Ledger,
+    launcher: Launcher,
     *,
-    workers: int = 1,
     retry_failed: bool = False,
-    command: Callable[[Path], list[str]] = trial_command,
     monitor: Monitor | None = None,
-    poll_seconds: float = 0.1,
 ) -> dict[str, State]:
     """Brings every job to an end and returns their states.
 
-    Failed and diverged trials of earlier runs are left alone unless `retry_failed`. On
-    KeyboardInterrupt the running trials save their state before it is raised again. One runner
-    at a time: see `Workspace.claimed`.
+    Failed and diverged trials of earlier runs are left alone unless `retry_failed`; a failed one then goes on from
+    its checkpoint, a diverged one starts anew. On KeyboardInterrupt the running trials save their state before it is
+    raised again. One runner at a time: see `Workspace.claimed`.
     """
-    monitor = monitor or Monitor()
-    ids = [job.id for job in jobs]
-    before = read_states(ids, trials, ledger)
-    again = {MISSING, INTERRUPTED, REFUSED} | ({FAILED, DIVERGED} if retry_failed else set())
-    waiting = [job for job in jobs if before[job.id].event in again]
-    running: dict[int, _Running] = {}
-    recorded = {id for id, record in ledger.states().items() if record["event"] == FINISHED}
-    for id, state in before.items():  # a runner was killed between a result and its line in the ledger
-        if state.event == FINISHED and id not in recorded:
-            ledger.append(id, FINISHED)
+    run = _Run(trials, ledger, launcher, monitor or Monitor())
+    before = read_states([job.id for job in jobs], trials, ledger)
+    recorded = ledger.states()
+    for id, state in before.items():  # an earlier runner ended between an event and its line
+        if state.event not in (RUNNING, MISSING) and recorded.get(id, {}).get("event") != state.event:
+            run.record(id, state)
+    again = {MISSING, LOST, PREEMPTED, REFUSED} | ({FAILED, DIVERGED} if retry_failed else set())
+    run.waiting = [(job, before[job.id].event) for job in jobs if before[job.id].event in again]
+    run.elsewhere = [job for job in jobs if before[job.id].event == RUNNING]
     try:
-        while waiting or running:
-            for slot in range(workers):
-                if slot not in running and waiting:
-                    job = waiting.pop(0)
-                    if before[job.id].event in (FAILED, DIVERGED):
-                        shutil.rmtree(trials / job.id, ignore_errors=True)
-                    running[slot] = _start(job, trials, ledger, slot, workers, command)
-                    monitor.started(job, before[job.id].event == INTERRUPTED)
-            time.sleep(poll_seconds)
-            for slot, child in list(running.items()):
-                if child.process.poll() is None:
-                    _pass_on_progress(child, monitor)
-                    continue
-                del running[slot]
-                state, seconds = _outcome(child), time.monotonic() - child.began
-                details = {"message": state.message} if state.message else {}
-                ledger.append(child.job.id, state.event, seconds=round(seconds, 1), **details)
-                monitor.ended(child.job, state, seconds)
-                if state.event == REFUSED:  # as every other one would be
-                    waiting.clear()
+        run.to_the_end()
     finally:
-        _stop([child.process for child in running.values()])
-    return read_states(ids, trials, ledger)
+        run.stop()
+    return read_states([job.id for job in jobs], trials, ledger)
 
 
 @dataclass
-class _Running:
+class _Attempt:
     job: Job
     directory: Path
-    process: subprocess.Popen
-    began: float
-    shown: str = ""
+    handle: Any
+    launched: float
+    start: dict[str, Any] | None = None
+    shown: dict[str, Any] | None = None
 
 
-def _start(
-    job: Job,
-    trials: Path,
-    ledger: Ledger,
-    slot: int,
-    workers: int,
-    command: Callable[[Path], list[str]],
-) -> _Running:
-    directory = trials / job.id
-    directory.mkdir(parents=True, exist_ok=True)
-    (directory / FAILURE).unlink(missing_ok=True)
-    write_file(directory / JOB, json.dumps(job.record, indent=1))
-    ledger.append(job.id, STARTED, title=job.title)
-    with open(directory / "output.txt", "a") as output:
-        process = subprocess.Popen(
-            command(directory),
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env=child_environment(slot, workers, trials.parent / "compiled"),
-            start_new_session=True,  # Ctrl-C reaches the runner only, which asks them to save
-        )
-    return _Running(job, directory, process, time.monotonic())
+class _Run:
+    """`waiting` jobs with the state that each is in, those that are `running`, and those of earlier runners that
+    still run `elsewhere`."""
 
+    def __init__(self, trials: Path, ledger: Ledger, launcher: Launcher, monitor: Monitor):
+        self.trials, self.ledger, self.launcher, self.monitor = trials, ledger, launcher, monitor
+        self.waiting: list[tuple[Job, str]] = []
+        self.elsewhere: list[Job] = []
+        self.running: list[_Attempt] = []
+        self.lost = Counter[str]()
+        self.looked = -LOOK_EVERY
 
-def _pass_on_progress(child: _Running, monitor: Monitor) -> None:
-    try:
-        text = (child.directory / PROGRESS).read_text()
-    except FileNotFoundError:
-        return
-    if text != child.shown:
-        child.shown = text
-        monitor.progressed(child.job, **json.loads(text))
+    def to_the_end(self) -> None:
+        while self.waiting or self.running or self.elsewhere:
+            self._launch()
+            time.sleep(self.launcher.pause)
+            for attempt in list(self.running):
+                self._look_at(attempt)
+            self._look_elsewhere()
 
+    def stop(self) -> None:
+        """Trials that still run save their state; how each ended is recorded."""
+        attempts, self.running = self.running, []
+        if attempts:
+            for attempt, ended in zip(attempts, self.launcher.stop([a.handle for a in attempts]), strict=True):
+                self._end(attempt, outcome(attempt.directory, ended), again=False)
 
-def _outcome(child: _Running) -> State:
-    """How an ended process left its trial."""
-    code = child.process.returncode
-    if (child.directory / RESULT).exists():
-        return State(FINISHED)
-    if (child.directory / FAILURE).exists():
-        failure = json.loads((child.directory / FAILURE).read_text())
-        return State(failure["state"], failure["message"])
-    if code == STOPPED:
-        return State(INTERRUPTED)
-    log = child.directory / "output.txt"
-    if code < 0:
-        name = signal.Signals(-code).name
-        hint = " (out of memory?)" if name == "SIGKILL" else ""
-        return State(FAILED, f"its process was ended by {name}{hint}; output in {log}")
-    return State(FAILED, f"its process ended with exit code {code} and no result; output in {log}")
+    def record(self, id: str, state: State, **details: Any) -> None:
+        self.ledger.append(id, state.event, **details, **({"message": state.message} if state.message else {}))
 
+    def _launch(self) -> None:
+        room = max(self.launcher.at_once - len(self.running), 0)
+        chosen, self.waiting = self.waiting[:room], self.waiting[room:]
+        if not chosen:
+            return
+        directories = [self._make_ready(job, state) for job, state in chosen]
+        now = time.monotonic()
+        for (job, state), directory, handle in zip(
+            chosen, directories, self.launcher.launch(directories), strict=True
+        ):
+            self.running.append(_Attempt(job, directory, handle, now))
+            self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
-def _stop(processes: Sequence[subprocess.Popen]) -> None:
-    """Asks each process to save and end; kills it after the grace period."""
-    for process in processes:
-        process.terminate()
-    deadline = time.monotonic() + GRACE_SECONDS
-    for process in processes:
-        try:
-            process.wait(max(deadline - time.monotonic(), 0.1))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+    def _make_ready(self, job: Job, state: str) -> Path:
+        """The directory of a trial that was left in `state`, ready for the next attempt."""
+        directory = self.trials / job.id
+        directory.mkdir(parents=True, exist_ok=True)
+        if state == DIVERGED:  # from its checkpoint it would diverge again
+            shutil.rmtree(directory / RUN, ignore_errors=True)
+        for name in (FAILURE, STARTED, PROGRESS):
+            (directory / name).unlink(missing_ok=True)
+        write_file(directory / JOB, json.dumps(job.record, indent=1))
+        return directory
+
+    def _look_at(self, attempt: _Attempt) -> None:
+        ended = self.launcher.ended(attempt.handle)  # first: what is read below was written before
+        self._note_start(attempt)
+        if ended is not None:
+            self.running.remove(attempt)
+            state = outcome(attempt.directory, ended)
+            self._end(attempt, state, again=self._try_again(attempt.job, state))
+            if state.event == REFUSED:  # as every other one would be
+                self.waiting.clear()
+            return
+        progress = read_progress(attempt.directory)
+        if progress and progress != attempt.shown:
+            attempt.shown = progress
+            self.monitor.progressed(attempt.job, **progress)
+
+    def _note_start(self, attempt: _Attempt) -> None:
+        """An engine may start the process of an attempt more than once."""
+        start = read_start(attempt.directory)
+        if start and start != attempt.start:
+            attempt.start = start
+            where = {key: value for key, value in start.items() if key != "token"}
+            self.ledger.append(attempt.job.id, RUNNING, title=attempt.job.title, **where)
+
+    def _end(self, attempt: _Attempt, state: State, again: bool) -> None:
+        self._note_start(attempt)
+        seconds = time.monotonic() - attempt.launched
+        if attempt.start or state.event not in (LOST, PREEMPTED):  # otherwise it was only queued
+            self.record(attempt.job.id, state, seconds=round(seconds, 1))
+        self.monitor.ended(attempt.job, state, seconds, again)
+
+    def _try_again(self, job: Job, state: State) -> bool:
+        self.lost[job.id] += state.event == LOST
+        again = state.event == PREEMPTED or state.event == LOST and self.lost[job.id] < TRIES
+        if again:
+            self.waiting.insert(0, (job, state.event))
+        return again
+
+    def _look_elsewhere(self) -> None:
+        """What an earlier runner started and left: once its claim is free, it has ended or is ours to try."""
+        if time.monotonic() - self.looked < LOOK_EVERY:
+            return
+        self.looked = time.monotonic()
+        for job in list(self.elsewhere):
+            if is_alive(self.trials / job.id):
+                continue
+            self.elsewhere.remove(job)
+            state = outcome(self.trials / job.id, Ended(None, "its process is gone"))
+            self.record(job.id, state)
+            if state.event == LOST:
+                self.waiting.append((job, LOST))
+            else:
+                self.monitor.ended(job, state, 0.0, again=False)

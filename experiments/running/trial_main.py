@@ -2,7 +2,7 @@
 
 Reads DIRECTORY/job.json, runs the trial, and on failure leaves DIRECTORY/failure.json with
 the state and one message. A trial whose sources are not those that job.json names is refused before any work.
-The runner starts this; run it by hand to debug a trial.
+A launcher starts this, on whichever machine; run it by hand to debug a trial.
 """
 
 from __future__ import annotations
@@ -11,20 +11,31 @@ import json
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 
+from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, attempt
 from experiments.running.children import settle
-from hma_jax.runtime.exits import Exit, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
-RESULT, FAILURE, PROGRESS, JOB = "result.json", "failure.json", "progress.json", "job.json"
-STOPPED = Exit.STOPPED
-"""Exit code of a trial that was asked to stop and saved its state."""
+LOOK_EVERY = 30.0
+"""Seconds between two looks whether the trial is still ours."""
 
 
 def main(directory: Path) -> int:
-    """0: finished; 1: failed or diverged (see failure.json); 2: refused, the sources changed; STOPPED: will resume."""
+    """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; STOPPED or INTERRUPTED: the
+    next attempt goes on from here."""
     settle()  # before anything imports JAX
+    try:
+        with terminated_like_interrupted(), attempt(directory) as held:
+            if (directory / RESULT).exists():  # another attempt finished while this one waited
+                return Exit.DONE
+            return _run(directory, held.lost)
+    except KeyboardInterrupt as request:
+        return exit_of_interrupt(request)
 
+
+def _run(directory: Path, lost: Callable[[], bool]) -> int:
     job = json.loads((directory / JOB).read_text())
     closure = _load_sources(directory, job.get("code"))
     if closure is None:
@@ -41,22 +52,28 @@ def main(directory: Path) -> int:
     from hma_jax.training.divergence import DivergedError
     from hma_jax.training.loop import Interrupted
 
-    report = _ProgressFile(directory / PROGRESS)
+    report = _ProgressFile(directory / PROGRESS, lost)
     try:
         trial, execution = read_job(job)
         record_start(directory, inputs_of(job["provenance"]), closure)
-        with terminated_like_interrupted():  # also while it evaluates
-            run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
-        return 0
-    except (Interrupted, KeyboardInterrupt):
-        return STOPPED
+        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
+        return Exit.DONE
+    except Interrupted as request:
+        return request.exit
+    except TakenOver as error:
+        print(error, file=sys.stderr)
+        return Exit.STOPPED
     except Exception as error:  # the boundary of the process: every failure becomes a record
         traceback.print_exc()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
         state = DIVERGED if isinstance(error, DivergedError) else FAILED
         write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
-        return 1
+        return Exit.FAILED
+
+
+class TakenOver(Exception):
+    """Another attempt works on the trial: this process was cut off for longer than its lease."""
 
 
 def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, str] | None:
@@ -73,14 +90,22 @@ def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, st
 
 
 class _ProgressFile:
-    """Writes {phase, done, total} for the runner to show, a few times a second at most."""
+    """Writes {phase, done, total} for the runner to show, a few times a second at most.
 
-    def __init__(self, path: Path):
-        self.path = path
+    Raises TakenOver when `lost` says that the trial is another attempt's by now.
+    """
+
+    def __init__(self, path: Path, lost: Callable[[], bool]):
+        self.path, self.lost = path, lost
         self.last = ("", 0.0)
+        self.looked = time.monotonic()
 
     def __call__(self, phase: str, done: int, total: int) -> None:
         now = time.monotonic()
+        if now - self.looked >= LOOK_EVERY:
+            self.looked = now
+            if self.lost():
+                raise TakenOver(f"{self.path.parent}: another attempt at this trial has taken over")
         if phase == self.last[0] and now - self.last[1] < 0.3 and done < total:
             return
         self.last = (phase, now)

@@ -9,6 +9,7 @@ whoever reads it checks them.
 
 from __future__ import annotations
 
+import errno
 import logging
 import math
 import os
@@ -105,6 +106,7 @@ class Checkpoints:
         items = {name: item for name, item in state._asdict().items() if item is not None}
         self._bytes = sum(x.nbytes for x in jax.tree.leaves(items))
         try:
+            _require_writable(self.directory)
             # Without `force` Orbax may decide that this step need not be saved.
             response = self._writer().save_checkpointables_async(
                 step, items, custom_metadata=self.meta, force=True
@@ -227,6 +229,14 @@ class Checkpoints:
             aside.parent.mkdir(exist_ok=True)
             os.replace(self.directory / str(step), aside)
             log.warning("the checkpoint of step %d is damaged (%s) and was moved to %s", step, damage, aside)
+
+
+def _require_writable(directory: Path) -> None:
+    """Raises OSError where nothing can be made. Orbax finds out in a thread, for which others then wait without end."""
+    if not os.access(directory, os.W_OK | os.X_OK):
+        read_only = directory.is_dir() and os.statvfs(directory).f_flag & os.ST_RDONLY
+        code = errno.EROFS if read_only else errno.EACCES if directory.is_dir() else errno.ENOENT
+        raise OSError(code, os.strerror(code), str(directory))
 
 
 def _size(count: int) -> str:

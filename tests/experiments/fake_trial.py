@@ -11,9 +11,12 @@ import sys
 import time
 from pathlib import Path
 
+from experiments.running.attempts import RUN, attempt
 from experiments.running.children import settle
+from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job, run_missing
+from hma_jax.runtime.exits import exit_of_interrupt, terminated_like_interrupted
 
 THREE = [Job(f"t{i}", f"trial {i}", {"steps": 8, "seconds": 0.05, "end": "result"}) for i in range(3)]
 
@@ -22,10 +25,17 @@ def command(directory: Path) -> list[str]:
     return [sys.executable, __file__, str(directory)]
 
 
-def run_one(directory: Path) -> int:
+def launcher(root: Path, workers: int = 1) -> LocalLauncher:
+    place = LocalLauncher(root, workers, command=command)
+    place.pause = 0.01
+    return place
+
+
+def count_to_the_end(directory: Path) -> int:
     """Counts to 'steps', saving the count as it goes, and ends as told."""
     job = json.loads((directory / "job.json").read_text())
-    saved = directory / "count.txt"
+    saved = directory / RUN / "count.txt"
+    saved.parent.mkdir(exist_ok=True)
     start = int(saved.read_text() or 0) if saved.exists() else 0
     with open(directory / "starts.txt", "a") as file:
         file.write(f"{start}\n")
@@ -34,23 +44,29 @@ def run_one(directory: Path) -> int:
         aside = saved.with_suffix(".tmp")
         aside.write_text(str(count))
         aside.replace(saved)
+    killed = len((directory / "starts.txt").read_text().split()) <= job.get("times", 1)
     match job["end"]:
-        case "result":
-            (directory / "result.json").write_text(json.dumps({"count": job["steps"]}))
         case "diverge":
             (directory / "failure.json").write_text(json.dumps({"state": "diverged", "message": "loss is nan"}))
             return 1
         case "crash":
             raise SystemExit("no such luck")
-        case "killed":
-            os.kill(os.getpid(), signal.SIGKILL)
+        case "none":
+            return 0
+        case end if end.startswith("SIG") and killed:
+            os.kill(os.getpid(), signal.Signals[end])
+    (directory / "result.json").write_text(json.dumps({"count": job["steps"]}))
     return 0
 
 
 if __name__ == "__main__":
-    settle()
     if sys.argv[1] == "--sweep":
         root = Path(sys.argv[2])
-        run_missing(THREE, root / "trials", Ledger(root / "ledger.jsonl"), command=command, poll_seconds=0.02)
+        run_missing(THREE, root / "trials", Ledger(root / "ledger.jsonl"), launcher(root))
     else:
-        sys.exit(run_one(Path(sys.argv[1])))
+        settle()
+        try:
+            with terminated_like_interrupted(), attempt(Path(sys.argv[1])):
+                sys.exit(count_to_the_end(Path(sys.argv[1])))
+        except KeyboardInterrupt as request:
+            sys.exit(exit_of_interrupt(request))

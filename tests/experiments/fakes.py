@@ -12,9 +12,9 @@ import numpy as np
 from experiments.commands.study import AXES, SCALING
 from experiments.presets import SMOKE
 from experiments.rows import Row, collect
+from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
 from experiments.running.provenance import Provenance, Start, TrialRecord
-from experiments.running.runner import read_states
 from experiments.running.sealed import write_result
 from experiments.study import Study, TransferConfig
 from experiments.sweep import Sweep, titles, unique_trials

@@ -5,6 +5,7 @@ import graphlib
 import shlex
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,8 +17,9 @@ from experiments import pipeline
 from experiments.cli.main import main
 from experiments.commands import study as commands
 from experiments.preparing import windows
+from experiments.running.attempts import read_states
+from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import Ledger
-from experiments.running.runner import read_states
 from experiments.setting import Where, make_setting
 from experiments.workspace import Workspace, load_record, save_record
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
@@ -156,7 +158,7 @@ def test_report_is_drawn_again_from_disk(tmp_path, capsys):
 def instant_trials(monkeypatch):
     """Nothing is prepared; trials have fake results, but those of width 8 fail."""
 
-    def run_missing(jobs, trials, ledger, **_):
+    def run_missing(jobs, trials, ledger, launcher, **_):
         record = load_record(Workspace(trials.parent))
         finished_study(trials.parent, record.study, broken={"width 8 ": "failed"}, axes=record.axes)
         return read_states([job.id for job in jobs], trials, Ledger(ledger.path))
@@ -164,6 +166,7 @@ def instant_trials(monkeypatch):
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: PROVENANCE)
     monkeypatch.setattr(windows, "require_judged", lambda *_: None)
     monkeypatch.setattr(commands, "run_missing", run_missing)
+    monkeypatch.setattr(Launching, "launcher", lambda *_: nullcontext())
 
 
 def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp_path, capsys):
@@ -223,7 +226,8 @@ def test_a_record_that_cannot_be_read_is_not_replaced_either(instant_trials, tmp
 
 def test_failed_trials_are_tried_again_by_the_command_that_is_printed(instant_trials, tmp_path, capsys, monkeypatch):
     smoke = ["--preset", "smoke", "--out", str(tmp_path)]
-    assert main(["sweep", "width", *smoke, "--set", "widths=8,32", "--workers", "2"]) == 1
+    placed = ["--workers", "2", "--launcher", "slurm", "--launcher-set", "gpus=1", "--launcher-set", "partition=a b"]
+    assert main(["sweep", "width", *smoke, "--set", "widths=8,32", *placed]) == 1
     printed = capsys.readouterr().err.split("To try them again: ")[1].strip()
     asked = {}
 
@@ -232,7 +236,8 @@ def test_failed_trials_are_tried_again_by_the_command_that_is_printed(instant_tr
 
     monkeypatch.setattr(commands, "run_study", run_study)
     assert main(shlex.split(printed)[1:]) == 0
-    assert asked["retry_failed"] and asked["workers"] == 2 and asked["axes"] == ("width",)
+    assert asked["retry_failed"] and asked["axes"] == ("width",)
+    assert asked["launcher"] == Launching("slurm", 2, ("gpus=1", "partition=a b"))
     assert asked["setting"] == make_setting(Where("smoke", tmp_path, set=("widths=8,32",)))
 
 

@@ -324,7 +324,7 @@ def test_report_of_an_empty_directory(tmp_path, refused):
         ("model.mlp_ratio=2", "model.mlp_ratio: 4.0 -> 2.0"),
         ("train.batch=2", "train.batch: 4 -> 2"),
         ("train.optimizer.learning_rate=0.1", "train.optimizer.learning_rate: 0.001 -> 0.1"),
-        ("tau=2", "provenance.loader.tau: 3.0 -> 2.0"),
+        ("weighed=all", "provenance.loader.weighed: 'used' -> 'all'"),
     ],
 )
 def test_training_is_not_resumed_under_another_configuration(setting, difference, study, refused):

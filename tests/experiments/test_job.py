@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.former import modernise
 from experiments.job import read_job
 from experiments.presets import SMOKE
 from experiments.sweep import reference_trial
@@ -31,6 +32,13 @@ def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_i
     assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train, **data)
     assert (trial.model.width, trial.train.steps) == (SMOKE.model.width, SMOKE.train.steps)
     assert execution == ExecutionConfig("bfloat16", "products", "auto", accumulate=2, mesh=MeshConfig(fsdp=2))
+
+
+def test_fields_of_earlier_versions_are_read_as_what_they_are_called_today():
+    before = {"model": {"remat": True, "width": 8}, "train": {"accumulate": 2}, "eval": {"unmask_steps": 7, "seed": 1}}
+    today, execution = modernise(before)
+    assert today == {"model": {"width": 8}, "train": {}, "eval": {"decode": {"unmask_steps": 7}, "seed": 1}}
+    assert execution == {"remat": "everything", "accumulate": 2} and before["eval"]["unmask_steps"] == 7
 
 
 def test_what_is_no_job_is_refused_by_words():

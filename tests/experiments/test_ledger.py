@@ -16,11 +16,17 @@ def ledger(tmp_path):
 
 def test_last_line_of_a_trial_is_its_state(ledger):
     ledger.append("a", "started")
-    ledger.append("b", "started")
+    ledger.append("b", "running")
     ledger.append("a", "failed", message="no luck")
     states = ledger.states()
     assert states["a"] == {"time": 7.0, "trial": "a", "event": "failed", "message": "no luck"}
-    assert states["b"]["event"] == "interrupted"
+    assert states["b"]["event"] == "running"
+
+
+def test_lines_of_earlier_versions_are_read_in_todays_words(ledger):
+    ledger.append("a", "started")
+    ledger.append("b", "interrupted")
+    assert [record["event"] for record in ledger.states().values()] == ["running", "preempted"]
 
 
 @pytest.mark.parametrize("torn", ['{"trial": "b", "ev', "{", '{"time": 1, "trial": "b", "event": "failed"}'])

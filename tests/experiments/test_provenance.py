@@ -14,10 +14,13 @@ from experiments.report.page import _origin
 from experiments.rows import Row, read_csv, write_csv
 from experiments.running import provenance
 from experiments.running.agreement import check_finished, group_by_sources, require_one_closure
+from experiments.running.attempts import read_states
 from experiments.running.closure import ROOT, closure_hash, source_hash, trace
+from experiments.running.launchers.local import LocalLauncher
+from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
-from experiments.running.runner import Job, read_states, run_missing
+from experiments.running.runner import Job, run_missing
 from experiments.running.sealed import write_result
 from experiments.setting import Where, make_setting
 from experiments.sweep import unique_trials
@@ -118,7 +121,7 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
         trial = [sys.executable, "-m", "experiments.running.trial_main", str(directory)]
         return ["sh", "-c", 'cd "$0" && PYTHONPATH="$0" exec "$@"', str(checkout), *trial]
 
-    states = run_missing(jobs, tmp_path / "trials", ledger, command=command, poll_seconds=0.01)
+    states = run_missing(jobs, tmp_path / "trials", ledger, LocalLauncher(tmp_path, 1, command=command))
     assert [states[f"t{i}"].event for i in range(3)] == ["refused", "missing", "missing"]
     assert "sources changed since this sweep was started: hma_jax.objective.losses." in states["t0"].message
     assert not (tmp_path / "trials" / "t0" / "run").exists()
@@ -129,7 +132,7 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
 def test_a_refused_trial_is_tried_again_without_being_asked_for(tmp_path):
     ledger, jobs = Ledger(tmp_path / "ledger.jsonl"), [Job("t0", "trial", {"end": "result", "steps": 1, "seconds": 0})]
     ledger.append("t0", REFUSED)
-    states = run_missing(jobs, tmp_path / "trials", ledger, command=fake_trial.command, poll_seconds=0.01)
+    states = run_missing(jobs, tmp_path / "trials", ledger, fake_trial.launcher(tmp_path))
     assert states["t0"].event == "finished"
 
 
@@ -179,7 +182,8 @@ def test_finished_trials_copied_from_another_machine_count_as_done(tmp_path):
     check_finished(here.trials, ids)
     require_one_closure(here.trials, ids, None, accept=False)
     assert {s.event for s in read_states(ids, here.trials, ledger).values()} == {"finished"}
-    run_missing([Job(id, id, {}) for id in ids], here.trials, ledger, command=lambda _: pytest.fail("it ran again"))
+    again = LocalLauncher(tmp_path, 1, command=lambda _: pytest.fail("it ran again"))
+    run_missing([Job(id, id, {}) for id in ids], here.trials, ledger, again)
     sweeps = [commands.AXES[axis](STUDY) for axis in commands.SCALING]
     for workspace in (there, here):
         write_csv(workspace.results, Row, rows_of(workspace, sweeps))
@@ -273,8 +277,8 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
     setting = replace(make_setting(Where("smoke", tmp_path)), study=STUDY)
 
     def run():
-        commands.run_study(setting, commands.SCALING, again="", workers=1, retry_failed=False, accept_code=accept,
-                           replace=None)  # fmt: skip
+        commands.run_study(setting, commands.SCALING, again="", launcher=Launching(), retry_failed=False,
+                           accept_code=accept, replace=None)  # fmt: skip
 
     if accept:
         run()

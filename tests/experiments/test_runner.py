@@ -1,29 +1,38 @@
 """The runner survives crashes, interruptions and its own death, and repeats nothing."""
 
+import json
 import os
 import platform
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
 
+from experiments.running import runner, trial_main
+from experiments.running.attempts import attempt, read_states
 from experiments.running.children import child_environment
 from experiments.running.ledger import Ledger
-from experiments.running.runner import Job, Monitor, read_states, run_missing
+from experiments.running.runner import TRIES, Job, Monitor, run_missing
+from hma_jax.runtime import locks
 from hma_jax.runtime.host_memory import KEPT_PAGES
 from tests.experiments import fake_trial
 
 
-def job(id: str, end: str = "result", steps: int = 1) -> Job:
-    return Job(id, f"trial {id}", {"steps": steps, "seconds": 0.0, "end": end})
+def job(id: str, end: str = "result", steps: int = 1, **more) -> Job:
+    return Job(id, f"trial {id}", {"steps": steps, "seconds": 0.0, "end": end, **more})
 
 
-def run(root: Path, jobs, **options):
-    ledger = Ledger(root / "ledger.jsonl")
-    return run_missing(jobs, root / "trials", ledger, command=fake_trial.command, poll_seconds=0.01, **options)
+def run(root: Path, jobs, workers: int = 1, **options):
+    place = fake_trial.launcher(root, workers)
+    return run_missing(jobs, root / "trials", Ledger(root / "ledger.jsonl"), place, **options)
+
+
+def events(root: Path, id: str) -> list[str]:
+    return [line["event"] for line in Ledger(root / "ledger.jsonl").records() if line["trial"] == id]
 
 
 def starts(root: Path, id: str) -> list[int]:
@@ -55,21 +64,44 @@ def test_second_run_starts_nothing(tmp_path):
 
 
 def test_failures_are_recorded_and_the_sweep_goes_on(tmp_path):
-    jobs = [job("crash", "crash"), job("nan", "diverge"), job("oom", "killed"), job("silent", "none"), job("good")]
+    jobs = [job("crash", "crash"), job("nan", "diverge"), job("abort", "SIGABRT"), job("silent", "none"), job("good")]
     states = run(tmp_path, jobs, workers=2)
     assert {k: s.event for k, s in states.items()} == {
-        "crash": "failed", "nan": "diverged", "oom": "failed", "silent": "failed", "good": "finished",
+        "crash": "failed", "nan": "diverged", "abort": "failed", "silent": "failed", "good": "finished",
     }  # fmt: skip
     assert states["nan"].message == "loss is nan"
-    assert "SIGKILL" in states["oom"].message and "output.txt" in states["oom"].message
+    assert "SIGABRT" in states["abort"].message and "output.txt" in states["abort"].message
     assert "exit code 1" in states["crash"].message
     assert "no such luck" in (tmp_path / "trials/crash/output.txt").read_text()
 
 
-def test_failed_trials_run_again_only_on_request(tmp_path):
-    run(tmp_path, [job("a", "crash")])
+@pytest.mark.parametrize(("end", "state"), [("SIGKILL", "lost"), ("SIGTERM", "preempted")])
+def test_a_trial_that_is_killed_goes_on_from_where_it_was(tmp_path, end, state):
+    """The kernel's out-of-memory killer, or a machine that is taken away: nothing is wrong with the trial."""
+    assert run(tmp_path, [job("a", end, steps=3)])["a"].event == "finished"
+    assert starts(tmp_path, "a") == [0, 3]
+    assert events(tmp_path, "a") == ["running", state, "running", "finished"]
+
+
+def test_what_kills_a_trial_every_time_is_not_tried_for_ever(tmp_path):
+    state = run(tmp_path, [job("big", "SIGKILL", times=99), job("good")])["big"]
+    assert state.event == "lost" and "out of memory?" in state.message
+    assert len(starts(tmp_path, "big")) == TRIES and starts(tmp_path, "good") == [0]
+    run(tmp_path, [job("big", "SIGKILL", times=99)])  # the next command tries as often
+    assert len(starts(tmp_path, "big")) == 2 * TRIES
+
+
+def test_failed_trials_run_again_only_on_request_and_keep_their_checkpoint(tmp_path):
+    run(tmp_path, [job("a", "crash", steps=3)])
     assert run(tmp_path, [job("a")])["a"].event == "failed"
-    assert run(tmp_path, [job("a")], retry_failed=True)["a"].event == "finished"
+    assert run(tmp_path, [job("a", steps=4)], retry_failed=True)["a"].event == "finished"
+    assert starts(tmp_path, "a") == [0, 3]
+
+
+def test_a_diverged_trial_is_tried_from_the_start(tmp_path):
+    run(tmp_path, [job("a", "diverge", steps=3)])
+    assert run(tmp_path, [job("a", steps=3)], retry_failed=True)["a"].event == "finished"
+    assert starts(tmp_path, "a") == [0, 0]
 
 
 def test_deleted_trial_directory_is_run_again(tmp_path):
@@ -80,16 +112,16 @@ def test_deleted_trial_directory_is_run_again(tmp_path):
 
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGINT])
 def test_killed_inside_a_trial_resumes_it(tmp_path, kill):
-    runner = start_sweep(tmp_path)
-    count = tmp_path / "trials/t1/count.txt"
+    sweep = start_sweep(tmp_path)
+    count = tmp_path / "trials/t1/run/count.txt"
     wait_for(lambda: count.exists() and int(count.read_text()) >= 3)
-    runner.send_signal(kill)
-    assert runner.wait(20) != 0
+    sweep.send_signal(kill)
+    assert sweep.wait(20) != 0
     reached = int(count.read_text())
     time.sleep(0.3)
     assert int(count.read_text()) <= reached + 1, "the trial outlived its runner"
     states = read_states(["t1"], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"))
-    assert states["t1"].event == "interrupted"
+    assert states["t1"].event == ("lost" if kill == signal.SIGKILL else "preempted")
 
     assert start_sweep(tmp_path).wait(30) == 0
     assert starts(tmp_path, "t0") == [0], "a finished trial ran again"
@@ -112,29 +144,66 @@ def test_monitor_hears_starts_and_ends(tmp_path):
     heard = []
 
     class Listener(Monitor):
-        def started(self, job, resumed):
-            heard.append(("started", job.id, resumed))
+        def launched(self, job, resumed):
+            heard.append(("launched", job.id, resumed))
 
-        def ended(self, job, state, seconds):
-            heard.append(("ended", job.id, state.event))
+        def ended(self, job, state, seconds, again):
+            heard.append((state.event, job.id, again))
 
-    run(tmp_path, [job("a")], monitor=Listener())
-    assert heard == [("started", "a", False), ("ended", "a", "finished")]
+    run(tmp_path, [job("a", "SIGKILL")], monitor=Listener())
+    assert heard == [("launched", "a", False), ("lost", "a", True), ("launched", "a", True), ("finished", "a", False)]
 
 
-def test_workers_share_the_cores():
-    cores = set(os.sched_getaffinity(0))
-    shares = [set(map(int, child_environment(i, 2)["HMA_CORES"].split(","))) for i in range(2)]
-    assert shares[0] | shares[1] == cores
-    if len(cores) > 1:
-        assert not shares[0] & shares[1]
-    assert "HMA_CORES" not in child_environment(0, 1)
+def test_a_trial_that_another_runner_left_running_is_waited_for(tmp_path, monkeypatch):
+    """On another machine a trial outlives the runner that started it: it is neither started twice nor lost."""
+    monkeypatch.setattr(runner, "LOOK_EVERY", 0.05)
+    directory = tmp_path / "trials/a"
+    directory.mkdir(parents=True)
+    Ledger(tmp_path / "ledger.jsonl").append("a", "running", title="trial a")
+    with attempt(directory):
+        assert read_states(["a"], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"))["a"].event == "running"
+        ended = threading.Timer(0.5, lambda: (directory / "result.json").write_text("{}"))
+        waits = threading.Thread(target=run, args=(tmp_path, [job("a"), job("b")]))
+        ended.start(), waits.start()
+        wait_for(lambda: (directory / "result.json").exists())
+        assert waits.is_alive()
+    waits.join(20)
+    assert not (directory / "starts.txt").exists() and starts(tmp_path, "b") == [0]
+    assert events(tmp_path, "a") == ["running", "finished"]
+
+
+def test_a_lease_that_ran_out_lets_another_take_the_trial(tmp_path, monkeypatch):
+    """A worker on another machine died: its lock file stays, unrenewed, and no lock of this kernel's is behind it."""
+    monkeypatch.setattr(runner, "LOOK_EVERY", 0.05)
+    directory = tmp_path / "trials/a"
+    directory.mkdir(parents=True)
+    Ledger(tmp_path / "ledger.jsonl").append("a", "running", title="trial a")
+    lock = directory / "trial.lock"
+    lock.write_text(json.dumps({"process": 1, "host": "far", "since": "noon", "machine": "far", "token": "x"}))
+    states = lambda: read_states(["a"], tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"))["a"].event
+    assert states() == "running"
+    renewed = time.time() - locks.EXPIRES - 1
+    os.utime(lock, (renewed, renewed))
+    assert run(tmp_path, [job("a")])["a"].event == "finished"
+    assert events(tmp_path, "a") == ["running", "lost", "running", "finished"]
 
 
 def test_a_child_uses_huge_pages_unless_the_user_said_otherwise(monkeypatch):
-    assert child_environment(0, 1)["GLIBC_TUNABLES"] == KEPT_PAGES["GLIBC_TUNABLES"]
+    assert child_environment(Path("compiled"))["GLIBC_TUNABLES"] == KEPT_PAGES["GLIBC_TUNABLES"]
     monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.hugetlb=0")
-    assert child_environment(0, 1)["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=0"
+    assert child_environment(Path("compiled"))["GLIBC_TUNABLES"] == "glibc.malloc.hugetlb=0"
+
+
+def test_a_trial_that_lost_its_lease_stops_for_the_one_that_took_over(tmp_path, monkeypatch):
+    """A machine that was cut off for longer than its lease finds out when it is back."""
+    monkeypatch.setattr(trial_main, "LOOK_EVERY", 0.0)
+    with attempt(tmp_path) as held:
+        report = trial_main._ProgressFile(tmp_path / "progress.json", held.lost)
+        report("training", 1, 2)
+        (tmp_path / "trial.lock").unlink()
+        with attempt(tmp_path), pytest.raises(trial_main.TakenOver, match="another attempt"):
+            report("training", 2, 2)
+    assert json.loads((tmp_path / "progress.json").read_text())["done"] == 1
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the setting is glibc's")

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments import trial as trials
@@ -86,6 +87,17 @@ def test_a_run_that_another_process_trains_is_refused(where, tmp_path, capsys):
     said = capsys.readouterr().err
     assert said.startswith(f"error: {tmp_path / 'run'} is being trained in by process ") and "Traceback" not in said
     assert main(["train", *where, "--run", str(tmp_path / "run")]) == 0
+
+
+def test_the_number_of_damaged_episodes_that_were_left_out_is_in_the_checkpoint(tmp_path):
+    def spoil(episode, features):
+        if episode in (3, 5):
+            features["steps/action"][0] = np.nan
+
+    data = write_rlds(tmp_path, ARM, [18] * 12, change=spoil)
+    where = [*SMOKE, "--out", str(tmp_path / "out"), "--data", str(data), "--set", "store.corrupt=skip"]
+    assert main(["train", *where]) == 0
+    assert load_run(tmp_path / "out" / "model").provenance["lost"] == {ARM.name: 2}
 
 
 @pytest.mark.slow

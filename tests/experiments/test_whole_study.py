@@ -26,7 +26,7 @@ def finish(command: list[str]) -> None:
 
 
 def starts(out: Path) -> int:
-    return sum(json.loads(line)["event"] == "started" for line in (out / "ledger.jsonl").read_text().splitlines())
+    return sum(json.loads(line)["event"] == "running" for line in (out / "ledger.jsonl").read_text().splitlines())
 
 
 def test_one_command_goes_from_nothing_to_a_page(tmp_path):
@@ -63,7 +63,8 @@ def test_killed_study_ends_with_the_same_csv(tmp_path):
     finish(command)
     assert starts(tmp_path) == 6 and (tmp_path / "results.csv").read_bytes() == csv
 
-    interrupted = json.loads((tmp_path / "ledger.jsonl").read_text().splitlines()[2])["trial"]
-    shutil.rmtree(tmp_path / "trials" / interrupted)  # never killed, this time
+    ledger = map(json.loads, (tmp_path / "ledger.jsonl").read_text().splitlines())
+    (lost,) = (line["trial"] for line in ledger if line["event"] == "lost")
+    shutil.rmtree(tmp_path / "trials" / lost)  # never killed, this time
     finish(command)
     assert starts(tmp_path) == 7 and (tmp_path / "results.csv").read_bytes() == csv

@@ -63,6 +63,20 @@ def test_what_is_not_finite_is_never_saved(what, value, message, at, tmp_path: P
     assert resumed.resumed_from == at - 1 and len(resumed.losses) == 6
 
 
+def test_the_records_of_the_batch_that_was_not_finite_are_named(tmp_path: Path):
+    def make(start: int):
+        for index, batch in enumerate(toy_batches(start), start):
+            yield np.full_like(batch, math.nan) if index == 3 else batch
+
+    def records(index: int) -> list[str]:
+        return [f"record {10 * index + row}" for row in range(6)]
+
+    with pytest.raises(DivergedError, match="loss is nan at step 4; its batch was record 30; record 31; .* and 2 more"):
+        fit_toy(tmp_path, make=make, records=records, options=EVERY_STEP)
+    said = json.loads((tmp_path / "diverged.json").read_text())
+    assert said == {"step": 4, "what": "the loss is nan at step 4", "records": [f"record {30 + row}" for row in range(6)]}
+
+
 def test_checks_are_not_logged(tmp_path: Path):
     fit_toy(tmp_path)
     assert lines(tmp_path / "metrics.jsonl")[0].keys() == {"step", "loss"}

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from hma_jax.training.reading import find_damage, list_steps
 
 ROOT = Path(__file__).parents[2]
@@ -27,15 +29,20 @@ def test_a_new_run_and_a_resumed_one_hold_one_state(tmp_path: Path):
         assert 1 <= said["states"] <= 1.05, said
 
 
-def test_a_full_disk_is_one_message_and_the_last_checkpoint_is_kept(tmp_path: Path):
-    full = run("train_full_disk", tmp_path, "full")
-    assert full.returncode == 1
-    assert full.stderr.count("\n") == 1, full.stderr[-3000:]
-    assert full.stderr.startswith(f"error: the checkpoint of step 4 could not be written to {tmp_path}/checkpoints: ")
-    assert re.search(r": File too large\. It takes about 8 kB, and [0-9.]+ .?B are free there\. See that", full.stderr)
-    assert full.stderr.endswith("the same command again: it goes on from step 2, the last whole checkpoint\n")
+@pytest.mark.parametrize(
+    ("mode", "reason"),
+    [("full", r"File too large\. It takes about 8 kB, and [0-9.]+ .?B are free there"), ("read-only", "Permission denied")],
+)
+def test_a_disk_that_takes_no_more_is_one_message_and_the_last_checkpoint_is_kept(mode, reason, tmp_path: Path):
+    failed = run("train_full_disk", tmp_path, mode)
+    assert failed.returncode == 1
+    assert failed.stderr.count("\n") == 1, failed.stderr[-3000:]
+    assert failed.stderr.startswith(f"error: the checkpoint of step 4 could not be written to {tmp_path}/checkpoints: ")
+    assert re.search(rf": {reason}.* See that there is space and permission", failed.stderr), failed.stderr
+    assert failed.stderr.endswith("the same command again: it goes on from step 2, the last whole checkpoint\n")
     assert list_steps(tmp_path / "checkpoints") == [2]
     assert find_damage(tmp_path / "checkpoints" / "2") is None
+    (tmp_path / "checkpoints").chmod(0o755)
     again = run("train_full_disk", tmp_path)
     assert again.returncode == 0, again.stderr[-3000:]
     assert again.stdout == "2\n" and list_steps(tmp_path / "checkpoints") == [4, 6]

@@ -1,7 +1,7 @@
 """Trains a model of forty robots on several meshes of the devices at hand; prints a JSON line.
 
-Arguments: the kind of model ("ids", "latents" or "attended": ids, actions entering by cross-attention), the
-number of steps, the number of robots and the meshes, each as "data,fsdp,tensor".
+Arguments: the kind of model ("ids", "latents", "attended": ids, actions entering by cross-attention, or "kept":
+ids, nothing computed twice), the number of steps, the number of robots and the meshes, each as "data,fsdp,tensor".
 """
 
 import json
@@ -43,7 +43,7 @@ def make_model(kind: str) -> ModelConfig:
 def train(kind: str, mesh: tuple[int, int, int], steps: int, robots: int) -> dict:
     model, table, config = make_model(kind), make_table(robots), train_config(steps=steps, batch=BATCH, optimizer=FAST)
     mesh_config = MeshConfig(*mesh, min_shard_size=1)
-    execution = ExecutionConfig(mesh=mesh_config)
+    execution = ExecutionConfig(remat="none" if kind == "kept" else "everything", mesh=mesh_config)
     declared = declare_model(model, table, execution)
     device_mesh = make_mesh(mesh_config, jax.devices()[: math.prod(mesh)])
     shapes = state_shapes(declared, table, device_mesh, mesh_config)

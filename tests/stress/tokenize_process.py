@@ -50,7 +50,7 @@ def tokenize(work: Work, dies_in: int = 0) -> None:
     """All datasets, as `hma tokenize` does. `dies_in`: kills itself before this step of its saves, from 1 on."""
     log_parts(work.log)
     if dies_in:
-        die_in_save(work.log, dies_in)
+        end_in_save(work.log, dies_in)
     tokenizer = SlowTokenizer(work.pause)
 
     def make(name: str, wait: bool) -> bool:
@@ -80,20 +80,25 @@ def log_parts(log: Path) -> None:
     part_maker.write_part = logged
 
 
-def die_in_save(log: Path, countdown: int) -> None:
+def end_in_save(log: Path, at: int, how: signal.Signals = signal.SIGKILL) -> Callable[[], int]:
+    """From now on counts the steps of saves, and sends itself the signal `how` before the one numbered `at`, if
+    there are so many (0: before none). Returns what tells how many there were."""
+    done = 0
+
     def patched(call: Callable) -> Callable:
         def step(*arguments: object, **options: object) -> object:
-            nonlocal countdown
-            countdown -= 1
-            if countdown == 0:
+            nonlocal done
+            done += 1
+            if done == at:
                 write(log, "dies", call.__name__)
-                os.kill(os.getpid(), signal.SIGKILL)
+                os.kill(os.getpid(), how)
             return call(*arguments, **options)
 
         return step
 
     for name in STEPS_OF_A_SAVE:
         setattr(os, name, patched(getattr(os, name)))
+    return lambda: done
 
 
 def write(log: Path, what: str, place: str = "") -> None:

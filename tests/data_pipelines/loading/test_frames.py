@@ -10,6 +10,7 @@ from data_pipelines.errors import EpisodeError
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import get_spec
 from data_pipelines.sampling.splits import held_out
+from data_pipelines.sources.identity import describe
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles
 from hma_jax.config import ConfigError
@@ -46,11 +47,22 @@ def test_splits_share_no_episode_and_cover_all_frames(rlds):
     assert seen["val"] == {(e, t) for e in np.flatnonzero(mask) for t in range(5 + e)}
 
 
-def test_resuming_continues_exactly(rlds):
-    straight = take([(SPEC, rlds)], 6)
-    for start in (1, 4):
-        rest = take([(SPEC, rlds)], 2, start_step=start, threads=0)
-        assert np.array_equal(rest, straight[start : start + 2])
+def test_resuming_at_every_step_continues_exactly(tmp_path, rlds):
+    other = make_spec("other")
+    for datasets in ([(SPEC, rlds)], [(SPEC, rlds), (other, write_rlds(tmp_path, other, [9] * 6))]):
+        straight = take(datasets, 7)
+        for start in range(6):
+            rest = take(datasets, 2, start_step=start, threads=0)
+            assert np.array_equal(rest, straight[start : start + 2])
+
+
+def test_the_records_of_a_batch_are_those_that_its_frames_were_read_from(rlds):
+    """The fixture's frames say (episode, step); four come from one episode at a time."""
+    loader = make_frame_loader([(SPEC, rlds)], image_size=8, batch=8, seed=1)
+    runs = RldsDataset(rlds).runs
+    for step in range(4):
+        episodes = next(loader)[::4, 0, 0, 0]
+        assert loader.describe(step) == [f"toy: {describe(runs, int(e))}" for e in episodes]
 
 
 def test_number_of_threads_changes_no_frame(tmp_path, rlds):

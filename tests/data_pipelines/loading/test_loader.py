@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import resource
 import shutil
 from dataclasses import replace
@@ -10,8 +11,9 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
-from data_pipelines.loading.loader import make_loader
+from data_pipelines.loading.loader import describe_batch, make_loader
 from data_pipelines.loading.selection import LoaderConfig, select_windows, training_table
+from data_pipelines.sources.identity import describe
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
@@ -112,11 +114,27 @@ def test_global_batch_does_not_depend_on_the_number_of_processes(store, table, p
         assert same(batch, joined)
 
 
-def test_resuming_at_every_step_continues_exactly(store, table):
-    straight = take(store, table, 9)
+@pytest.mark.parametrize("process", [(0, 1), (1, 2)])
+@pytest.mark.parametrize("datasets", [(), ("arm",)])
+def test_resuming_at_every_step_continues_exactly(datasets, process, store, table):
+    """A mixture and a single dataset; alone and as one of two processes."""
+    config, part = replace(CONFIG, datasets=datasets), dict(process_index=process[0], process_count=process[1])
+    straight = take(store, table, 9, config, **part)
     for start in range(9):
-        for batch, expected in zip(take(store, table, 2, start_step=start), straight[start:], strict=False):
+        rest = take(store, table, 2, config, start_step=start, **part)
+        for batch, expected in zip(rest, straight[start:], strict=False):
             assert same(batch, expected)
+
+
+def test_the_records_of_a_batch_are_those_that_its_rows_were_read_from(store, table):
+    """The fixture's tokens say (episode, step)."""
+    for step, batch in enumerate(take(store, table, 3)):
+        records = describe_batch(store, table, CONFIG, step)
+        assert len(records) == CONFIG.batch
+        for tokens, embodiment, record in zip(batch["tokens"], batch["embodiment"], records, strict=True):
+            name, place, frame = re.fullmatch(r"(\w+): (.*), from frame (\d+)", record).groups()
+            assert name == table.names[embodiment] and int(frame) == tokens[0, 0] % 256
+            assert place == describe(store.manifest(name).runs, tokens[0, 0] // 256)
 
 
 def test_resuming_with_other_processes_and_threads_continues_exactly(store, table):

@@ -1,0 +1,138 @@
+"""One attempt at a trial: what it leaves in the trial's directory, and what that says of the trial.
+
+The same wherever the attempt runs. Its process holds the trial's claim, a lock with a lease
+(`data_pipelines.publishing.claims`), for as long as it lives; whoever finds the claim free may try again.
+A trial's directory holds, besides what `experiments.trial` lists,
+
+    trial.lock      while an attempt is alive
+    started.json    of the latest attempt: its process and host
+    progress.json   how far it is
+    failure.json    why it failed or diverged
+    output.txt      what all attempts printed
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from data_pipelines.publishing.claims import Claim, claim, living_claim
+from data_pipelines.publishing.files import write_file
+from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
+
+JOB, STARTED, PROGRESS = "job.json", "started.json", "progress.json"
+RESULT, FAILURE, OUTPUT = "result.json", "failure.json", "output.txt"
+RUN = "run"
+"""The training run, with its checkpoints."""
+
+STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+"""What an attempt is asked to stop by. It saves and ends with 128 + n; before it can, with -n."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a trial stands: one of the states of `ledger`, with a message when it has no result."""
+
+    event: str
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How the process of an attempt ended. `code` is as of `subprocess`, negative for a signal; None if nobody
+    saw its end, and then `why` says how that is known."""
+
+    code: int | None
+    why: str = ""
+
+
+@contextmanager
+def attempt(directory: Path) -> Iterator[Claim]:
+    """Held by the process of an attempt: the trial's claim. Waits for one that another process holds.
+
+    A process that died on another machine holds it until its lease is over (`hma_jax.runtime.locks.EXPIRES`).
+    """
+    with claim(directory / "trial", wait=True) as held:
+        who = {"host": socket.gethostname(), "process": os.getpid(), "token": secrets.token_hex(4)}
+        write_file(directory / STARTED, json.dumps(who | _engine_job()))
+        yield held
+
+
+def _engine_job() -> dict[str, str]:
+    """The job of an engine that this process is in, by the name that the engine's commands take."""
+    array, task = os.environ.get("SLURM_ARRAY_JOB_ID"), os.environ.get("SLURM_ARRAY_TASK_ID")
+    job = f"{array}_{task}" if array else os.environ.get("SLURM_JOB_ID")
+    return {"job": job} if job else {}
+
+
+def is_alive(directory: Path) -> bool:
+    """Whether a living process holds the trial's claim."""
+    return living_claim(directory) is not None
+
+
+def read_start(directory: Path) -> dict[str, Any] | None:
+    """Of the latest attempt: host, process, an engine's job and a token of its own; None before its process is up."""
+    return _read(directory / STARTED)
+
+
+def read_progress(directory: Path) -> dict[str, Any] | None:
+    """{phase, done, total}, or None before there is any."""
+    return _read(directory / PROGRESS)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        return None
+
+
+def outcome(directory: Path, ended: Ended) -> State:
+    """How an attempt that has ended left its trial."""
+    if (directory / RESULT).exists():
+        return State(FINISHED)
+    if failure := _read(directory / FAILURE):
+        return State(failure["state"], failure["message"])
+    log = f"output in {directory / OUTPUT}"
+    if ended.code is None:
+        return State(LOST, f"{ended.why}; {log}")
+    number = _signal(ended.code)
+    if number in STOP_SIGNALS:
+        return State(PREEMPTED, ended.why)
+    if number == signal.SIGKILL:
+        return State(LOST, f"its process was ended by SIGKILL (out of memory?); {log}")
+    if number:
+        return State(FAILED, f"its process was ended by {signal.Signals(number).name}; {log}")
+    return State(FAILED, f"its process ended with exit code {ended.code} and no result; {log}")
+
+
+def _signal(code: int) -> int:
+    """The number of the signal that ended a process, said by subprocess (-n) or a shell (128 + n); 0: none."""
+    number = -code if code < 0 else code - 128
+    return number if number in set(signal.Signals) else 0
+
+
+def read_states(ids: Sequence[str], trials: Path, ledger: Ledger) -> dict[str, State]:
+    """The state of each trial. A result on disk is the truth; the ledger may lag behind it."""
+    recorded = ledger.states()
+    return {id: _state(trials / id, recorded.get(id)) for id in ids}
+
+
+def _state(directory: Path, record: dict[str, Any] | None) -> State:
+    if (directory / RESULT).exists():
+        return State(FINISHED)
+    if is_alive(directory):
+        return State(RUNNING)
+    if record is None or record["event"] == FINISHED:  # its directory was deleted: run it again
+        return State(MISSING)
+    if record["event"] == RUNNING:  # whoever started it did not see its end
+        return outcome(directory, Ended(None, "its process is gone"))
+    return State(record["event"], record.get("message", ""))

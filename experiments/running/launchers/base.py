@@ -1,0 +1,73 @@
+"""What the runner asks of a place where trials run.
+
+A launcher starts processes, says when they have ended and stops them. It knows nothing of what they do: they
+leave results, failures and progress in the directories of their trials (`experiments.running.attempts`), which
+every place must share.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from experiments.running.attempts import Ended
+
+GRACE_SECONDS = 60.0
+"""How long a trial may take to save its state when it is asked to stop."""
+
+Command = Callable[[Path], list[str]]
+"""The command of the process that makes an attempt in a trial's directory."""
+
+
+def trial_command(directory: Path) -> list[str]:
+    return [sys.executable, "-m", "experiments.running.trial_main", str(directory)]
+
+
+class Launcher(ABC):
+    """A place where trials run. `Settings` is a dataclass: what `--launcher-set` may say of it."""
+
+    Settings: ClassVar[type]
+    pause: ClassVar[float] = 0.1
+    """Seconds between two looks at what has ended."""
+
+    at_once: int = sys.maxsize
+    """How many trials it takes at a time; the engines queue what does not fit."""
+
+    @abstractmethod
+    def launch(self, directories: Sequence[Path]) -> list[Any]:
+        """Asks for an attempt at the trial of each directory, and returns a handle for each.
+
+        Raises ConfigError if the place refuses them.
+        """
+
+    @abstractmethod
+    def ended(self, handle: Any) -> Ended | None:
+        """How the attempt ended; None while it is queued or runs."""
+
+    @abstractmethod
+    def ask_to_stop(self, handles: Sequence[Any]) -> None:
+        """Asks running attempts to save and end, and takes queued ones back. Does not wait."""
+
+    @abstractmethod
+    def kill(self, handles: Sequence[Any]) -> None:
+        """Ends attempts at once, those that have ended already too."""
+
+    def stop(self, handles: Sequence[Any], grace: float | None = None) -> list[Ended]:
+        """Asks, waits until all have ended, kills the rest after the grace period. Returns how each ended."""
+        self.ask_to_stop(handles)
+        deadline = time.monotonic() + (GRACE_SECONDS if grace is None else grace)
+        while time.monotonic() < deadline and any(self.ended(h) is None for h in handles):
+            time.sleep(self.pause)
+        self.kill([h for h in handles if self.ended(h) is None])
+        return [self.ended(h) or Ended(None, "it did not end when it was asked to") for h in handles]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Leaves the place. Everything launched has ended."""
+        return

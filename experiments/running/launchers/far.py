@@ -1,0 +1,73 @@
+"""A process of an engine on some machine, which makes one attempt at a trial in a child of its own.
+
+The child's memory, signals and accelerators are its own, and it ends with this process however that ends. The
+engine's SIGTERM is handed on as SIGINT: some engines send it to the child too, and a trial takes the second one
+of a kind for impatience.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+from experiments.running.attempts import OUTPUT
+from experiments.running.children import child_environment
+from experiments.running.launchers.base import GRACE_SECONDS, Command
+
+LOOK_EVERY = 0.1
+"""Seconds between two looks whether the child has ended."""
+
+
+class Attempt:
+    """`directory` is the trial's, `cache` of compiled programs; both on the shared disk."""
+
+    def __init__(self, directory: Path, cache: Path, command: Command):
+        self.directory, self.cache, self.command = directory, cache, command
+        self._child: subprocess.Popen | None = None
+        self._code: int | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return vars(self) | {"_child": None, "_code": None}
+
+    def run(self) -> int:
+        """Makes the attempt and returns its exit code, as of `subprocess`."""
+        with open(self.directory / OUTPUT, "a") as output:
+            self._child = subprocess.Popen(
+                self.command(self.directory),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=child_environment(self.cache),
+                start_new_session=True,  # signals come through here, once
+            )
+        # Engines stop us by calls from signal handlers in this thread. Here and there it must hold no lock,
+        # as those of `subprocess` are, so another one waits for the child.
+        threading.Thread(target=self._wait, daemon=True).start()
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, lambda *_: self._ask())
+        try:
+            while self._code is None:
+                time.sleep(LOOK_EVERY)
+            return self._code
+        finally:  # the engine interrupts the call
+            self.end()
+
+    def _wait(self) -> None:
+        self._code = self._child.wait()
+
+    def _ask(self) -> None:
+        self._child.send_signal(signal.SIGINT)
+
+    def end(self) -> None:
+        """Asks the child to save and waits until it has ended; kills it after the grace period."""
+        if self._code is not None:
+            return
+        self._ask()
+        deadline = time.monotonic() + GRACE_SECONDS
+        while self._code is None and time.monotonic() < deadline:
+            time.sleep(LOOK_EVERY)
+        if self._code is None:
+            self._child.kill()

@@ -1,0 +1,79 @@
+"""This machine: processes that share its cores and accelerators and end with the command that started them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.running.attempts import OUTPUT, Ended
+from experiments.running.children import child_environment
+from experiments.running.launchers.base import Command, Launcher, trial_command
+from experiments.running.slots import cut, find_accelerators
+
+
+@dataclass(frozen=True)
+class LocalSettings:
+    """Nothing: the machine's cores and accelerators are divided by --workers."""
+
+
+@dataclass(frozen=True)
+class Child:
+    """A process of ours."""
+
+    process: subprocess.Popen
+    slot: int
+
+
+class LocalLauncher(Launcher):
+    """`workers` trials at a time, each in a slot of its own. Raises ConfigError for more than there can be."""
+
+    Settings = LocalSettings
+
+    def __init__(
+        self,
+        root: Path,
+        workers: int | None,
+        settings: LocalSettings = LocalSettings(),
+        command: Command = trial_command,
+    ):
+        self.at_once = workers or 1
+        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else ()
+        self._slots = cut(self.at_once, find_accelerators(), cores)
+        self._free = list(range(self.at_once))
+        self._root, self._command = root, command
+
+    def launch(self, directories: Sequence[Path]) -> list[Child]:
+        return [self._start(directory) for directory in directories]
+
+    def _start(self, directory: Path) -> Child:
+        slot = self._free.pop(0)
+        with open(directory / OUTPUT, "a") as output:
+            process = subprocess.Popen(
+                self._command(directory),
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=child_environment(self._root / "compiled", self._slots[slot]),
+                start_new_session=True,  # Ctrl-C reaches the runner only, which asks them to save
+            )
+        return Child(process, slot)
+
+    def ended(self, handle: Child) -> Ended | None:
+        code = handle.process.poll()
+        if code is None:
+            return None
+        if handle.slot not in self._free:
+            self._free.append(handle.slot)
+        return Ended(code)
+
+    def ask_to_stop(self, handles: Sequence[Child]) -> None:
+        for handle in handles:
+            handle.process.terminate()
+
+    def kill(self, handles: Sequence[Child]) -> None:
+        for handle in handles:
+            handle.process.kill()
+            handle.process.wait()

@@ -1,0 +1,118 @@
+"""A Ray cluster: one task for each trial, on whichever machine has the cores and accelerators that it asks for.
+
+Machines may differ and may come and go. Ray tells each task which accelerators are its own. A task whose worker
+or machine dies is not tried again by Ray: the runner does that, with its bound.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.running.attempts import Ended, is_alive
+from experiments.running.launchers.base import Command, Launcher, trial_command
+from experiments.running.launchers.far import Attempt
+from hma_jax.config import ConfigError
+
+
+@dataclass(frozen=True)
+class RaySettings:
+    """The cluster, and what each trial takes of it."""
+
+    address: str = "auto"  # of the head, "host:6379" or "ray://host:10001"; auto: the one this machine is part of
+    cpus: float = 1
+    gpus: float = 0
+    tpus: int = 0  # chips
+    memory_gb: float | None = None
+    resources: tuple[str, ...] = ()  # others that the cluster names, such as "big_memory=1"
+
+
+@dataclass(frozen=True)
+class Task:
+    directory: Path
+    reference: Any  # Ray's, to what the task returns
+
+
+class RayLauncher(Launcher):
+    """`workers`: how many trials run at a time; None: as many as the cluster holds. Raises ConfigError without it."""
+
+    Settings = RaySettings
+    pause = 0.5
+
+    def __init__(
+        self,
+        root: Path,
+        workers: int | None,
+        settings: RaySettings = RaySettings(),
+        command: Command = trial_command,
+        engine: Any = None,
+    ):
+        self.at_once = workers or Launcher.at_once
+        self._root, self._command = root, command
+        self._ray = engine or _join(settings.address)
+        self._run = self._ray.remote(**_options(settings))(run)
+
+    def launch(self, directories: Sequence[Path]) -> list[Task]:
+        cache = self._root / "compiled"
+        return [Task(d, self._run.remote(Attempt(d, cache, self._command))) for d in directories]
+
+    def ended(self, handle: Task) -> Ended | None:
+        done, _ = self._ray.wait([handle.reference], timeout=0)
+        if not done:
+            return None
+        try:
+            return Ended(self._ray.get(handle.reference))
+        except self._ray.exceptions.TaskCancelledError:
+            return None if is_alive(handle.directory) else Ended(-signal.SIGTERM)
+        except self._ray.exceptions.RayError as error:
+            return Ended(None, f"Ray says: {str(error).strip().splitlines()[0]}")
+
+    def ask_to_stop(self, handles: Sequence[Task]) -> None:
+        for handle in handles:  # raises KeyboardInterrupt in the task, which asks its child
+            self._ray.cancel(handle.reference, force=False)
+
+    def kill(self, handles: Sequence[Task]) -> None:
+        for handle in handles:
+            self._ray.cancel(handle.reference, force=True)
+        time.sleep(self.pause)
+
+    def __exit__(self, *exc: object) -> None:
+        self._ray.shutdown()
+
+
+def run(attempt: Attempt) -> int:
+    """The task."""
+    return attempt.run()
+
+
+def _options(settings: RaySettings) -> dict[str, Any]:
+    named = {name: float(amount) for name, _, amount in (r.partition("=") for r in settings.resources)}
+    if settings.tpus:
+        named["TPU"] = settings.tpus
+    memory = {} if settings.memory_gb is None else {"memory": int(settings.memory_gb * 2**30)}
+    return {"num_cpus": settings.cpus, "num_gpus": settings.gpus, "resources": named, "max_retries": 0, **memory}
+
+
+def _join(address: str) -> Any:
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError:
+        raise ConfigError("--launcher ray needs Ray: pip install 'hma-jax[ray]'") from None
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level="warning")
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)  # Ray's would abort this process, before trials are asked to save
+    except (ConnectionError, TimeoutError, RuntimeError) as error:
+        raise ConfigError(
+            f"no Ray cluster at {address} ({error}); start one with `ray start --head`, or name its head with "
+            "--launcher-set address=HOST:6379"
+        ) from error
+    return ray

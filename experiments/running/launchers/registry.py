@@ -1,0 +1,70 @@
+"""The launchers by name, and one made from what the command line says."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from experiments.running.launchers.base import Launcher
+from hma_jax.config import ConfigError, require
+from hma_jax.config.json import from_dict
+
+LAUNCHERS = {
+    "local": "experiments.running.launchers.local:LocalLauncher",
+    "slurm": "experiments.running.launchers.slurm:SlurmLauncher",
+    "ray": "experiments.running.launchers.ray:RayLauncher",
+}
+"""Where each is; imported when it is asked for."""
+
+
+@dataclass(frozen=True)
+class Launching:
+    """What the command line says of it. Raises ConfigError for a launcher or setting that there is not."""
+
+    name: str = "local"
+    workers: int | None = None  # trials at a time
+    said: tuple[str, ...] = ()  # 'key=value'
+
+    def __post_init__(self):
+        self._parsed()
+
+    def _parsed(self) -> tuple[type[Launcher], Any]:
+        kind = launcher_class(self.name)
+        return kind, parse_settings(self.name, kind.Settings, self.said)
+
+    def launcher(self, root: Path) -> Launcher:
+        """For the study in `root`. Raises ConfigError where it cannot work."""
+        kind, settings = self._parsed()
+        return kind(root, self.workers, settings)
+
+
+def launcher_class(name: str) -> type[Launcher]:
+    require(name in LAUNCHERS, f"--launcher {name}: choose one of {', '.join(LAUNCHERS)}")
+    module, _, attribute = LAUNCHERS[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def parse_settings(name: str, kind: type, said: Sequence[str]) -> Any:
+    """A `kind` from 'key=value' strings; a key whose value is a list may be said several times."""
+    hints, known = typing.get_type_hints(kind), ", ".join(f.name for f in fields(kind)) or "none"
+    values: dict[str, Any] = {}
+    for setting in said:
+        key, separator, text = setting.partition("=")
+        flag = f"--launcher-set {setting}"
+        require(bool(separator), f"{flag}: write it as key=value; the {name} launcher has {known}")
+        require(key in hints, f"{flag}: the {name} launcher has no such setting, but {known}")
+        if typing.get_origin(hints[key]) is tuple:
+            values[key] = [*values.get(key, ()), text]
+        elif str in (hints[key], *typing.get_args(hints[key])):
+            values[key] = text
+        else:
+            try:
+                values[key] = json.loads(text)
+            except ValueError:
+                raise ConfigError(f"{flag}: expected a number") from None
+    return from_dict(kind, values, f"--launcher-set of {name}")

@@ -1,0 +1,194 @@
+"""Slurm, through submitit: an array of jobs, one for each trial.
+
+Submitit writes and submits the batch script, runs the pickled attempt in the job, and puts it back into the queue
+when Slurm announces that it will be pre-empted or that its time is over (SIGUSR2, `grace` seconds before). A job
+that is cancelled, or pre-empted with a SIGTERM alone, has saved as well; the runner submits it again. Where jobs
+stand is asked of squeue, which every cluster has, with or without accounting.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import pickle
+import signal
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.running.attempts import Ended
+from experiments.running.launchers.base import Command, Launcher, trial_command
+from experiments.running.launchers.far import Attempt
+from hma_jax.config import ConfigError
+
+log = logging.getLogger(__name__)
+
+LARGEST_ARRAY = 1000
+"""Jobs in an array; Slurm's own default for MaxArraySize is 1001."""
+
+TIMEOUTS = 1000
+"""How often a trial may use up a job's time; it goes on from its checkpoint in the next."""
+
+COMPLETED = "COMPLETED"
+ASKED_TO_STOP = {"CANCELLED", "PREEMPTED", "TIMEOUT"}
+OVER = ASKED_TO_STOP | {COMPLETED, "BOOT_FAIL", "DEADLINE", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "REVOKED"}
+"""States of a job that will not run again."""
+
+LINGER = 30.0
+"""Seconds for a job's last words to reach this machine through a shared disk."""
+
+
+@dataclass(frozen=True)
+class SlurmSettings:
+    """Of the job of each trial."""
+
+    partition: str | None = None
+    account: str | None = None
+    qos: str | None = None
+    constraint: str | None = None
+    gpus: int | None = None  # on its node; None: as the partition gives them
+    cpus: int | None = None
+    memory_gb: float | None = None
+    minutes: int = 1440  # of one job; a trial that needs more goes on in the next
+    grace: int = 120  # seconds to save before the end of a job's time
+    sbatch: tuple[str, ...] = ()  # further options, such as "gres=gpu:h100:1"
+
+
+class SlurmAttempt(Attempt):
+    """What submitit pickles, calls in the job, and asks for what to do after an announced end."""
+
+    def __call__(self) -> int:
+        return self.run()
+
+    def checkpoint(self) -> Any:
+        from submitit.helpers import DelayedSubmission
+
+        self.end()
+        return DelayedSubmission(SlurmAttempt(self.directory, self.cache, self.command))
+
+
+class SlurmLauncher(Launcher):
+    """`workers`: how many jobs of the array run at a time; None: as many as Slurm gives.
+
+    Raises ConfigError where submitit or Slurm is missing.
+    """
+
+    Settings = SlurmSettings
+    pause = 2.0
+
+    def __init__(
+        self,
+        root: Path,
+        workers: int | None,
+        settings: SlurmSettings = SlurmSettings(),
+        command: Command = trial_command,
+        executor: Any = None,
+    ):
+        self._root, self._command = root, command
+        self._executor = executor or _make_executor(root / "slurm", workers, settings)
+        self._asked = -math.inf
+        self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
+        self._over: dict[str, float] = {}  # when a job was first seen to be over
+
+    def launch(self, directories: Sequence[Path]) -> list[Any]:
+        from submitit.core.utils import FailedJobError
+
+        attempts = [SlurmAttempt(d, self._root / "compiled", self._command) for d in directories]
+        jobs: list[Any] = []
+        try:
+            for first in range(0, len(attempts), LARGEST_ARRAY):
+                jobs += self._executor.submit_array(attempts[first : first + LARGEST_ARRAY])
+        except FailedJobError as error:
+            raise ConfigError(f"Slurm does not take the jobs: {error}; change --launcher-set") from error
+        self._asked, self._states = -math.inf, None
+        return jobs
+
+    def ended(self, handle: Any) -> Ended | None:
+        result = self._result(handle)
+        if result is not None:
+            if result.code != 0:  # Slurm might bring it back, beside the one that the runner submits
+                self.ask_to_stop([handle])
+            return result
+        state = self._state(handle.job_id)
+        if state not in OVER:
+            return None
+        why = f"Slurm says {state} of job {handle.job_id}"
+        if state in ASKED_TO_STOP:
+            return Ended(-signal.SIGTERM, why)
+        seen = self._over.setdefault(handle.job_id, time.monotonic())
+        if state == COMPLETED and time.monotonic() - seen < LINGER:
+            return None
+        return Ended(None, f"{why}; its log is {handle.paths.stdout}")
+
+    def _result(self, job: Any) -> Ended | None:
+        """What the job's process left when it ended by itself."""
+        try:
+            kind, value = pickle.loads(job.paths.result_pickle.read_bytes())
+        except FileNotFoundError:
+            return None
+        if kind == "success":
+            return Ended(value)
+        return Ended(None, f"job {job.job_id} ended with {str(value).strip().splitlines()[-1]}")
+
+    def _state(self, id: str) -> str:
+        """Of one job; all are asked for at once, not more often than is good for the cluster."""
+        if time.monotonic() - self._asked >= self.pause:
+            self._asked = time.monotonic()
+            answer = ask_states()
+            self._states = self._states if answer is None else answer
+        if self._states is None:
+            return "UNKNOWN"
+        return self._states.get(id, COMPLETED)  # squeue forgets what has been over for a while
+
+    def ask_to_stop(self, handles: Sequence[Any]) -> None:
+        """Slurm sends SIGTERM, and SIGKILL after its KillWait; jobs in the queue leave it."""
+        if handles:
+            subprocess.run(["scancel", *(h.job_id for h in handles)], check=False)
+
+    def kill(self, handles: Sequence[Any]) -> None:
+        """Slurm has done that by now."""
+
+
+def ask_states() -> dict[str, str] | None:
+    """The state of each job of this user, {id: state}; None if Slurm does not answer now."""
+    command = ["squeue", "--me", "--array", "--noheader", "--states=all", "--format=%i %T"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
+        log.warning("squeue does not answer (%s); asking again", error)
+        return None
+    return dict(line.split() for line in done.stdout.splitlines())
+
+
+def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -> Any:
+    try:
+        from submitit import SlurmExecutor
+    except ImportError:
+        raise ConfigError("--launcher slurm needs submitit: pip install 'hma-jax[slurm]'") from None
+    try:
+        executor = SlurmExecutor(folder, max_num_timeout=TIMEOUTS)
+    except RuntimeError:
+        raise ConfigError("no Slurm here: srun is not on the PATH; start this where jobs are submitted") from None
+    asked = {
+        "partition": settings.partition,
+        "account": settings.account,
+        "qos": settings.qos,
+        "constraint": settings.constraint,
+        "gpus_per_node": settings.gpus,
+        "cpus_per_task": settings.cpus,
+        "mem": None if settings.memory_gb is None else f"{round(settings.memory_gb * 1024)}M",
+    }
+    further = {name: value if equals else True for name, equals, value in (o.partition("=") for o in settings.sbatch)}
+    executor.update_parameters(
+        job_name="hma",
+        time=settings.minutes,
+        signal_delay_s=settings.grace,
+        array_parallelism=workers or LARGEST_ARRAY,
+        stderr_to_stdout=True,
+        additional_parameters={"requeue": True, **further},
+        **{name: value for name, value in asked.items() if value is not None},
+    )
+    return executor

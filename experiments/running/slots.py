@@ -1,0 +1,128 @@
+"""This machine cut into slots, one for each trial that runs at a time: its cores and its accelerators.
+
+Accelerators are found without JAX, which would take them for the process that asks. A slot owns its
+accelerators; where there are more slots than GPUs, several share one, each with its part of the memory. TPU chips
+belong to one process each.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+from hma_jax.config import require
+
+MEMORY = 0.9
+"""Of a GPU's memory, what all trials on it may take; part of it is the driver's and the libraries'."""
+
+CHIP_BOUNDS = {1: "1,1,1", 2: "1,2,1", 4: "2,2,1", 8: "2,4,1"}
+"""How so many TPU chips of one host lie, as libtpu wants it said."""
+
+
+GOOGLE, TPU_DEVICES = "0x1ae0", ("0x0027", "0x0056", "0x005e", "0x0062", "0x0063", "0x006f", "0x0076")
+"""PCI ids of TPU chips, v2 to 7x, as JAX knows them."""
+
+
+@dataclass(frozen=True)
+class Accelerators:
+    """What of the machine's accelerators this process may use, by the names that a child is told."""
+
+    kind: Literal["gpu", "tpu"]
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Slot:
+    """A share of the machine. No accelerators: JAX takes those it finds."""
+
+    cores: tuple[int, ...] = ()  # (): all
+    accelerators: Accelerators | None = None
+    sharers: int = 1  # slots on the same accelerators, this one too
+
+    def environment(self) -> dict[str, str]:
+        """What a child is told of its accelerators."""
+        told: dict[str, str] = {}
+        if self.sharers > 1:
+            told["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{MEMORY / self.sharers:.3f}"
+        if self.accelerators is None:
+            return told
+        names = ",".join(self.accelerators.names)
+        if self.accelerators.kind == "gpu":
+            return told | {"CUDA_VISIBLE_DEVICES": names}
+        return told | {
+            "TPU_VISIBLE_CHIPS": names,
+            "TPU_CHIPS_PER_PROCESS_BOUNDS": CHIP_BOUNDS[len(self.accelerators.names)],
+            "TPU_PROCESS_BOUNDS": "1,1,1",
+        }
+
+
+def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerators | None:
+    """GPUs or TPU chips that `environment` lets this process use; None without any, or if JAX is told to use none."""
+    platforms = environment.get("JAX_PLATFORMS", "")
+    if platforms and not set(platforms.split(",")) & {"cuda", "gpu", "tpu"}:
+        return None
+    for kind, variable, find in (("gpu", "CUDA_VISIBLE_DEVICES", _gpus), ("tpu", "TPU_VISIBLE_CHIPS", _tpu_chips)):
+        told = environment.get(variable)
+        names = find() if told is None else tuple(name.strip() for name in told.split(",") if name.strip())
+        if names:
+            return Accelerators(kind, names)
+    return None
+
+
+@cache
+def _gpus() -> tuple[str, ...]:
+    if shutil.which("nvidia-smi") is None:
+        return ()
+    command = ["nvidia-smi", "--query-gpu=index", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    except (OSError, subprocess.SubprocessError):  # the program is there, the driver is not
+        return ()
+    return tuple(done.stdout.split())
+
+
+@cache
+def _tpu_chips(pci: Path = Path("/sys/bus/pci/devices")) -> tuple[str, ...]:
+    chips = [d for d in pci.glob("*") if _id(d / "vendor") == GOOGLE and _id(d / "device") in TPU_DEVICES]
+    return tuple(map(str, range(len(chips))))
+
+
+def _id(file: Path) -> str:
+    try:
+        return file.read_text().strip()
+    except OSError:
+        return ""
+
+
+def cut(slots: int, accelerators: Accelerators | None, cores: Sequence[int]) -> list[Slot]:
+    """The machine in so many `slots`. Raises ConfigError where it cannot be cut that way.
+
+    Neighbours stay together, since they are the best connected; what does not divide stays idle.
+    """
+    shares = [tuple(cores[i::slots]) or (cores[i % len(cores)],) if cores and slots > 1 else () for i in range(slots)]
+    if accelerators is None or slots == 1:
+        return [Slot(share, None, slots if accelerators is None else 1) for share in shares]
+    names, kind = accelerators.names, accelerators.kind
+    if slots > len(names):
+        require(
+            kind == "gpu",
+            f"--workers {slots}: a TPU chip belongs to one process, and there are {len(names)}; at most --workers "
+            f"{len(names)}",
+        )
+        sharers = [sum(j % len(names) == i for j in range(slots)) for i in range(len(names))]
+        return [
+            Slot(share, Accelerators(kind, (names[i % len(names)],)), sharers[i % len(names)])
+            for i, share in enumerate(shares)
+        ]
+    each = len(names) // slots
+    if kind == "tpu":
+        each = max(n for n in CHIP_BOUNDS if n <= each)
+    return [
+        Slot(share, Accelerators(kind, names[i * each : (i + 1) * each])) for i, share in enumerate(shares)
+    ]

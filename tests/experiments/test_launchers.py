@@ -1,0 +1,309 @@
+"""Every launcher brings the same trials to the same ends; what engines say of their jobs becomes the right state.
+
+The engines are fakes that run attempts in threads; `tests.stress.slurm_sweep` and `ray_sweep` use real ones.
+"""
+
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import Future
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from experiments.cli.main import main
+from experiments.running.attempts import Ended, outcome
+from experiments.running.launchers import ray, slurm
+from experiments.running.launchers.far import Attempt
+from experiments.running.launchers.ray import RayLauncher, RaySettings
+from experiments.running.launchers.registry import LAUNCHERS, Launching, launcher_class
+from experiments.running.launchers.slurm import SlurmAttempt, SlurmLauncher, SlurmSettings
+from experiments.running.ledger import Ledger
+from experiments.running.runner import run_missing
+from hma_jax.config import ConfigError
+from tests.experiments import fake_trial
+from tests.experiments.test_runner import job, starts
+
+
+class FakeSlurm:
+    """What the launcher uses of submitit, squeue and scancel."""
+
+    def __init__(self, folder: Path, monkeypatch):
+        self.folder, self.arrays, self.states, self.cancelled = folder, [], {}, []
+        folder.mkdir()
+        monkeypatch.setattr(slurm, "ask_states", lambda: dict(self.states))
+        monkeypatch.setattr(slurm.subprocess, "run", lambda words, **_: self.cancelled.append(words))
+
+    def submit_array(self, attempts):
+        self.arrays.append(len(attempts))
+        return [self.submit(attempt, f"{len(self.arrays)}_{i}") for i, attempt in enumerate(attempts)]
+
+    def submit(self, attempt, id):
+        paths = SimpleNamespace(result_pickle=self.folder / f"{id}.pkl", stdout=self.folder / f"{id}.out")
+        self.states[id] = "RUNNING"
+
+        def work():
+            result = pickle.loads(pickle.dumps(attempt))()
+            aside = paths.result_pickle.with_suffix(".tmp")
+            aside.write_bytes(pickle.dumps(("success", result)))
+            aside.rename(paths.result_pickle)
+            self.states[id] = "COMPLETED"
+
+        if isinstance(attempt, Attempt):
+            threading.Thread(target=work).start()
+        return SimpleNamespace(job_id=id, paths=paths)
+
+
+class FakeRay:
+    """What the launcher uses of Ray."""
+
+    class exceptions:
+        class RayError(Exception): ...
+
+        class TaskCancelledError(RayError): ...
+
+    def __init__(self):
+        self.options, self.left = {}, False
+
+    def remote(self, **options):
+        self.options = options
+
+        def decorate(function):
+            def start(attempt):
+                future = Future()
+                copy = pickle.loads(pickle.dumps(attempt))
+                threading.Thread(target=lambda: future.set_result(function(copy))).start()
+                return future
+
+            return SimpleNamespace(remote=start)
+
+        return decorate
+
+    def wait(self, futures, timeout):
+        return [f for f in futures if f.done()], [f for f in futures if not f.done()]
+
+    def get(self, future):
+        return future.result()
+
+    def shutdown(self):
+        self.left = True
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+
+    def make(name: str, root: Path):
+        if name == "local":
+            return fake_trial.launcher(root, 2)
+        if name == "slurm":
+            place = SlurmLauncher(root, None, command=fake_trial.command, executor=FakeSlurm(root / "slurm", monkeypatch))
+        else:
+            place = RayLauncher(root, 2, command=fake_trial.command, engine=FakeRay())
+        place.pause = 0.01
+        return place
+
+    return make
+
+
+def test_every_launcher_is_tested_here():
+    assert set(LAUNCHERS) == {"local", "slurm", "ray"}
+    for name in LAUNCHERS:
+        assert launcher_class(name).Settings
+
+
+@pytest.mark.parametrize("name", list(LAUNCHERS))
+def test_trials_come_to_the_same_ends_everywhere(name, places, tmp_path):
+    jobs = [job("good", steps=2), job("killed", "SIGKILL", steps=2), job("nan", "diverge"), job("crash", "crash")]
+    with places(name, tmp_path) as place:
+        states = run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert {id: state.event for id, state in states.items()} == {
+        "good": "finished", "killed": "finished", "nan": "diverged", "crash": "failed"
+    }  # fmt: skip
+    assert starts(tmp_path, "killed") == [0, 2] and "no such luck" in (tmp_path / "trials/crash/output.txt").read_text()
+
+
+def test_slurm_gets_one_array_of_all_trials_and_those_that_are_lost_later(places, tmp_path):
+    place = places("slurm", tmp_path)
+    jobs = [job("a"), job("b", "SIGKILL"), job("c")]
+    run_missing(jobs, tmp_path / "trials", Ledger(tmp_path / "ledger.jsonl"), place)
+    assert place._executor.arrays == [3, 1]
+
+
+@pytest.fixture
+def submitted(tmp_path, monkeypatch):
+    """A Slurm launcher, its fake, and a job that only stands in the queue."""
+    pytest.importorskip("submitit")
+    fake = FakeSlurm(tmp_path / "slurm", monkeypatch)
+    place = SlurmLauncher(tmp_path, None, executor=fake)
+    place.pause = 0.0
+    return place, fake, fake.submit(None, "7_0")
+
+
+@pytest.mark.parametrize(
+    ("said", "state"),
+    [("PENDING", None), ("RUNNING", None), ("COMPLETING", None), ("REQUEUED", None), ("NODE_FAIL", "lost"),
+     ("OUT_OF_MEMORY", "lost"), ("FAILED", "lost"), ("CANCELLED", "preempted"), ("PREEMPTED", "preempted"),
+     ("TIMEOUT", "preempted")],
+)  # fmt: skip
+def test_what_slurm_says_of_a_job_without_a_result(submitted, tmp_path, said, state):
+    place, fake, handle = submitted
+    fake.states["7_0"] = said
+    ended = place.ended(handle)
+    assert (ended and outcome(tmp_path, ended).event) == state
+    assert state is None or said in outcome(tmp_path, ended).message
+
+
+def test_a_result_that_is_late_on_the_shared_disk_is_waited_for(submitted, monkeypatch):
+    place, fake, handle = submitted
+    fake.states["7_0"] = "COMPLETED"
+    assert place.ended(handle) is None
+    handle.paths.result_pickle.write_bytes(pickle.dumps(("success", 0)))
+    assert place.ended(handle) == Ended(0)
+    handle.paths.result_pickle.unlink()
+    monkeypatch.setattr(slurm, "LINGER", 0.0)
+    assert place.ended(handle).code is None
+
+
+def test_a_job_that_stopped_is_not_brought_back_by_slurm_beside_the_next_one(submitted):
+    place, fake, handle = submitted
+    handle.paths.result_pickle.write_bytes(pickle.dumps(("success", 130)))
+    assert place.ended(handle) == Ended(130)
+    assert fake.cancelled == [["scancel", "7_0"]]
+
+
+def test_a_controller_that_does_not_answer_ends_no_trial(submitted, monkeypatch):
+    place, fake, handle = submitted
+    monkeypatch.undo()
+
+    def run(*_, **__):
+        raise subprocess.CalledProcessError(1, "squeue")
+
+    monkeypatch.setattr(slurm.subprocess, "run", run)
+    monkeypatch.setattr(slurm, "LINGER", 0.0)
+    assert slurm.ask_states() is None and place.ended(handle) is None
+    monkeypatch.setattr(slurm, "ask_states", lambda: {"6_0": "RUNNING"})
+    assert place.ended(handle).code is None  # it answers, and knows the job no more
+
+
+def start_attempt(root: Path, kind: type[Attempt] = Attempt) -> tuple[Attempt, threading.Thread, list[int]]:
+    """An attempt at a trial that takes long, once it has begun to count."""
+    directory = root / "trials/a"
+    directory.mkdir(parents=True)
+    (directory / "job.json").write_text('{"steps": 2000, "seconds": 0.02, "end": "result"}')
+    attempt, codes = kind(directory, root / "compiled", fake_trial.command), []
+    thread = threading.Thread(target=lambda: codes.append(attempt.run()))
+    thread.start()
+    deadline = time.monotonic() + 30
+    while not (directory / "run/count.txt").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    return attempt, thread, codes
+
+
+def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_path):
+    """What submitit calls on SIGUSR2, before it puts the job back into the queue."""
+    pytest.importorskip("submitit")
+    attempt, thread, codes = start_attempt(tmp_path, SlurmAttempt)
+    again = attempt.checkpoint()
+    thread.join(20)
+    assert outcome(attempt.directory, Ended(codes[0])).event == "preempted"
+    copy = pickle.loads(pickle.dumps(again.function))
+    assert (copy.directory, copy.cache) == (attempt.directory, attempt.cache)
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 130), (signal.SIGUSR2, 77)])
+def test_a_signal_to_the_engines_process_stops_its_trial_in_order(tmp_path, sent, code):
+    """SIGTERM of scancel, and SIGUSR2, on which submitit asks for a checkpoint in the signal's handler."""
+    program = (
+        "import signal, sys; from pathlib import Path\n"
+        "from experiments.running.launchers.far import Attempt; from tests.experiments import fake_trial\n"
+        "attempt = Attempt(Path(sys.argv[1]), Path('compiled'), fake_trial.command)\n"
+        "def announced(*_): attempt.end(); sys.exit(77)\n"
+        "signal.signal(signal.SIGUSR2, announced)\n"
+        "code = attempt.run()\n"
+        "sys.exit(128 - code if code < 0 else code)"
+    )
+    directory = tmp_path / "trials/a"
+    directory.mkdir(parents=True)
+    (directory / "job.json").write_text('{"steps": 2000, "seconds": 0.02, "end": "result"}')
+    engine = subprocess.Popen([sys.executable, "-c", program, str(directory)])
+    deadline = time.monotonic() + 60
+    while not (directory / "run/count.txt").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    engine.send_signal(sent)
+    assert engine.wait(50) == code
+    assert not (directory / "trial.lock").exists(), "it did not leave in order"
+
+
+def test_ray_is_asked_for_what_a_trial_takes(tmp_path):
+    engine = FakeRay()
+    settings = RaySettings(cpus=2, gpus=0.5, tpus=4, memory_gb=1.5, resources=("fast_disk=1",))
+    with RayLauncher(tmp_path, None, settings, engine=engine):
+        pass
+    assert engine.left and engine.options == {
+        "num_cpus": 2, "num_gpus": 0.5, "memory": 3 * 2**29, "max_retries": 0, "resources": {"fast_disk": 1.0, "TPU": 4}
+    }  # fmt: skip
+
+
+def test_a_ray_worker_that_dies_is_a_lost_trial(tmp_path):
+    engine = FakeRay()
+    place = RayLauncher(tmp_path, None, engine=engine)
+    died = Future()
+    died.set_exception(engine.exceptions.RayError("the node died\nmore"))
+    ended = place.ended(ray.Task(tmp_path, died))
+    assert outcome(tmp_path, ended).event == "lost" and "the node died" in ended.why
+
+
+def test_joining_a_cluster_leaves_sigterm_to_the_command(monkeypatch):
+    """Ray takes it over, and would abort the command before its trials are asked to save."""
+    before = signal.getsignal(signal.SIGTERM)
+    engine = SimpleNamespace(init=lambda **_: signal.signal(signal.SIGTERM, signal.SIG_DFL))
+    monkeypatch.setitem(sys.modules, "ray", engine)
+    try:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        assert ray._join("auto") is engine and signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (("slurm", 1, ("partition",)), "--launcher-set partition: write it as key=value"),
+        (("slurm", 1, ("part=x",)), "the slurm launcher has no such setting, but partition, account"),
+        (("slurm", 1, ("gpus=two",)), "--launcher-set gpus=two: expected a number"),
+        (("slurm", 1, ("gpus=1.5",)), "gpus: expected int, got 1.5"),
+        (("local", 1, ("gpus=1",)), "the local launcher has no such setting, but none"),
+        (("mpi", 1, ()), "--launcher mpi: choose one of local, slurm, ray"),
+    ],
+)
+def test_mistakes_in_launcher_settings_are_said_before_anything_runs(said, words):
+    with pytest.raises(ConfigError) as error:
+        Launching(*said)
+    assert words in str(error.value)
+
+
+def test_the_command_line_refuses_a_launcher_that_is_not_there(capsys):
+    assert main(["study", "--preset", "smoke", "--launcher", "pbs"]) == 2
+    assert "--launcher pbs: choose one of local, slurm, ray" in capsys.readouterr().err
+
+
+def test_settings_are_read_as_what_they_are():
+    said = ("partition=123", "gpus=2", "memory_gb=1.5", "sbatch=gres=gpu:h100:1", "sbatch=exclusive")
+    _, settings = Launching("slurm", None, said)._parsed()
+    assert settings == SlurmSettings(
+        partition="123", gpus=2, memory_gb=1.5, sbatch=("gres=gpu:h100:1", "exclusive")
+    )
+
+
+def test_without_the_engine_the_message_says_what_to_install(tmp_path, monkeypatch):
+    for name, package in (("slurm", "submitit"), ("ray", "ray")):
+        monkeypatch.setitem(sys.modules, package, None)
+        with pytest.raises(ConfigError, match=rf"pip install 'hma-jax\[{name}\]'"):
+            Launching(name).launcher(tmp_path)

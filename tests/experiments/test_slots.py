@@ -1,0 +1,87 @@
+"""Trials that run at a time on one machine divide it: no GPU or chip belongs to two unless it must."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from experiments.running import slots
+from experiments.running.children import child_environment
+from experiments.running.slots import Accelerators, Slot, cut, find_accelerators
+from hma_jax.config import ConfigError
+
+EIGHT = Accelerators("gpu", tuple("01234567"))
+
+
+def gpus(count: int, accelerators: Accelerators = EIGHT) -> list[str | None]:
+    return [slot.environment().get("CUDA_VISIBLE_DEVICES") for slot in cut(count, accelerators, range(4))]
+
+
+def test_every_slot_owns_its_gpus():
+    assert gpus(8) == list("01234567")
+    assert gpus(2) == ["0,1,2,3", "4,5,6,7"]
+    assert gpus(3) == ["0,1", "2,3", "4,5"]
+    assert gpus(1) == [None]  # a single trial has all of them, as JAX finds them
+
+
+def test_more_slots_than_gpus_share_their_memory():
+    three = cut(3, Accelerators("gpu", ("0", "1")), range(4))
+    told = [slot.environment() for slot in three]
+    assert [t["CUDA_VISIBLE_DEVICES"] for t in told] == ["0", "1", "0"]
+    assert [t.get("XLA_PYTHON_CLIENT_MEM_FRACTION") for t in told] == ["0.450", None, "0.450"]
+
+
+def test_tpu_chips_are_never_shared():
+    chips = Accelerators("tpu", ("0", "1", "2", "3"))
+    two = [slot.environment() for slot in cut(2, chips, ())]
+    assert [t["TPU_VISIBLE_CHIPS"] for t in two] == ["0,1", "2,3"]
+    assert {t["TPU_CHIPS_PER_PROCESS_BOUNDS"] for t in two} == {"1,2,1"}
+    with pytest.raises(ConfigError, match="--workers 5: a TPU chip belongs to one process"):
+        cut(5, chips, ())
+
+
+def test_slots_share_the_cores():
+    shares = [set(slot.cores) for slot in cut(2, None, range(5))]
+    assert shares[0] | shares[1] == set(range(5)) and not shares[0] & shares[1]
+    assert [slot.cores for slot in cut(3, None, (7,))] == [(7,), (7,), (7,)]
+    assert cut(1, None, range(5))[0].cores == ()
+
+
+@pytest.mark.parametrize(
+    ("environment", "found"),
+    [
+        ({"CUDA_VISIBLE_DEVICES": "2,5"}, Accelerators("gpu", ("2", "5"))),
+        ({"CUDA_VISIBLE_DEVICES": "MIG-a, MIG-b"}, Accelerators("gpu", ("MIG-a", "MIG-b"))),
+        ({"CUDA_VISIBLE_DEVICES": ""}, None),
+        ({"CUDA_VISIBLE_DEVICES": "0,1", "JAX_PLATFORMS": "cpu"}, None),
+        ({"CUDA_VISIBLE_DEVICES": "", "TPU_VISIBLE_CHIPS": "1"}, Accelerators("tpu", ("1",))),
+        ({}, Accelerators("gpu", ("0", "1"))),
+    ],
+)
+def test_what_the_user_allows_is_what_is_divided(environment, found, monkeypatch):
+    monkeypatch.setattr(slots, "_gpus", lambda: ("0", "1"))
+    monkeypatch.setattr(slots, "_tpu_chips", lambda: ())
+    assert find_accelerators(environment) == found
+
+
+def test_tpu_chips_are_counted_on_the_bus(tmp_path):
+    for number, (vendor, device) in enumerate(
+        [("0x1ae0", "0x0063"), ("0x1ae0", "0x0063"), ("0x1ae0", "0x0042"), ("0x10de", "0x0063")]  # a network card, a GPU
+    ):
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "vendor").write_text(f"{vendor}\n")
+        (tmp_path / str(number) / "device").write_text(f"{device}\n")
+    assert slots._tpu_chips(tmp_path) == ("0", "1")
+
+
+def test_a_child_is_told_its_slot_but_the_users_memory_stays(monkeypatch):
+    monkeypatch.setenv("HMA_CORES", "0")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_MEM_FRACTION", raising=False)
+    slot = Slot((1, 2), Accelerators("gpu", ("1",)), sharers=2)
+    told = child_environment(Path("compiled"), slot)
+    assert (told["HMA_CORES"], told["CUDA_VISIBLE_DEVICES"]) == ("1,2", "1")
+    assert told["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.450" and told["HMA_PARENT_PID"] == str(os.getpid())
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.2")
+    assert child_environment(Path("compiled"), slot)["XLA_PYTHON_CLIENT_MEM_FRACTION"] == "0.2"
+    assert "HMA_CORES" not in child_environment(Path("compiled"))

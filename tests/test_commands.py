@@ -1,0 +1,234 @@
+"""README.md and docs/: every command parses, those of a moment run, and every path that is mentioned exists.
+
+Commands stand in blocks marked `sh` and in backticks. One in backticks may leave out what it needs (`hma evaluate`),
+write several at once (`hma bench generate|train`) and end in `...`.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import itertools
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tyro.extras import SubcommandApp
+
+from experiments.cli import main as program
+from experiments.presets import get_preset
+from experiments.study import override
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"(?<!`)`((?:hma|make|python -m)\b[^`]*)`(?!`)")
+STARTS = ("hma", "make", "pip", "python")
+TOP = ("hma_jax/", "data_pipelines/", "experiments/", "tests/", "docs/", ".ci/")
+MENTIONED = re.compile(r"(?<!`)`([^`\s]+)`|\]\(([^)\s#]+)\)")
+
+QUICK = (
+    "hma data list open-x",
+    "hma bench report experiments/results/bench/cpu",
+    "python -m experiments.scale_width --preset cpu --dry-run",
+)
+"""Of the documented commands, those that take a moment and need no data; tests run them."""
+
+
+def blocks(page: str) -> Iterator[str]:
+    """Commands of the blocks of a page, one by one: comments, prompts and what a shell does around them left out."""
+    for language, text in BLOCK.findall(page):
+        if language not in ("", "sh"):
+            continue
+        known: dict[str, str] = {}
+        for line in text.replace("\\\n", " ").splitlines():
+            line = re.sub(r"\s#.*", "", line).strip().removeprefix("$ ")
+            for name, value in known.items():
+                line = re.sub(rf"\${name}\b", value, line)
+            if assigned := re.fullmatch(r"(\w+)=(?:'(.*)'|\"(.*)\"|(\S+))|for (\w+) in (\S+).*", line):
+                name, *values = filter(None, assigned.groups())
+                known[name] = values[0]
+                continue
+            for command in re.split(r"&&|;|\|(?!\S)", line):
+                words = re.sub(r"^(?:do\s+|[A-Z_]+=\S*\s+)+", "", command.strip())
+                if words.startswith(STARTS):
+                    yield words
+
+
+def inline(page: str) -> Iterator[str]:
+    """Commands in backticks, with alternatives written out."""
+    for found in INLINE.findall(BLOCK.sub("", page)):
+        parts = [word.split("|") for word in shlex.split(found)]
+        yield from (shlex.join(choice) for choice in itertools.product(*parts))
+
+
+def commands(kind) -> list[str]:
+    return sorted({command for page in PAGES for command in kind(page.read_text())})
+
+
+# --- What a command line says ----------------------------------------------------------------
+
+
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
+    """What the commands of `hma` were called with; none of them does anything."""
+    calls: list[dict] = []
+
+    def recorder(function):
+        @functools.wraps(function)
+        def record(**arguments):
+            calls.append(arguments)
+
+        return record
+
+    def record_all(app: SubcommandApp) -> None:
+        for spec in app._subcommands.values():
+            if isinstance(spec.target, SubcommandApp):
+                record_all(spec.target)
+            else:
+                monkeypatch.setattr(spec, "target", recorder(spec.target))
+
+    record_all(program.app)
+    return calls
+
+
+def complaint(command: str, calls: list[dict], capsys, *, whole: bool) -> str | None:
+    """What is wrong with a documented command. `whole`: it must say everything that it needs."""
+    words = shlex.split(command)
+    match words:
+        case ["hma", *arguments]:
+            return _complaint_of_hma(arguments, calls, capsys, whole)
+        case ["make", *rest]:
+            targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+            unknown = [word for word in rest if "=" not in word and word not in targets]
+            return f"the Makefile has no target {', '.join(unknown)}" if unknown else None
+        case ["pip", "install", *rest]:
+            extras = re.findall(r"\[(\w+)\]", " ".join(rest))
+            known = (ROOT / "pyproject.toml").read_text()
+            unknown = [extra for extra in extras if not re.search(rf"^{extra} = \[", known, re.MULTILINE)]
+            return f"no extra {', '.join(unknown)}" if unknown else None
+        case ["python", "-m", module, *arguments]:
+            return _complaint_of_module(module, arguments, calls, capsys)
+    return "no command that this test knows"
+
+
+def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bool) -> str | None:
+    if arguments[-1:] == ["..."]:
+        arguments = [*arguments[:-1], "x"] if arguments[-2:-1] and arguments[-2].startswith("-") else arguments[:-1]
+    arguments = [word.removesuffix("...") for word in arguments if word != "..."]
+    if not whole and not any(word.startswith("-") for word in arguments):  # it is only mentioned, perhaps with its RUN
+        words = list(itertools.takewhile(lambda word: re.fullmatch(r"[a-z][a-z-]*", word), arguments))
+        with pytest.raises(SystemExit) as end:
+            program.main([*words, "--help"])
+        capsys.readouterr()
+        return "there is no such command" if end.value.code else None
+    calls.clear()
+    try:
+        code = program.main(arguments)
+    except SystemExit as end:
+        code = end.code
+    said = " ".join(re.sub(r"[│╭╮╰╯─]", " ", capsys.readouterr().err).split())
+    if code:
+        missing = "equired" in said and "nrecognized" not in said and "invalid" not in said.lower()
+        return None if missing and not whole else said
+    where = calls[-1].get("where") if calls else None
+    if where is not None and where.set:
+        override(get_preset(where.preset or "cpu"), list(where.set))  # raises ConfigError
+    return None
+
+
+def _complaint_of_module(module: str, arguments: list[str], calls: list[dict], capsys) -> str | None:
+    if module == "pytest":
+        missing = [word for word in arguments if not word.startswith("-") and not (ROOT / word).exists()]
+        return f"no {', '.join(missing)}" if missing else None
+    found = importlib.util.find_spec(module)
+    if found is None or found.origin is None:
+        return f"no module {module}"
+    text = Path(found.origin).read_text()
+    if axis := re.search(r'run_sweep\("(\w+)"\)', text):
+        return _complaint_of_hma(["sweep", axis[1], *arguments], calls, capsys, True)
+    unknown = [word for word in arguments if word.startswith("--") and f'"{word}"' not in text]
+    return f"{module} does not take {', '.join(unknown)}" if unknown else None
+
+
+def test_every_command_in_a_block_parses(parsed, capsys):
+    found = commands(blocks)
+    assert len(found) > 20
+    wrong = {command: what for command in found if (what := complaint(command, parsed, capsys, whole=True))}
+    assert not wrong, "\n".join(f"{command}: {what}" for command, what in wrong.items())
+
+
+def test_every_command_in_backticks_parses(parsed, capsys):
+    found = commands(inline)
+    assert len(found) > 50
+    wrong = {command: what for command in found if (what := complaint(command, parsed, capsys, whole=False))}
+    assert not wrong, "\n".join(f"{command}: {what}" for command, what in wrong.items())
+
+
+@pytest.mark.parametrize(
+    ("command", "wrong"),
+    [
+        ("hma train --preset accelerator --mesh 4 2 1", None),
+        ("hma trian --preset accelerator", "trian"),
+        ("hma train --presets accelerator", "--presets"),
+        ("hma train --preset gpu", "gpu"),
+        ("hma evaluate", "equired"),
+        ("make study PRESET=smoke", None),
+        ("make stduy", "stduy"),
+        ("pip install -e '.[cuda]'", None),
+        ("pip install -e '.[cudda]'", "cudda"),
+        ("python -m tests.stress.tokenize_kills --kills 3", None),
+        ("python -m tests.stress.tokenize_kills --kill 3", "--kill"),
+        ("python -m tests.stress.nothing", "no module"),
+        ("python -m experiments.scale_width --dry-runs", "--dry-runs"),
+    ],
+)
+def test_what_is_wrong_is_found(command, wrong, parsed, capsys):
+    said = complaint(command, parsed, capsys, whole=True)
+    assert (said is None) if wrong is None else (said and wrong in said), said
+
+
+def test_blocks_are_read_as_a_shell_does():
+    page = (
+        "```sh\nW='--preset cpu'\nhma tokenize $W && hma train $W   # both\nfor m in base xl; do\n"
+        "  hma bench train --model $m \\\n    --batch 8\ndone\nJAX_PLATFORMS=cpu python -m pytest x\n```\n"
+    )
+    assert list(blocks(page)) == [
+        "hma tokenize --preset cpu", "hma train --preset cpu", "hma bench train --model base      --batch 8",
+        "python -m pytest x",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("command", QUICK)
+def test_a_documented_command_of_a_moment_runs(command, monkeypatch, capsys):
+    assert command in commands(inline), "it is documented no longer"
+    monkeypatch.chdir(ROOT)
+    words = shlex.split(command)
+    arguments = words[1:] if words[0] == "hma" else ["sweep", words[2].split("_")[-1], *words[3:]]
+    assert program.main(arguments) == 0
+    assert capsys.readouterr().out.count("\n") > 3
+
+
+# --- Paths -----------------------------------------------------------------------------------
+
+
+def paths(page: Path) -> Iterator[tuple[str, Path]]:
+    """(as it is written, what it must be) of every path of the project that a page mentions."""
+    for quoted, link in MENTIONED.findall(BLOCK.sub("", page.read_text())):
+        if link and "://" not in link:
+            yield link, page.parent / link
+        elif quoted.startswith(TOP):
+            yield quoted, ROOT / quoted.removesuffix("/").split("::")[0]
+
+
+def test_every_path_that_is_mentioned_exists():
+    wrong = [
+        f"{page.name}: {name}"
+        for page in PAGES
+        for name, place in paths(page)
+        if not place.exists() and not list(ROOT.glob(str(place.relative_to(ROOT)) if ROOT in place.parents else "-"))
+    ]
+    assert not wrong, "\n".join(wrong)
+    assert sum(len(list(paths(page))) for page in PAGES) > 30
