@@ -19,6 +19,7 @@ from experiments.program import PROGRAM
 from experiments.study import Study, on_tokenizer, on_user_data, override
 from experiments.workspace import Workspace
 from hma_jax.config import ConfigError
+from hma_jax.training.claim import is_address
 
 Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous"]
 
@@ -49,6 +50,10 @@ class Where:
     mesh: Annotated[tuple[int, int, int] | None, arg(metavar="DATA FSDP TENSOR"), UNSET] = None
     """Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
     Short for --set execution.mesh.data=... and so on. No result depends on it."""
+
+    def __post_init__(self):
+        require_local("--out", self.out)
+        require_local("--tokenizer", self.tokenizer)
 
     def anywhere(self) -> Where:
         """The same, meant in the same way from any working directory."""
@@ -97,6 +102,15 @@ class Setting:
     def command(self, name: str, *arguments: str | Path) -> str:
         """The command line `hma NAME ARGUMENTS` for the same study, data, directory and devices."""
         return command(name, *arguments, *self.asked.words())
+
+
+def require_local(flag: str, path: Path | None) -> None:
+    """Raises ConfigError for what was meant as an address: datasets are read there, but nothing is written."""
+    if path is not None and is_address(path):
+        raise ConfigError(
+            f"{flag} {path}: only a directory of a file system can be written to, not a bucket; mount the bucket, or "
+            "choose a disk that all hosts share and copy to the bucket what is finished"
+        )
 
 
 def command(name: str, *arguments: str | Path) -> str:

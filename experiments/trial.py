@@ -127,11 +127,10 @@ def train_trial(
     A model that is not new has a `table` of its own (of which the trial's datasets are part), its
     `initial` parameters and an `origin`, which its checkpoints remember.
     """
-    import jax
-
     from data_pipelines.loading.loader import describe_batch, make_loader
     from data_pipelines.loading.selection import LoaderConfig, training_table
     from hma_jax.config.json import from_dict
+    from hma_jax.runtime.rows import own_rows
     from hma_jax.training.loop import LoopOptions
     from hma_jax.training.train import train_model
     from hma_jax.training.validation import Validation
@@ -154,8 +153,7 @@ def train_trial(
         table,
         trial.train,
         lambda start: make_loader(
-            store, table, loader, start_step=start,
-            process_index=jax.process_index(), process_count=jax.process_count(),
+            store, table, loader, start_step=start, rows=own_rows(execution.mesh, trial.train.batch)
         ),
         execution=execution,
         run_dir=run_dir,
@@ -175,21 +173,21 @@ def train_trial(
             keep_checkpoints=options.keep_checkpoints,
             skip_damaged=options.skip_damaged,
         ),
-        validation=Validation(validate_every, lambda: validation_batches(trial, materials, table))
+        validation=Validation(validate_every, lambda: validation_batches(trial, materials, table, execution))
         if validate_every
         else None,
         progress=report,
     )
 
 
-def validation_batches(trial: Trial, materials: Materials, table: EmbodimentTable) -> Iterator[dict[str, Any]]:
+def validation_batches(
+    trial: Trial, materials: Materials, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+) -> Iterator[dict[str, Any]]:
     """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
-    import jax
-
     from data_pipelines.windows.evalset import eval_batches
+    from hma_jax.runtime.rows import own_rows
 
-    rows = trial.train.batch // jax.process_count()
-    own = slice(jax.process_index() * rows, (jax.process_index() + 1) * rows)
+    own = own_rows(execution.mesh, trial.train.batch)
     for name in trial.evaluated:
         for whole in eval_batches(materials.store, table, materials.manifest, trial.train.batch, (name,)):
             yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
@@ -249,6 +247,7 @@ def run_trial(
     from experiments.running.sealed import write_result
     from hma_jax.model.flops import train_flops_per_window
     from hma_jax.model.hma import declare_model
+    from hma_jax.runtime.processes import is_writer
 
     started = time.perf_counter()
     materials = open_materials(workspace)
@@ -265,7 +264,6 @@ def run_trial(
             trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
         ).summary.to_dict()
 
-    write_evaluation(directory, evaluation)
     result = {
         "evaluation": evaluation.summary.to_dict(),
         "untrained": untrained,
@@ -280,8 +278,10 @@ def run_trial(
             "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
         },
     }
-    record_end(directory)
-    write_result(directory, result)
+    if is_writer():
+        write_evaluation(directory, evaluation)
+        record_end(directory)
+        write_result(directory, result)
     return result
 
 

@@ -7,7 +7,7 @@ resumes from its step alone, without iterator state.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import grain
 import numpy as np
@@ -28,8 +28,7 @@ def make_loader(
     config: LoaderConfig,
     *,
     start_step: int = 0,
-    process_index: int = 0,
-    process_count: int = 1,
+    rows: Sequence[int] | None = None,
     prefetch: int = 2,
     threads: int = 2,
 ) -> Iterator[dict[str, np.ndarray]]:
@@ -37,25 +36,23 @@ def make_loader(
 
     A batch: `tokens` int32 [B, T, S] or, latents, float32 [B, T, S, C]; `actions` float32
     [B, T, U] in raw units, zero-padded; `embodiment` int32 [B], index into `table`; `real` bool [B, T],
-    False for frames that only fill up a window of a short episode. Process p of
-    n yields rows [p B/n, (p+1) B/n) of the global batch. `threads` read ahead by `prefetch`
-    batches each.
+    False for frames that only fill up a window of a short episode. `rows` are those of the
+    global batch that are wanted, in their order: one of several processes takes its own
+    (`hma_jax.runtime.rows`). `threads` read ahead by `prefetch` batches each.
 
-    Raises ConfigError for unknown datasets or a batch that does not split, DataError if no
-    episode is long enough for one window.
+    Raises ConfigError for unknown datasets or rows, DataError if no episode is long enough for one window.
     """
+    wanted = np.arange(config.batch) if rows is None else np.asarray(rows, np.int64)
     require(
-        process_count >= 1 and config.batch % process_count == 0,
-        f"loader.batch {config.batch} does not split over {process_count} processes",
+        len(wanted) > 0 and 0 <= wanted.min() and wanted.max() < config.batch,
+        f"a batch of {config.batch} rows has none of {wanted.tolist()}",
     )
-    require(0 <= process_index < process_count, f"process {process_index} of {process_count}")
     selected = select_windows(store, config)
     names = selected.mixture.names
     grids = {store.manifest(name).tokenizer for name in names}
     require(len(grids) == 1, f"the datasets were tokenised differently: {sorted(map(str, grids))}")
     store.check_table(table, names, config.rate)
-    rows = config.batch // process_count
-    batches = _Batches(store, table, selected, config, rows, process_index * rows)
+    batches = _Batches(store, table, selected, config, wanted)
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(threads * prefetch, 1))
     iterator = iter(grain.MapDataset.source(batches).to_iter_dataset(options))
     iterator.set_state({"next_index": start_step})
@@ -67,11 +64,11 @@ def describe_batch(store: TokenStore, table: EmbodimentTable, config: LoaderConf
 
     Raises what `make_loader` raises.
     """
-    return _Batches(store, table, select_windows(store, config), config, config.batch, 0).describe(step)
+    return _Batches(store, table, select_windows(store, config), config, np.arange(config.batch)).describe(step)
 
 
 class _Batches:
-    """Element s: `rows` rows of the global batch of step s, from row `first` on."""
+    """Element s: `rows` of the global batch of step s."""
 
     def __init__(
         self,
@@ -79,15 +76,14 @@ class _Batches:
         table: EmbodimentTable,
         selected: TrainingWindows,
         config: LoaderConfig,
-        rows: int,
-        first: int,
+        rows: np.ndarray,
     ):
         sets = [selected.sets[name] for name in selected.mixture.names]
         self._streams = [_Stream(store, table, windows, config) for windows in sets]
         self._draws = Draws(selected.mixture.weights, config.seed)
         self._lengths = np.asarray([len(windows) for windows in sets])
         self._seeds = np.asarray([stream_seed(config.seed, "order", windows.name) for windows in sets])
-        self._batch, self._rows, self._first = config.batch, rows, first
+        self._batch, self._rows = config.batch, rows
 
     def __len__(self) -> int:
         return ENDLESS // self._batch
@@ -101,7 +97,7 @@ class _Batches:
 
     def _chosen(self, step: int) -> Iterator[tuple[int, int, int]]:
         """(dataset, how many were drawn of it before, window) of every row."""
-        dataset, draw = self._draws.at(step * self._batch + self._first + np.arange(self._rows))
+        dataset, draw = self._draws.at(step * self._batch + self._rows)
         window = endless_shuffle(draw, self._lengths[dataset], self._seeds[dataset])
         return zip(dataset.tolist(), draw.tolist(), window.tolist(), strict=True)
 

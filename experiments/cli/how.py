@@ -10,7 +10,7 @@ from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
 
 from experiments.preparing.made_from import Step
 from experiments.running.launchers.registry import LAUNCHERS
-from experiments.setting import UNSET
+from experiments.setting import UNSET, require_local
 
 
 @dataclass(frozen=True)
@@ -56,3 +56,6 @@ class OneModel:
     """Directory of the training run. Resumed if it exists."""
     trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Trajectories of each robot, chosen by hash: the same as in a sweep over trajectories."""
+
+    def __post_init__(self):
+        require_local("--run", self.run)

@@ -56,17 +56,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 description="HMA-JAX: scaling studies of an action-conditioned video model over many robots.",
                 args=arguments or ["--help"],
             )
+            _end_together()
         return Exit.DONE
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
         _say(f"{'stopped by SIGTERM' if code == Exit.STOPPED else 'interrupted'}; the same command goes on from here")
+        _end_together(request, code)
         return code
     except Exception as error:  # the boundary of the program
         code = _exit_code(error)
         if debug or code is None:
+            _end_together(error, code or Exit.FAILED, show=True)
             raise
         _say(f"error: {_words(error)}")
+        _end_together(error, code)
         return code
+
+
+def _end_together(error: BaseException | None = None, code: int = Exit.DONE, show: bool = False) -> None:
+    """With other processes, where there are any: none is left waiting for one that ends."""
+    if "hma_jax.runtime.processes" in sys.modules:  # otherwise none was started
+        from experiments.cli.hosts import end_together
+
+        end_together(error, code, show)
 
 
 def _silence_background() -> None:

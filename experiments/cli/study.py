@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
+from experiments.cli.hosts import Hosts
 from experiments.cli.how import How, OneModel, Remake
 from experiments.commands import model as model_commands
 from experiments.commands import study as commands
@@ -94,6 +95,7 @@ def train(
     one: OmitArgPrefixes[OneModel],
     options: OmitArgPrefixes[RunOptions],
     remake: OmitArgPrefixes[Remake],
+    hosts: OmitArgPrefixes[Hosts],
 ) -> None:
     """Train one model: the study's reference trial, on all trajectories unless told otherwise.
 
@@ -104,7 +106,9 @@ def train(
         one: How this model is trained; no sweep reads it.
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
+        hosts: Several processes that train together, on one host or on many.
     """
+    hosts.join()
     model_commands.train(make_setting(where), one.run, options, trajectories=one.trajectories, replace=remake.replace)
 
 
@@ -114,6 +118,7 @@ def adapt(
     one: OmitArgPrefixes[OneModel],
     options: OmitArgPrefixes[RunOptions],
     remake: OmitArgPrefixes[Remake],
+    hosts: OmitArgPrefixes[Hosts],
     everything: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
     """Add new robots to a trained model and train them on the study's datasets.
@@ -127,8 +132,10 @@ def adapt(
         one: How the new robots are trained.
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
+        hosts: Several processes that train together, on one host or on many.
         everything: Train the whole model, not the new robots' own parameters alone.
     """
+    hosts.join()
     model_commands.adapt(
         make_setting(where),
         source,
@@ -141,15 +148,20 @@ def adapt(
 
 
 def evaluate(
-    run: Annotated[Positional[Path], arg(metavar="RUN")], where: OmitArgPrefixes[Where], weights: Weights = "auto"
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    where: OmitArgPrefixes[Where],
+    hosts: OmitArgPrefixes[Hosts],
+    weights: Weights = "auto",
 ) -> None:
     """Evaluate a trained model on the frozen windows of a study.
 
     Args:
         run: Directory of the training run.
         where: The study whose windows, tokenizer and protocol are used.
+        hosts: Several processes that evaluate together, on one host or on many.
         weights: The last weights, their moving average (train.ema_decay), or the average where there is one.
     """
+    hosts.join()
     model_commands.evaluate(make_setting(where), run, weights)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,9 +93,12 @@ def _check(trajectories: int | None, options: RunOptions) -> None:
 
 def _prepare(setting: Setting, replace: Step | None) -> None:
     from experiments.pipeline import prepare
+    from hma_jax.runtime.processes import is_writer, writer_first
 
-    with setting.workspace.claimed():
-        prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
+    with writer_first("data"):
+        if is_writer():
+            with setting.workspace.claimed():
+                prepare(setting.study, setting.workspace, setting.data, setting.tokenizer, replace=replace)
 
 
 def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
@@ -105,6 +109,7 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
     from experiments.trial import open_materials, train_trial
+    from hma_jax.runtime.processes import is_writer
 
     materials, steps = open_materials(setting.workspace), trial.train.steps
     say_data(trial, materials)
@@ -118,6 +123,8 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
             progress=lambda phase, done, total: update(done, total, phase),
             **start,
         )
+    if not is_writer():
+        return
     console.print(f"loss {result.losses[-1]:.4f} after {len(result.losses):,} steps")
     wrote(run, then=setting.command("evaluate", run.absolute()))
 
@@ -141,17 +148,20 @@ def say_data(trial: Trial, materials: Materials) -> None:
 
 
 def evaluate(setting: Setting, run: Path, weights: Weights) -> None:
+    from hma_jax.runtime.processes import is_writer
     from hma_jax.training.claim import EVALUATION, claimed
     from hma_jax.training.runs import load_model
 
     trained = load_model(run, setting.study.execution, weights).run
-    with claimed(run, EVALUATION):  # before the work: that its results can be written, and by nobody else
+    # Before the work: that its results can be written, and by nobody else.
+    with claimed(run, EVALUATION) if is_writer() else nullcontext():
         _evaluate(setting, run, trained)
 
 
 def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
     from experiments.trial import evaluate_on, open_materials, write_evaluation
     from hma_jax.evaluation.windows import FILE
+    from hma_jax.runtime.processes import is_writer
 
     require_prepared(setting)
     materials = open_materials(setting.workspace)
@@ -174,6 +184,8 @@ def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
             execution=setting.study.execution,
             progress=lambda phase, done, total: update(done, total, phase),
         )
+    if not is_writer():
+        return
     summary = evaluation.summary
     metrics = [m for m in SHOWN if m in summary.overall]
     which = ", averaged weights" if trained.weights == "ema" else ""

@@ -27,6 +27,7 @@ from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.runtime.audit import param_shardings
 from hma_jax.runtime.mesh import make_mesh
+from hma_jax.runtime.rows import lay_out
 from hma_jax.runtime.sharding import BATCH, batch_sharding, constrain
 
 T = TypeVar("T")
@@ -63,14 +64,15 @@ def evaluate(
 
     A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
     and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the model was trained for.
-    `progress` is told the windows done so far. Raises ConfigError if there is no window, or for a
+    `progress` is told the windows done so far. With several processes (`runtime.processes`) all call this with the
+    same batches, and each gets the whole result. Raises ConfigError if there is no window, or for a
     model whose predictions are not finite.
     """
     mesh = make_mesh(execution.mesh)
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     declared = declare_model(model, table, execution)
-    weights = jax.device_put(params, param_shardings(declared, mesh, execution.mesh))
-    decoder_weights = jax.device_put(tokenizer.params, NamedSharding(mesh, PartitionSpec()))
+    weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
+    decoder_weights = lay_out(tokenizer.params, NamedSharding(mesh, PartitionSpec()))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted]]]:
         for batch in batches:

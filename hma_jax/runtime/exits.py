@@ -16,6 +16,7 @@ class Exit(IntEnum):
     FAILED = 1  # the work could not be done: data, disk, a trial
     REFUSED = 2  # wrong arguments or configuration, or a directory that another process holds
     DIVERGED = 3  # a number was not finite: the same command would end so again
+    LOST = 75  # another process of the same program is lost or failed (EX_TEMPFAIL): start all of them again
     INTERRUPTED = 128 + signal.SIGINT  # Ctrl-C; what could be saved is, and the same command goes on
     STOPPED = 128 + signal.SIGTERM  # the same, asked for by SIGTERM
 

@@ -24,6 +24,7 @@ import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config.json import diff
+from hma_jax.runtime.processes import from_writer, is_writer, writer_first
 from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
     CheckpointError,
@@ -88,6 +89,11 @@ class Checkpoints:
     def latest_step(self) -> int | None:
         return max(list_steps(self.directory), default=None)
 
+    def agree_on_latest(self) -> int | None:
+        """The latest step as process 0 sees it: a shared disk may show the others an older state of the directory."""
+        latest = from_writer("latest checkpoint", "" if self.latest_step is None else str(self.latest_step))
+        return int(latest) if latest else None
+
     # --- Saving ------------------------------------------------------------------------------
 
     def save(self, step: int, state: Any) -> None:
@@ -139,7 +145,7 @@ class Checkpoints:
     def _finish(self, step: int, response: Any) -> None:
         """In the background: waits for Orbax, then lists what it wrote."""
         response.result()
-        if jax.process_index() == 0:
+        if is_writer():
             write_list(self.directory / str(step))
 
     def _failed(self, step: int, error: Exception) -> SaveError:
@@ -181,8 +187,10 @@ class Checkpoints:
         CheckpointError naming every other difference, or the file that is damaged.
         """
         if skip_damaged:
-            self._set_damaged_aside()
-        step = self.latest_step
+            with writer_first("damaged checkpoints"):
+                if is_writer():
+                    self._set_damaged_aside()
+        step = self.agree_on_latest()
         if step is None:
             raise CheckpointError(f"no checkpoint under {self.directory}")
         checkpoint = self.directory / str(step)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 from hma_jax.runtime.locks import Held, Lock, exclusive
 
 NAME, EVALUATION = ".lock", ".evaluation.lock"
@@ -16,10 +17,20 @@ class RunBusy(Held):
     """Another process works in the directory."""
 
 
+def is_address(path: Path) -> bool:
+    """Whether a path was made of an address such as gs://bucket/run, of which `Path` keeps one slash."""
+    return re.match(r"[a-z][a-z0-9+.-]+:/", str(path)) is not None
+
+
 @contextmanager
 def claimed(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
     """Makes `run_dir` and holds it: to train in it or, with EVALUATION, to write the evaluation of its model.
     Raises RunBusy naming the process that holds it already, and ConfigError if it cannot be written."""
+    require(
+        not is_address(run_dir),
+        f"a run directory must be one of a file system, got the address {run_dir}; mount the bucket, or choose a disk "
+        "that all hosts share",
+    )
     with ExitStack() as stack:
         try:
             run_dir.mkdir(parents=True, exist_ok=True)

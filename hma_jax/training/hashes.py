@@ -37,9 +37,10 @@ def write_list(checkpoint: Path) -> None:
     os.replace(aside, checkpoint / NAME)
 
 
-def verify(checkpoint: Path, chosen: Chosen = lambda name: True) -> bool:
+def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:
     """Compares the `chosen` files with the list. False if there is no list.
 
+    With `share` (i, n) the i-th of n processes compares every n-th file, so that each is read by one of them.
     Raises Damaged for the first file that is missing or differs, the list itself included.
     """
     path = checkpoint / NAME
@@ -49,9 +50,9 @@ def verify(checkpoint: Path, chosen: Chosen = lambda name: True) -> bool:
         return False
     except (OSError, ValueError) as error:
         raise Damaged(path, f"cannot be read ({error})") from error
-    for name, size, digest in _rows(path, text):
-        if chosen(name):
-            _compare(checkpoint / name, size, digest)
+    rows = [row for row in _rows(path, text) if chosen(row[0])]
+    for name, size, digest in rows[share[0] :: share[1]]:
+        _compare(checkpoint / name, size, digest)
     return True
 
 

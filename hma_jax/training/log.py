@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from hma_jax.config import ConfigError
+from hma_jax.runtime.processes import is_writer
 from hma_jax.training.board import Board
 from hma_jax.training.checkpoints import SaveError
 
@@ -23,6 +24,31 @@ of its numbers as 'validation/loss' and so on."""
 
 FLUSH_SECONDS = 30.0
 """After so long at most, files show what was written."""
+
+
+def open_log(run_dir: Path, start: int, steps: int, **how: Any) -> RunLog | Listener:
+    """The log of this process: only one of a program writes. Raises as `RunLog`."""
+    return RunLog(run_dir, start, steps, **how) if is_writer() else Listener(steps, how["progress"])
+
+
+class Listener:
+    """A log that writes nothing, of a process that is not the writer."""
+
+    run_dir = None
+
+    def __init__(self, steps: int, progress: Progress | None):
+        self.steps, self.progress = steps, progress
+        self.losses: list[float] = []
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        self.losses.append(values["loss"])
+        if self.progress is not None:
+            self.progress(step, self.steps, dict(values))
+
+    def nothing(self, *_: Any) -> None:
+        """In place of what only the writer does."""
+
+    start_clock = discount = write_start = write_validation = flush = close = nothing
 
 
 class RunLog:

@@ -30,10 +30,11 @@ import jax
 
 from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.locks import Lock
+from hma_jax.runtime.processes import Agreement, is_writer, meet
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
 from hma_jax.training.claim import claimed
 from hma_jax.training.divergence import Records, require_finite
-from hma_jax.training.log import Progress, RunLog
+from hma_jax.training.log import Listener, Progress, RunLog, open_log
 from hma_jax.training.state import FINITE
 
 
@@ -86,7 +87,7 @@ class Start:
 @dataclass(frozen=True)
 class FitResult:
     state: Any
-    losses: list[float]  # one per step, from the first step of the run
+    losses: list[float]  # one per step, from the first step of the run (processes but 0: of this start)
     seconds: float  # spent in steps by this process, without compiling and validating
     compile_seconds: float
     resumed_from: int
@@ -112,22 +113,24 @@ def fit(
     state, a named tuple; `metrics` holds scalars, one of them 'loss', and checks (`state.FINITE`).
     `shapes` are the state's, with shardings; `make_state()` is called only when nothing is restored,
     so that there never are two. `make_batches(start)` yields host batches from step `start` on.
+    With several processes (`runtime.processes`) all call this; process 0 writes, and `losses` of the others begin
+    with this start. A stop that any of them was asked for, and saves by the minute, come after the same step for all.
     Raises DivergedError, Interrupted, CheckpointError, SaveError, RunBusy.
     """
     run_dir, clock = Path(run_dir), options.clock
-    # One writer per run: the others of a program with several processes leave the lock alone.
+    # One writer per run: the others of a program with several processes leave lock and log alone.
     with (
-        claimed(run_dir) if jax.process_index() == 0 else nullcontext() as lock,
+        claimed(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
             run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise
         ) as checkpoints,
         _stop_requests() as stop,
     ):
-        if checkpoints.latest_step is None:
+        if checkpoints.agree_on_latest() is None:
             start, state = 0, make_state()
         else:
             start, state = checkpoints.restore(shapes, options.may_change, options.skip_damaged)
-        log = RunLog(
+        log = open_log(
             run_dir,
             start,
             steps,
@@ -146,11 +149,17 @@ def fit(
             began = clock()
             compiled = step_fn.lower(state, batch).compile()
             compile_seconds = clock() - began
+            agreement = Agreement()
+            meet("compiled")
 
             began = saved = clock()
             watching = 0.0  # seconds
             log.start_clock(start)
             pending: tuple[int, dict[str, jax.Array]] | None = None
+
+            def wish() -> int:
+                return STOP if stop.is_set() else SAVE if _is_late(clock() - saved, options) else 0
+
             for step in range(start + 1, steps + 1):
                 state, metrics = compiled(state, batch)
                 if step < steps:
@@ -159,9 +168,10 @@ def fit(
                     _report(log, *pending, about.records)
                 pending = (step, metrics)
                 checkpoints.raise_failure()
-                last, stopping = step == steps, stop.is_set()
+                wanted = agreement.outcome(wish)
+                last, stopping = step == steps, wanted == STOP
                 to_watch = watch is not None and (last or step % watch.every == 0)
-                to_save = last or stopping or _is_due(step, clock() - saved, options)
+                to_save = last or wanted or _is_due(step, options)
                 if to_watch or to_save:
                     _report(log, *pending, about.records)  # a diverged step is neither watched nor saved
                     pending = None
@@ -175,6 +185,7 @@ def fit(
                     _require_held(lock, run_dir, step)
                     checkpoints.save(step, state)
                     saved = clock()
+                agreement.cast(wish)
                 if stopping and not last:
                     checkpoints.wait()
                     raise Interrupted(
@@ -186,7 +197,7 @@ def fit(
     return FitResult(state, log.losses, seconds, compile_seconds, start)
 
 
-def _report(log: RunLog, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
+def _report(log: RunLog | Listener, step: int, metrics: dict[str, jax.Array], records: Records) -> None:
     """Writes a step's metrics. Raises DivergedError, and writes none of them, if it was not finite."""
     values = {name: float(value) for name, value in jax.device_get(metrics).items()}
     require_finite(step, values, log.run_dir, records)
@@ -202,11 +213,18 @@ def _require_held(lock: Lock | None, run_dir: Path, step: int) -> None:
         )
 
 
-def _is_due(step: int, seconds: float, options: LoopOptions) -> bool:
-    """Whether to save after `step`, `seconds` after the last save."""
-    by_steps = options.checkpoint_every > 0 and step % options.checkpoint_every == 0
-    by_time = options.checkpoint_minutes > 0 and seconds >= 60 * options.checkpoint_minutes
-    return by_steps or by_time
+STOP, SAVE = 2, 1
+"""What a process may wish for between two steps; the larger one counts."""
+
+
+def _is_due(step: int, options: LoopOptions) -> bool:
+    """Whether `step` is one to save after."""
+    return options.checkpoint_every > 0 and step % options.checkpoint_every == 0
+
+
+def _is_late(seconds: float, options: LoopOptions) -> bool:
+    """Whether to save `seconds` after the last time."""
+    return options.checkpoint_minutes > 0 and seconds >= 60 * options.checkpoint_minutes
 
 
 def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:

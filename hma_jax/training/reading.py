@@ -7,16 +7,19 @@ items that are asked for are read and checked.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import jax
 from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
-from hma_jax.training.hashes import Damaged, verify
+from hma_jax.runtime.processes import tell
+from hma_jax.training.hashes import Chosen, Damaged, verify
 
 WHOLE_STATE = "state"
 """The one item of checkpoints that were written before there were several."""
@@ -60,18 +63,31 @@ def read_description(checkpoint: Path) -> dict[str, Any]:
 def load_items(checkpoint: Path, shapes: Mapping[str, Any]) -> dict[str, Any]:
     """The items that `shapes` names, each laid out as its tree of jax.ShapeDtypeStruct says.
 
-    Raises CheckpointError if a file of theirs is damaged or missing.
+    With several processes all call this. Raises CheckpointError if a file of theirs is damaged or missing.
     """
     old = (checkpoint / WHOLE_STATE).is_dir()
     folders = {WHOLE_STATE} if old else set(shapes)
     with _reading(checkpoint):
-        verify(checkpoint, lambda name: name.split("/")[0] in folders)
+        _verify_together(checkpoint, lambda name: name.split("/")[0] in folders)
         if not old:
             return ocp.load_checkpointables(checkpoint, dict(shapes))
         context = ocp.Context()
         context.pytree.loading.partial_load = True
         with context:
             return ocp.load(checkpoint, dict(shapes))
+
+
+def _verify_together(checkpoint: Path, chosen: Chosen) -> None:
+    """Each of several processes reads its share of the files; what one finds damaged, all refuse."""
+    mine: Damaged | None = None
+    try:
+        verify(checkpoint, chosen, (jax.process_index(), jax.process_count()))
+    except Damaged as damage:
+        mine = damage
+    found = tell("damage", json.dumps(mine and [str(mine.path), mine.reason]))
+    for damage in map(json.loads, found):
+        if damage:
+            raise mine or Damaged(Path(damage[0]), damage[1])
 
 
 def has_item(checkpoint: Path, name: str) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig
 from hma_jax.config.json import to_dict
@@ -46,8 +47,8 @@ def train_model(
 ) -> FitResult:
     """Trains to `config.steps`, resuming what is in `run_dir`.
 
-    `make_batches(start)` yields this process's rows of the global batches from step `start`
-    on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what
+    `make_batches(start)` yields this process's rows (`runtime.rows.own_rows`) of the global batches from step
+    `start` on. A new run starts from a copy of the `initial` parameters, or from a draw. `provenance` says what
     data the batches come from; resuming on other data is refused, and `modernise_provenance` brings what
     an earlier version said to today's form before they are compared. `execution` says how it is computed,
     `validation` on what it is watched: both may be others each time. `records` names what a batch is made of,
@@ -71,7 +72,8 @@ def train_model(
         step = jax.jit(
             make_train_step(declared, table, model, config, execution.accumulate),
             donate_argnums=0,
-            out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), None),
+            # Numbers lie everywhere, so that every process can read them.
+            out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), NamedSharding(device_mesh, PartitionSpec())),
         )
         # A constant rate does not depend on the number of steps: such a run may go on.
         extendable = ("train.steps",) if config.optimizer.schedule == "constant" else ()

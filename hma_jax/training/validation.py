@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MaskingConfig, ModelConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
@@ -46,7 +47,9 @@ def make_watch(
     put_batch: Callable[[Any], Any],
 ) -> Watch:
     """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one."""
-    compute = jax.jit(make_sums(declared, table, model, masking))
+    mesh = jax.sharding.get_mesh()
+    everywhere = None if mesh.empty else NamedSharding(mesh, PartitionSpec())
+    compute = jax.jit(make_sums(declared, table, model, masking), out_shardings=everywhere)
     held: list[dict[str, np.ndarray]] = []
 
     def mean(params: Params) -> dict[str, float]:

@@ -276,6 +276,20 @@ def test_run_directory_that_cannot_be_made(study, tmp_path, refused):
     assert str(tmp_path / "file" / "run") in message and "choose another output directory" in message
 
 
+@pytest.mark.parametrize(
+    "arguments", [["tokenize", "--out", "gs://bucket/out"], ["train", "--run", "s3://bucket/run"]], ids=["out", "run"]
+)
+def test_what_would_be_written_to_a_bucket_is_refused(arguments, refused, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = refused(2, *arguments, *SMOKE)
+    assert "only a directory of a file system can be written to" in message and not list(tmp_path.iterdir())
+
+
+def test_processes_that_do_not_know_each_other_are_refused(refused):
+    message = refused(2, "train", *SMOKE, "--processes", "2")
+    assert "--coordinator HOST:PORT, --processes N and --process I" in message
+
+
 def test_disk_that_fills_up_later(study, tmp_path, refused, monkeypatch):
     def full(path, text):
         raise OSError(28, "No space left on device", str(path))

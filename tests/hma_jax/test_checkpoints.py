@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+from hma_jax.training import hashes
 from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
 from hma_jax.training.hashes import NAME, Damaged, verify, write_list
 from hma_jax.training.loop import LoopOptions
@@ -45,6 +46,16 @@ def files_of(checkpoint: Path) -> list[str]:
 
 
 # --- Damage ----------------------------------------------------------------------------------
+
+
+def test_several_processes_read_every_file_once(run_dir: Path, monkeypatch):
+    checkpoint, read = run_dir / "checkpoints" / "6", []
+    monkeypatch.setattr(hashes, "_compare", lambda path, *_: read.append(path))
+    for share in range(3):
+        before = len(read)
+        assert verify(checkpoint, share=(share, 3))
+        assert len(read) > before
+    assert sorted(p.relative_to(checkpoint).as_posix() for p in read) == [n for n in files_of(checkpoint) if n != NAME]
 
 
 def test_one_flipped_bit_in_any_file_is_refused_by_its_name(run_dir: Path):

@@ -107,20 +107,21 @@ def test_an_epoch_visits_every_window_once(store):
 @pytest.mark.parametrize("processes", [2, 4, 16])
 def test_global_batch_does_not_depend_on_the_number_of_processes(store, table, processes):
     whole = take(store, table, 4)
-    parts = [take(store, table, 4, process_index=p, process_count=processes) for p in range(processes)]
+    rows = np.split(np.arange(CONFIG.batch), processes)
+    parts = [take(store, table, 4, rows=own) for own in rows]
     for step, batch in enumerate(whole):
         joined = {k: np.concatenate([part[step][k] for part in parts]) for k in batch}
         assert same(batch, joined)
 
 
-@pytest.mark.parametrize("process", [(0, 1), (1, 2)])
+@pytest.mark.parametrize("rows", [None, np.arange(CONFIG.batch // 2, CONFIG.batch)], ids=["alone", "one-of-two"])
 @pytest.mark.parametrize("datasets", [(), ("arm",)])
-def test_resuming_at_every_step_continues_exactly(datasets, process, store, table):
+def test_resuming_at_every_step_continues_exactly(datasets, rows, store, table):
     """A mixture and a single dataset; alone and as one of two processes."""
-    config, part = replace(CONFIG, datasets=datasets), dict(process_index=process[0], process_count=process[1])
-    straight = take(store, table, 9, config, **part)
+    config = replace(CONFIG, datasets=datasets)
+    straight = take(store, table, 9, config, rows=rows)
     for start in range(9):
-        rest = take(store, table, 2, config, start_step=start, **part)
+        rest = take(store, table, 2, config, start_step=start, rows=rows)
         for batch, expected in zip(rest, straight[start:], strict=False):
             assert same(batch, expected)
 
@@ -139,8 +140,8 @@ def test_the_records_of_a_batch_are_those_that_its_rows_were_read_from(store, ta
 def test_resuming_with_other_processes_and_threads_continues_exactly(store, table):
     straight = take(store, table, 4)
     parts = [
-        take(store, table, 2, start_step=2, process_index=p, process_count=2, threads=4 * p, prefetch=1)
-        for p in (0, 1)
+        take(store, table, 2, start_step=2, rows=own, threads=4 * p, prefetch=1)
+        for p, own in enumerate(np.split(np.arange(CONFIG.batch), 2))
     ]
     for k in (0, 1):
         assert same(straight[2 + k], {n: np.concatenate([p[k][n] for p in parts]) for n in straight[0]})
@@ -357,9 +358,15 @@ def test_unknown_dataset(store, table):
         make_loader(store, table, replace(CONFIG, datasets=("leg",)))
 
 
-def test_batch_that_does_not_split(store, table):
-    with pytest.raises(ConfigError, match="batch 16 does not split over 3 processes"):
-        make_loader(store, table, CONFIG, process_count=3)
+def test_rows_need_not_lie_side_by_side(store, table):
+    [whole], [some] = take(store, table, 1), take(store, table, 1, rows=[9, 2, 3])
+    assert same({k: x[[9, 2, 3]] for k, x in whole.items()}, some)
+
+
+@pytest.mark.parametrize("rows", [[16], [-1], []])
+def test_rows_that_a_batch_does_not_have(store, table, rows):
+    with pytest.raises(ConfigError, match=r"a batch of 16 rows has none of \["):
+        make_loader(store, table, CONFIG, rows=rows)
 
 
 def test_table_of_another_action_layout(store, table):

@@ -1,0 +1,53 @@
+"""What commands ask that several processes, on one host or on many, do together."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Annotated
+
+from tyro.conf import FlagCreatePairsOff, arg
+
+from experiments.setting import UNSET
+
+
+@dataclass(frozen=True)
+class Hosts:
+    """Several processes as one program (docs/hosts.md); the same command is started once for each."""
+
+    coordinator: Annotated[str | None, arg(metavar="HOST:PORT"), UNSET] = None
+    """Where process 0 can be reached by the others. Or HMA_COORDINATOR."""
+    processes: Annotated[int | None, arg(metavar="N"), UNSET] = None
+    """How many there are. Or HMA_PROCESSES."""
+    process: Annotated[int | None, arg(metavar="I"), UNSET] = None
+    """Which this one is, from 0. Or HMA_PROCESS."""
+    distributed: Annotated[FlagCreatePairsOff[bool], UNSET] = False
+    """Find out what is not given from Slurm (srun), Kubernetes, a TPU pod or MPI."""
+    start_timeout: Annotated[float, arg(name="start-timeout", metavar="SECONDS")] = 300.0
+    """Until all processes must have come."""
+    lost_after: Annotated[float, arg(name="lost-after", metavar="SECONDS")] = 90.0
+    """Without a sign of life of one process, after which the others end with code 75."""
+
+    def join(self) -> None:
+        """Joins the other processes, if there are any; from then on only process 0 writes to the screen."""
+        from hma_jax.runtime.processes import Processes, start
+
+        asked = Processes(
+            self.coordinator, self.processes, self.process, self.distributed, self.start_timeout, self.lost_after
+        ).or_from(os.environ)
+        if not asked.several:
+            return
+        start(asked)
+        from experiments.progress import console
+        from hma_jax.runtime.processes import is_writer
+
+        console.quiet = not is_writer()
+
+
+def end_together(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
+    """At the end of the program; a process by itself just ends."""
+    from hma_jax.runtime.processes import end
+    from hma_jax.training.loop import Interrupted
+
+    # A stop that was asked for is one of all processes, after the same step.
+    end(None if isinstance(error, Interrupted) else error, code, show)

@@ -1,0 +1,252 @@
+"""Several processes as one program, on one host or on many: its start, who writes, what all of them learn of each.
+
+Nothing here is needed or costs anything where one process works by itself: `start` is not called then, and every
+other function answers at once. Who is lost, and what becomes of the others, is told in `runtime.watchdog`; for
+users, docs/hosts.md says all of it.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from hma_jax.config import ConfigError, require
+from hma_jax.runtime import watchdog
+
+COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCESS"
+"""Environment variables for what is not given otherwise."""
+
+MARGIN = 20.0
+"""Seconds by which JAX's own patience exceeds twice `lost_after`: it ends a process without a word about whom it
+misses, and is left for the case that this process's watchdog is stuck. Twice, for JAX gives a sign of its own after
+half its patience only, and counts from the last one."""
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Which processes make up the program, and how long they wait for each other.
+
+    With `detect`, JAX finds out from Slurm, Kubernetes, a TPU pod or MPI what is not given.
+    """
+
+    coordinator: str | None = None  # HOST:PORT of process 0, as the others reach it
+    processes: int | None = None
+    process: int | None = None  # this one's number, from 0
+    detect: bool = False
+    start_timeout: float = 300.0  # seconds until all must have come
+    lost_after: float = 90.0  # seconds without a sign of life after which a process is lost
+
+    def __post_init__(self):
+        require(self.start_timeout >= 1, f"--start-timeout must be at least 1 second, got {self.start_timeout}")
+        require(self.lost_after >= 5, f"--lost-after must be at least 5 seconds, got {self.lost_after}")
+        if self.coordinator is not None:
+            port = self.coordinator.rpartition(":")[2]
+            require(port.isdigit(), f"--coordinator must be HOST:PORT, got {self.coordinator!r}")
+        if self.processes is not None and self.process is not None:
+            require(
+                0 <= self.process < self.processes,
+                f"--process counts from 0 to {self.processes - 1} with --processes {self.processes}, "
+                f"got {self.process}",
+            )
+
+    def or_from(self, environment: Mapping[str, str]) -> Processes:
+        """With the environment's values for what is not given. Raises ConfigError for one that is no number, and
+        if only a part of what is needed is known."""
+
+        def number(name: str, given: int | None) -> int | None:
+            text = environment.get(name)
+            if given is not None or text is None:
+                return given
+            require(text.isdigit(), f"{name} must be a number, got {text!r}")
+            return int(text)
+
+        found = replace(
+            self,
+            coordinator=self.coordinator or environment.get(COORDINATOR),
+            processes=number(PROCESSES, self.processes),
+            process=number(PROCESS, self.process),
+        )
+        given = (found.coordinator, found.processes, found.process)
+        require(
+            found.detect or None not in given or given == (None, None, None),
+            "several processes need --coordinator HOST:PORT, --processes N and --process I (or "
+            f"{COORDINATOR}, {PROCESSES}, {PROCESS}), or --distributed where Slurm, Kubernetes, a TPU pod or MPI "
+            "started them",
+        )
+        return found
+
+    @property
+    def several(self) -> bool:
+        return self.detect or (self.processes or 1) > 1
+
+
+def start(asked: Processes) -> None:
+    """Joins the other processes; before anything else of JAX is used. A single process needs nothing and gets
+    nothing. Raises ConfigError if they do not come together."""
+    if not asked.several:
+        return
+    # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `Agreement` sees both.
+    jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            asked.coordinator,
+            asked.processes,
+            asked.process,
+            cluster_detection_method=None if asked.detect else "deactivate",
+            initialization_timeout=int(asked.start_timeout),
+            heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),
+            shutdown_timeout_seconds=int(asked.lost_after),
+        )
+    except (RuntimeError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"the processes did not come together within {asked.start_timeout:.0f} s at "
+            f"{asked.coordinator or 'the address that was detected'} ({reason}); see that all were started with the "
+            "same address and that process 0 can be reached there"
+        ) from error
+    if jax.process_count() > 1:
+        _watch(asked.lost_after)
+
+
+def _watch(lost_after: float) -> None:
+    me, hosts = jax.process_index(), tell("host", socket.gethostname())
+    word, host = secrets.token_hex(8), _state().coordinator_address.rpartition(":")[0]
+    if me == 0:
+        board = watchdog.Board(word)
+        from_writer("watchdog", f"{board.port} {word}")
+        exchange, port = board.exchange, board.port
+    else:
+        said, word = from_writer("watchdog", "").split()
+        port = int(said)
+        exchange = partial(watchdog.visit, host.strip("[]"), port, word)
+    watchdog.watch(watchdog.Signs(me, hosts, f"{host}:{port}", lost_after), exchange)
+
+
+def end(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
+    """At the end of a process. Several end together if all is well; one that failed tells the others why, and
+    ends here with `code`, for a thread that hangs in a collective holds up any other end. `show`: prints where
+    the error comes from.
+    """
+    if jax.distributed.is_initialized() and jax.process_count() > 1:
+        if error is None:
+            meet("end")
+            watchdog.finish()
+            return
+        if show:
+            traceback.print_exception(error)
+        watchdog.finish(" ".join(str(error).split())[:500] or type(error).__name__, perhaps_lost=_of_others(error))
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+def _of_others(error: BaseException | None) -> bool:
+    """Whether an error may come of another process's end: what a collective or the coordination service says."""
+    while error is not None:
+        if isinstance(error, jax.errors.JaxRuntimeError):
+            return "RESOURCE_EXHAUSTED" not in str(error)
+        error = error.__cause__
+    return False
+
+
+def is_writer() -> bool:
+    """Whether this process writes what the program as a whole says: logs, results, lines on the screen."""
+    return jax.process_index() == 0
+
+
+def tell(name: str, text: str) -> list[str]:
+    """Every process's `text`, in their order; all call it at the same place, under the same `name`.
+
+    Waits for the slowest however long it takes: one that is lost ends the others (`runtime.watchdog`).
+    """
+    if jax.process_count() == 1:
+        return [text]
+    client = _state().client
+    turn = _turns[name] = _turns.get(name, 0) + 1
+    key = f"hma/tell/{name}/{turn}"
+    client.key_value_set(f"{key}/{jax.process_index()}", f"={text}")
+    return [_wait_for(client, f"{key}/{p}")[1:] for p in range(jax.process_count())]
+
+
+def meet(name: str) -> None:
+    """Waits until all processes are here. Before a program runs for the first time: its collectives wait for those
+    that still compile it, on CPUs for 30 seconds only."""
+    tell(name, "")
+
+
+def from_writer(name: str, text: str) -> str:
+    """What process 0 says; the others' `text` does not count. Called by all, as `tell`."""
+    return tell(name, text if is_writer() else "")[0]
+
+
+@contextmanager
+def writer_first(name: str) -> Iterator[None]:
+    """Process 0 goes through the block before the others do: `with writer_first("data"): prepare()`."""
+    if not is_writer():
+        meet(f"first/{name}")
+    yield
+    if is_writer():
+        meet(f"first/{name}")
+
+
+class Agreement:
+    """A number that any process may wish for, known to all of them at the same step.
+
+    With several processes the largest wish of one step is known after the next one was dispatched: no process
+    waits for another more than the steps themselves do.
+    """
+
+    def __init__(self):
+        self._count: Callable[[jax.Array], jax.Array] | None = None
+        self._cast: jax.Array | None = None
+        if jax.process_count() > 1:
+            mesh = Mesh(np.array(jax.devices()), ("devices",))
+            self._each = NamedSharding(mesh, PartitionSpec("devices"))
+            count = jax.jit(lambda wishes: wishes.max(), out_shardings=NamedSharding(mesh, PartitionSpec()))
+            shape = jax.ShapeDtypeStruct((jax.device_count(),), np.int32, sharding=self._each)
+            self._count = count.lower(shape).compile()
+
+    def cast(self, wish: Callable[[], int]) -> None:
+        """Once a step, by all."""
+        if self._count is not None:
+            mine = np.full(jax.device_count(), wish(), np.int32)
+            self._cast = self._count(jax.make_array_from_callback(mine.shape, self._each, lambda at: mine[at]))
+
+    def outcome(self, wish: Callable[[], int]) -> int:
+        """What was cast last, of all processes the largest. A single process has its `wish` of this moment."""
+        if self._count is None:
+            return wish()
+        return 0 if self._cast is None else int(self._cast)
+
+
+_turns: dict[str, int] = {}
+
+
+def _wait_for(client: Any, key: str) -> str:
+    while True:
+        try:
+            return client.blocking_key_value_get(key, 60_000)
+        except jax.errors.JaxRuntimeError as error:
+            if "DEADLINE_EXCEEDED" not in str(error):
+                raise
+            time.sleep(0.1)
+
+
+def _state() -> Any:
+    """What JAX keeps of its coordination service; it has no public way to it, and Orbax takes this one too."""
+    from jax._src import distributed
+
+    return distributed.global_state

@@ -1,0 +1,152 @@
+"""Several real processes as one program: what each learns of the others, and the rows that each loads."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+
+from hma_jax.config import ConfigError
+from hma_jax.runtime.processes import Processes
+from hma_jax.runtime.watchdog import DONE, FAILED, Board, Signs, Watchdog, visit
+from tests.multihost.processes import by_address, by_slurm, run
+
+
+@pytest.mark.parametrize("said", [by_address, pytest.param(by_slurm, marks=pytest.mark.slow)])
+def test_two_processes_meet(said, tmp_path: Path):
+    ended = run("tests.multihost.meet", [str(tmp_path / "file")], processes=2, said=said)
+    first, second = (json.loads(text.splitlines()[-1]) for text in ended)
+    assert first["rows"] == {"(-1, 1, 1)": [0, 1, 2, 3], "(1, 2, 1)": [0, 1, 2, 3], "(1, 1, 2)": [*range(8)]}
+    assert second["rows"] == {"(-1, 1, 1)": [4, 5, 6, 7], "(1, 2, 1)": [4, 5, 6, 7], "(1, 1, 2)": [*range(8)]}
+    for report in (first, second):
+        assert report["seen"] == "here" and report["told"] == ["p0", "p1"] and report["from_writer"] == "p0"
+        assert report["agreed"] == [0, 0, 1, 2]  # of each step the largest wish, a step later
+        assert report["sum"] == 5.0
+
+
+@pytest.mark.parametrize(
+    ("given", "environment", "message"),
+    [
+        ({"processes": 2}, {}, "several processes need --coordinator"),
+        ({}, {"HMA_PROCESSES": "2"}, "several processes need --coordinator"),
+        ({"coordinator": "a:1", "processes": 2, "process": 2}, {}, "--process counts from 0 to 1"),
+        ({"coordinator": "a", "processes": 2, "process": 0}, {}, "must be HOST:PORT"),
+        ({}, {"HMA_PROCESSES": "two"}, "HMA_PROCESSES must be a number"),
+        ({"lost_after": 1.0}, {}, "--lost-after must be at least 5"),
+    ],
+)
+def test_what_cannot_be_started_is_refused(given, environment, message):
+    with pytest.raises(ConfigError, match=message):
+        Processes(**given).or_from(environment)
+
+
+def test_what_is_given_goes_before_the_environment():
+    environment = {"HMA_COORDINATOR": "b:2", "HMA_PROCESSES": "2", "HMA_PROCESS": "1"}
+    asked = Processes(coordinator="a:1").or_from(environment)
+    assert (asked.coordinator, asked.processes, asked.process, asked.several) == ("a:1", 2, 1, True)
+    assert not Processes().or_from({}).several
+
+
+class World:
+    """Signs of process `me` of three, and a clock that stands until it is told."""
+
+    def __init__(self, me: int):
+        self.now = 0.0
+        self.signs = Signs(me, ["a", "b", "c"], "a:1", lost_after=90.0, clock=lambda: self.now)
+
+    def after(self, seconds: float, heard: dict[int, list] | None = None) -> str | None:
+        self.now += seconds
+        if heard is not None:
+            self.signs.hear(heard)
+        return self.signs.verdict()
+
+
+def test_a_silent_process_is_lost_by_name_when_its_time_is_over():
+    world = World(0)
+    assert world.after(1, {0: [1], 1: [1], 2: [1]}) is None
+    assert world.after(89, {0: [2], 1: [2], 2: [1]}) is None
+    assert "lost process 2 of 3 on host c: no sign of life for 91 s" in world.after(2, {0: [3], 1: [3], 2: [1]})
+
+
+def test_one_that_never_gave_a_sign_is_lost_too():
+    assert "process 1 of 3 on host b" in World(0).after(91, {0: [1], 2: [1]})
+
+
+def test_a_silent_coordinator_is_lost_and_nobody_else_is_blamed_for_its_silence():
+    world = World(1)
+    assert world.after(1, {0: [1], 1: [1], 2: [1]}) is None
+    assert world.after(90) is None
+    assert "process 0 of 3 on host a, the coordinator at a:1: it has not answered for 91 s" in world.after(1)
+
+
+def test_a_coordinator_that_refuses_connections_is_lost_at_once():
+    world = World(1)
+    world.signs.refused = True
+    assert "the coordinator at a:1: it has ended" in world.after(1)
+
+
+def test_after_a_cut_the_others_have_their_time_again():
+    world = World(1)
+    assert world.after(60) is None
+    assert world.after(0, {0: [60], 1: [1], 2: [1]}) is None
+    assert world.after(89, {0: [149], 1: [1], 2: [1]}) is None
+
+
+def test_a_process_that_stood_still_itself_blames_nobody():
+    world = World(1)
+    assert world.after(1, {0: [1], 1: [1], 2: [1]}) is None
+    world.now += 200
+    world.signs.excuse(200)
+    assert world.after(80) is None
+    assert "lost process 0" in world.after(20)
+
+
+def test_whoever_is_done_is_not_missed():
+    world = World(1)
+    assert world.after(1, {0: [DONE], 1: [1], 2: [DONE]}) is None
+    assert world.after(500) is None
+    world.signs.refused = True
+    assert world.after(1) is None
+
+
+def test_an_error_elsewhere_is_told_unless_this_process_has_it_too():
+    world = World(1)
+    assert world.after(1, {0: [1], 1: [1], 2: [FAILED, "disk full"]}) is None  # it may be about to say so itself
+    assert world.after(3, {0: [4]}) == "process 2 of 3 on host c ended with an error: disk full"
+    assert World(2).after(9, {2: [FAILED, "disk full"], 0: [1], 1: [1]}) is None
+
+
+def test_signs_are_brought_to_the_board_and_those_of_all_come_back():
+    board = Board("word")
+    assert board.exchange(0, [1]) == {0: [1]}
+    assert visit("127.0.0.1", board.port, "word", 1, [7]) == {0: [1], 1: [7]}
+    with pytest.raises(ConnectionResetError):
+        visit("127.0.0.1", board.port, "of another program", 1, [8])
+    with socket.create_connection(("127.0.0.1", board.port)) as stranger:
+        stranger.sendall(b"GET / HTTP/1.1\r\n\r\n")
+    assert visit("127.0.0.1", board.port, "word", 2, [1]) == {0: [1], 1: [7], 2: [1]}
+    board.shutdown()
+    board.server_close()
+    with pytest.raises(ConnectionRefusedError):
+        visit("127.0.0.1", board.port, "word", 1, [9])
+
+
+def test_a_watchdog_leaves_with_the_verdict_and_not_after_its_own_end():
+    heard, left = {1: [1]}, threading.Event()
+    verdicts: list[str] = []
+
+    def leave(verdict: str) -> None:
+        verdicts.append(verdict)
+        left.set()
+
+    def exchange(process: int, sign: list) -> dict[int, list]:
+        return heard | {process: sign}
+
+    dog = Watchdog(Signs(0, ["a", "b"], "a:1", lost_after=0.5), exchange, leave)
+    assert left.wait(10) and "lost process 1 of 2 on host b" in verdicts[0]
+    dog.end([DONE])
+    seen = len(verdicts)
+    assert not threading.Event().wait(1.5) and len(verdicts) == seen
