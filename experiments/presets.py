@@ -52,7 +52,7 @@ CPU = Study(
     # 2,500 steps as after 5,000, and follow actions as well. The price is a perplexity that is higher: factors
     # count as independent.
     tokenizer=TokenizerConfig(image_size=32, downsample=4, bits=16, factors=4),
-    tokenizer_train=TokenizerTrainConfig(steps=3600, batch=32),
+    tokenizer_train=TokenizerTrainConfig(steps=4000, batch=32),
     model=ModelConfig(
         width=48, layers=2, heads=2, frames=12, tokens=64, action_tokens=1, factors=4, factor_vocab=16,
         action_heads=False, mup=MupConfig(base_width=48),
