@@ -78,8 +78,7 @@ def _take_turns(
 ) -> dict[str, list[float]]:
     """Seconds of every turn, of one stage of the release and those of ours that give the same.
 
-    Every stage has a process of its own, as its users have: among others it would meet memory that those
-    left in pieces, and a training step then takes a quarter longer.
+    Every stage has a process of its own, as its users have: none meets memory that others left in pieces.
     """
     # As text: started from its file, it would find our modules beside it before those of the standard library.
     script = Path(__file__).with_name("released.py").read_text()
