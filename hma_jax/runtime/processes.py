@@ -35,6 +35,10 @@ misses, and is left for the case that this process's watchdog is stuck. Twice, f
 half its patience only, and counts from the last one."""
 
 
+# With what the messages of collectives and of the coordination service begin.
+STATUSES = ("ABORTED:", "CANCELLED:", "DEADLINE_EXCEEDED:", "INTERNAL:", "UNAVAILABLE:", "UNKNOWN:")
+
+
 @dataclass(frozen=True)
 class Processes:
     """Which processes make up the program, and how long they wait for each other.
@@ -154,10 +158,11 @@ def end(error: BaseException | None = None, code: int = 0, show: bool = False) -
 
 
 def _of_others(error: BaseException | None) -> bool:
-    """Whether an error may come of another process's end: what a collective or the coordination service says."""
+    """Whether an error may come of another process's end: what a collective or the coordination service says. Both
+    begin with the name of a status, in whatever type of exception."""
     while error is not None:
-        if isinstance(error, jax.errors.JaxRuntimeError):
-            return "RESOURCE_EXHAUSTED" not in str(error)
+        if str(error).startswith(STATUSES):
+            return True
         error = error.__cause__
     return False
 

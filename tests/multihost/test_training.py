@@ -11,10 +11,10 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from orbax.checkpoint import v1 as ocp
 
 from hma_jax.runtime.exits import Exit
 from hma_jax.training.reading import find_damage, list_steps
+from hma_jax.training.runs import load_run
 from tests.conftest import FAST_COMPILATION
 from tests.multihost.processes import Started, launch, run
 
@@ -73,11 +73,11 @@ def test_processes_train_as_one_does_and_write_one_log(processes: int, devices: 
     assert not find_damage(tmp_path / "checkpoints" / "20")
 
 
-@pytest.mark.parametrize("mesh", [[1, 4, 1], [2, 1, 2], [1, 1, 4]])
+@pytest.mark.parametrize("mesh", [[1, 4, 1], [1, 2, 2]])
 def test_any_mesh_over_four_processes(mesh: list[int], alone, tmp_path: Path):
     """With `tensor` across processes several of them load the same rows."""
     reports = train(tmp_path, 4, 1, steps=5, mesh=mesh)
-    assert global_batches(reports) == global_batches([alone[1]])[:6]
+    assert global_batches(reports) == global_batches([alone[1]])[:5]
     np.testing.assert_allclose(reports[0]["losses"], alone[1]["losses"][:5], rtol=1e-5)
 
 
@@ -93,8 +93,7 @@ def test_a_checkpoint_of_four_processes_goes_on_in_one_and_in_two(tmp_path: Path
     assert straight[1]["losses"] == straight[0]["losses"][4:]
     for reports in (one, two):
         np.testing.assert_allclose(reports[0]["losses"], straight[0]["losses"], rtol=1e-5)
-    a, b = (ocp.load_checkpointables(tmp_path / name / "checkpoints" / "8") for name in ("four", "one"))
-    assert a.keys() == b.keys() == {"step", "params", "opt_state", "ema"}
+    a, b = (load_run(tmp_path / name, "ema").params for name in ("four", "one"))
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_allclose(np.asarray(x), np.asarray(y), rtol=1e-4, atol=1e-6)
 
