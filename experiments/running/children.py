@@ -44,6 +44,7 @@ def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str
 def settle() -> None:
     """Called first in a child: takes its cores, arranges to die with its parent and to end in order when asked to."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked
     for number in (signal.SIGUSR1, signal.SIGUSR2):  # Slurm's, for the process above
         signal.signal(number, signal.SIG_IGN)
     cores = os.environ.get(_CORES)

@@ -225,6 +225,7 @@ def test_a_signal_to_the_engines_process_stops_its_trial_in_order(tmp_path, sent
         "attempt = Attempt(Path(sys.argv[1]), Path('compiled'), fake_trial.command)\n"
         "def announced(*_): attempt.end(); sys.exit(77)\n"
         "signal.signal(signal.SIGUSR2, announced)\n"
+        "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})\n"  # as in Ray's workers; children inherit it
         "code = attempt.run()\n"
         "sys.exit(128 - code if code < 0 else code)"
     )
