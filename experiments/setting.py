@@ -51,13 +51,12 @@ class Where:
     """Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
     Short for --set execution.mesh.data=... and so on. No result depends on it."""
 
-    def __post_init__(self):
+    def anywhere(self) -> Where:
+        """The same, meant in the same way from any working directory. Raises ConfigError for an `out` at a URL."""
+        from data_pipelines.sources.rlds.location import absolute
+
         require_local("--out", self.out)
         require_local("--tokenizer", self.tokenizer)
-
-    def anywhere(self) -> Where:
-        """The same, meant in the same way from any working directory."""
-        from data_pipelines.sources.rlds.location import absolute
 
         def whole(path: Path | None) -> Path | None:
             return path and path.absolute()

@@ -57,5 +57,7 @@ class OneModel:
     trajectories: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: all)")] = None
     """Trajectories of each robot, chosen by hash: the same as in a sweep over trajectories."""
 
-    def __post_init__(self):
+    def directory(self) -> Path | None:
+        """`run`. Raises ConfigError for a URL."""
         require_local("--run", self.run)
+        return self.run

@@ -109,7 +109,8 @@ def train(
         hosts: Several processes that train together, on one host or on many.
     """
     hosts.join()
-    model_commands.train(make_setting(where), one.run, options, trajectories=one.trajectories, replace=remake.replace)
+    setting = make_setting(where)
+    model_commands.train(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace)
 
 
 def adapt(
@@ -139,7 +140,7 @@ def adapt(
     model_commands.adapt(
         make_setting(where),
         source,
-        one.run,
+        one.directory(),
         options,
         everything=everything,
         trajectories=one.trajectories,
