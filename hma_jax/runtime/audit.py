@@ -12,7 +12,7 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, MeshConfig
-from hma_jax.runtime.sharding import Axes, mesh_axes, partition, stored
+from hma_jax.runtime.sharding import mesh_axes, partition, stored
 
 
 class Spec(Protocol):
