@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from data_pipelines.registry.mixtures import FORTY
-from experiments.study import StoreConfig, Study, SuiteConfig, TransferConfig
+from data_pipelines.suite.embodiments import NEW
+from experiments.study import DesignConfig, StoreConfig, Study, SuiteConfig, TransferConfig
 from hma_jax.config import (
     ConfigError,
     DecodeConfig,
@@ -39,6 +41,10 @@ SMOKE = Study(
     widths=(8, 16),
     ablation_seeds=(0, 1),
     transfer=TransferConfig(rates=3, widths=(8, 16, 32), datasets=1),
+    designs=DesignConfig(
+        judged=2, counts=(2, 3), poor=2, kinship=3, shots=(1, 2), shots_after=(2, 3), shots_steps=2, caps=(1, 2),
+        budgets=(2, 3), compute=(2, 3), rate_factors=(0.5, 1.0),
+    ),
     flops_per_second=2e9,
     trial_seconds=15.0,
 )
@@ -74,6 +80,23 @@ CPU = Study(
     flops_per_second=2.5e10,
     trial_seconds=60.0,
 )
+
+CPU_FULL = replace(
+    CPU,
+    name="cpu-full",  # the evidence: two cores, half a day; every point of three seeds, every axis with controls
+    unseen=tuple(e.name for e in NEW),
+    train=replace(CPU.train, steps=8000),
+    tau=1000.0,  # every robot weighs the same, whatever others there are and however much each has
+    seeds=(0, 1, 2),
+    widths=(24, 32, 48, 64, 80),  # a decade of trunk parameters
+    transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(24, 48, 96), datasets=10, steps=1000),
+    ablation_steps=4000,
+    designs=DesignConfig(long=(16_000, 32_000, 64_000), end_controls=True),
+    axes=(
+        "horizon", "dilution", "transfer", "newcomers", "episodes", "width", "compute", "lr", "lr_horizon", "fewshot",
+        "settings", "conditioning",
+    ),
+)  # fmt: skip
 
 ACCELERATOR = Study(
     name="accelerator",  # one GPU, hours
@@ -133,7 +156,7 @@ CPU_CONTINUOUS = replace(
     eval=replace(CPU.eval, decode=DecodeConfig(sampler=SamplerConfig(steps=20, temperature=0.0))),
 )
 
-PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS)}
+PRESETS = {p.name: p for p in (SMOKE, CPU, CPU_FULL, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS)}
 
 
 def get_preset(name: str) -> Study:

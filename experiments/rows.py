@@ -107,7 +107,7 @@ def _rows(
     last = result["losses"][-max(round(LAST * len(result["losses"])), 1) :]
     rows = [row(point.role, TRAINING, LOSS, mean_and_sem(last))]
     for role, summary in parts:
-        judged = [name for name in sweep.scope if name in summary.datasets]  # those with windows
+        judged = [name for name in point.scope or sweep.scope if name in summary.datasets]  # those with windows
         scopes = {OVERALL: summary.over(judged)}
         scopes |= {name: summary.datasets[name] for name in judged}
         for scope, metrics in scopes.items():

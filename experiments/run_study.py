@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import Any
 
 from experiments.preparing.made_from import Step, require_same
 from experiments.program import command_line
@@ -12,7 +13,10 @@ from experiments.running.attempts import State, read_states
 from experiments.running.closure import Closure
 from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import FINISHED, Ledger
+from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
+from experiments.running.shared_runs import share_runs
+from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
 from experiments.setting import Setting
 from experiments.study import Study
@@ -49,7 +53,7 @@ def run_study(
 
     study, workspace = setting.study, setting.workspace
     if not setting.data:
-        require_simulated(study.dataset_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
+        require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
     with workspace.locked():
         require_same_windows(study, workspace, replace)
@@ -66,13 +70,25 @@ def run_study(
         require_agreement(workspace, record, trials, sources, accept_code)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
-        # The widest take longest: first, so that no worker is left with one at the end.
-        ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
-        names = titles(sweeps, provenance)
-        jobs = [Job(id, names[id], {"trial": to_dict(trial), **common}) for id, trial in ordered]
+        jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common)
         states = run_jobs(jobs, workspace, launcher, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
+
+
+def make_jobs(
+    trials: dict[str, Trial], names: dict[str, str], provenance: Provenance, common: dict[str, Any]
+) -> list[Job]:
+    """A job for every trial, the widest and longest first: they take longest, and no worker is left with one at the
+    end. Trials that have the beginning of their training in common wait for the shorter ones of them, and those that go
+    on from another one for it."""
+    shared = share_runs(trials)
+    jobs = []
+    for id, trial in sorted(trials.items(), key=lambda item: (-item[1].model.width, -item[1].train.steps)):
+        record = {"trial": to_dict(trial), **common, "shared": to_dict(shared[id])}
+        sources = {trial_id(other, provenance) for other in trial.with_source()[:-1]}
+        jobs.append(Job(id, names[id], record, after=frozenset(sources | {other for other, _ in shared[id].before})))
+    return jobs
 
 
 def require_agreement(

@@ -1,8 +1,8 @@
 """What a study fixes: data, tokenizer, base model, budget, protocol and the points of each axis.
 
 Owns the `Study` record and how it is adapted (user data, command line overrides). Named
-instances are in `presets`; which trials follow from a study is in the modules of the axes (see
-`sweep`). Nothing here imports JAX.
+instances are in `presets`; which trials follow from a study is in `sweeps`, a file for each
+axis. Nothing here imports JAX.
 """
 
 from __future__ import annotations
@@ -79,6 +79,33 @@ class TransferConfig:
             require(value is None or value >= 1, f"transfer.{name} must be at least 1, got {value}")
 
 
+@dataclass(frozen=True)
+class DesignConfig:
+    """Designs of a study that is to be believed (axes `dilution`, `transfer`, `newcomers`, `fewshot`, `episodes`,
+    `compute`, `horizon`, `lr_horizon`); the demonstration has none of them. Fields of steps name decay branches of
+    runs that trials share (`experiments.running.shared_runs`)."""
+
+    judged: int = 5  # robots drawn at random, others for every seed, on whom designs over robots judge
+    counts: tuple[int, ...] = (5, 10, 20, 40)  # robots in the mixture
+    poor: int = 8  # trajectories of the judged robots, where they are to be poor
+    kinship: int = 20  # robots in the mixture where newcomers are siblings or strangers
+    shots: tuple[int, ...] = (4, 16, 64)  # trajectories of each unseen robot
+    shots_after: tuple[int, ...] = (5, 20, 40)  # robots that the model knows by then
+    shots_steps: int = 1000  # of adapting
+    caps: tuple[int, ...] = (4, 16, 64, 256)  # trajectories per robot at most; the last point has all
+    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference, the last those of every axis
+    long: tuple[int, ...] = ()  # more steps of the reference, of the first seed alone
+    compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # steps of the reference whose FLOPs every width may use
+    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the first and last of `budgets`
+    end_controls: bool = False  # controls at both ends of an axis, not at the reference alone
+
+    def __post_init__(self):
+        for name in ("counts", "shots", "shots_after", "caps", "budgets", "long", "compute"):
+            require_increasing(f"designs.{name}", getattr(self, name), at_least=1)
+        for name in ("judged", "poor", "kinship", "shots_steps"):
+            require(getattr(self, name) >= 1, f"designs.{name} must be at least 1, got {getattr(self, name)}")
+
+
 def require_increasing(name: str, points: tuple[int, ...], at_least: int) -> None:
     """Raises ConfigError unless `points` increase from `at_least`."""
     require(
@@ -111,9 +138,13 @@ class Study:
     # Whose windows weigh in the mixture: those of the trajectories that are used, as in the release's sampler, or
     # all, so that on the trajectories axis nothing but the trajectories changes.
     weighed: Literal["used", "all"] = "used"
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = (0,)  # of initial values, order of data and subsets of trajectories together
     ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
+    ablation_steps: int | None = None  # None: as many as every other trial
     transfer: TransferConfig = field(default_factory=TransferConfig)
+    designs: DesignConfig = field(default_factory=DesignConfig)
+    axes: tuple[str, ...] = ("datasets", "trajectories", "width")  # what `hma study` runs
+    unseen: tuple[str, ...] = ()  # robots that no model is trained on but to adapt to them
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)  # how trials are computed; names none
     flops_per_second: float = 1e13  # sustained; as the next only for the estimates of --dry-run
     trial_seconds: float = 120.0  # of a trial, besides computing: start, compilation, decoding, files
@@ -134,6 +165,8 @@ class Study:
             f"model.frames {self.model.frames}",
         )
         require(len(set(self.datasets)) == len(self.datasets), f"datasets repeat: {self.datasets}")
+        known = sorted(set(self.unseen) & set(self.datasets))
+        require(not known, f"unseen robots are trained on: {', '.join(known)}; leave them out of datasets")
 
     def _check_tokens(self) -> None:
         """Raises ConfigError unless the model takes the tokens that the tokenizer makes."""
@@ -180,10 +213,15 @@ class Study:
         return tuple(e.name for e in TRAINED[:count])
 
 
+    def all_names(self) -> tuple[str, ...]:
+        """Every dataset that is prepared: those of the study and the unseen robots'."""
+        return self.dataset_names() + self.unseen
+
+
 def on_user_data(study: Study, names: Sequence[str]) -> Study:
     """The same study on the user's datasets: counts beyond what there is are cut to it."""
     counts = tuple(sorted({min(c, len(names)) for c in study.dataset_counts} | {len(names)}))
-    return replace(study, datasets=tuple(names), dataset_counts=counts)
+    return replace(study, datasets=tuple(names), dataset_counts=counts, unseen=())
 
 
 def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:
@@ -278,13 +316,17 @@ def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequenc
     )
 
 
+OF_NAMES = ("datasets", "unseen")
+"""Lists of names, which may be empty."""
+
+
 def _parse(path: str, text: str, old: Any) -> Any:
     """A value of the kind of `old` from command line text."""
     if isinstance(old, str):
         return text
     if isinstance(old, list) and not text.startswith("["):
         items = [t.strip() for t in text.split(",") if t.strip()]
-        return [t if old and isinstance(old[0], str) or path == "datasets" else _json(path, t) for t in items]
+        return [t if path in OF_NAMES or old and isinstance(old[0], str) else _json(path, t) for t in items]
     value = _json(path, text)
     if old is not None and value is not None:
         number = isinstance(old, (int, float)) and not isinstance(old, bool)

@@ -28,6 +28,7 @@ class LoaderConfig:
     tau: float = 3.0  # datasets are drawn with p ∝ windows^(1/tau)
     seed: int = 0  # of the order and of the subset of trajectories
     max_trajectories: int | None = None  # per dataset
+    capped: tuple[str, ...] = ()  # datasets that it concerns; (): all of them
     datasets: tuple[str, ...] = ()  # empty: all of the store
     shuffle_actions: bool = False  # control: actions of another episode
     rate: float | None = FRAME_RATE  # of frames, in Hz; None: native
@@ -89,4 +90,5 @@ def training_embodiment(
 
 
 def _windows(store: TokenStore, name: str, config: LoaderConfig, limit: int | None) -> WindowSet:
+    limit = limit if not config.capped or name in config.capped else None
     return train_windows(store, name, config.frames, limit, config.seed, rate=config.rate)

@@ -11,7 +11,7 @@ from experiments.cli.arguments import Remake, RunningArguments
 from experiments.progress import console
 from experiments.running.launchers.registry import Launching
 from experiments.setting import StudyArguments, make_setting
-from experiments.sweeps.registry import AXES, SCALING, is_file, plan_sweeps
+from experiments.sweeps.registry import AXES, is_file, plan_sweeps
 from hma_jax.config import ConfigError
 
 
@@ -20,11 +20,13 @@ def study(
     running: OmitArgPrefixes[RunningArguments],
     remake: OmitArgPrefixes[Remake],
 ) -> None:
-    """Run a whole scaling study: data, tokenizer, the three sweeps, CSV, figures and a report page.
+    """Run a whole scaling study: data, tokenizer, its sweeps, CSV, figures and a report page.
+
+    The sweeps are those of the preset (--set axes=...): datasets, trajectories and width, or the designs of cpu-full.
 
     Run the same command again after an interruption: only what is missing is done.
     """
-    _run(("study",), asked, running, remake, SCALING)
+    _run(("study",), asked, running, remake)
 
 
 def sweep(
@@ -64,9 +66,11 @@ def _run(
     asked: StudyArguments,
     running: RunningArguments,
     remake: Remake,
-    axes: tuple[str, ...],
+    axes: tuple[str, ...] = (),
 ) -> None:
+    """`axes`: () for those of the study."""
     setting = make_setting(asked)
+    axes = axes or setting.study.axes
     if running.workers is not None and running.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     if running.dry_run:

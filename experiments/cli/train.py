@@ -107,9 +107,8 @@ def adapt_model(
     replace: Step | None = None,
 ) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
-    from data_pipelines.loading.selection import training_embodiment
-    from experiments.running.trial import loader_of, open_materials
-    from hma_jax.training.adapt import add_embodiments
+    from experiments.running.newcomers import add_robots
+    from experiments.running.trial import open_materials
     from hma_jax.training.runs import load_run
 
     _check(trajectories, options)
@@ -126,14 +125,11 @@ def adapt_model(
         model=trained.model,
         train=dataclasses.replace(study.train, seed=seed, only=only),
     )
-    scale = study.train.action_scale
-    robots = [training_embodiment(materials.store, name, loader_of(trial), scale) for name in new]
-    params, table = add_embodiments(trained.params, trained.model, trained.table, robots, seed)
+    beginning = add_robots(trained, trial, materials)
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
-    origin = {"step": trained.step, "provenance": trained.provenance}
     del trained  # its arrays are not needed while the new model trains
     where = run or setting.workspace.root / "model"
-    _train(setting, trial, where, options, table=table, initial=params, origin=origin)
+    _train(setting, trial, where, options, **beginning)
 
 
 def _check(trajectories: int | None, options: RunOptions) -> None:

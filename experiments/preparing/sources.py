@@ -31,16 +31,16 @@ def find_sources(study: Study, data: Sequence[str]) -> list[Source]:
     from data_pipelines.sources.rlds.location import locate
 
     named = dict(zip(name_datasets(data), map(locate, data), strict=True))
-    missing = [n for n in study.dataset_names() if n not in named]
+    missing = [n for n in study.all_names() if n not in named]
     require(not missing, f"no --data directory for {', '.join(missing)}; given: {', '.join(named)}")
-    return [(get_spec(name), named[name]) for name in study.dataset_names()]
+    return [(get_spec(name), named[name]) for name in study.all_names()]
 
 
 def find_suite(study: Study, workspace: Workspace, advice: str) -> list[Source]:
     """The simulated datasets, which must be there. Raises ConfigError with `advice` otherwise."""
     from data_pipelines.registry import get_spec
 
-    sources = [(get_spec(name), workspace.suite / name) for name in study.dataset_names()]
+    sources = [(get_spec(name), workspace.suite / name) for name in study.all_names()]
     missing = [spec.name for spec, path in sources if not path.is_dir()]
     require(not missing, f"{workspace.suite}: {', '.join(missing)} not simulated yet. {advice}")
     return sources

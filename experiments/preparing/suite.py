@@ -37,7 +37,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     from data_pipelines.sources.rlds.writer import VERSION
     from data_pipelines.suite.generate import generate_suite
 
-    names = study.dataset_names()
+    names = study.all_names()
     specs = [get_spec(name) for name in names]  # a mistyped name is refused before any work
     require_simulated(names)
     found = {name: _differences(name, workspace.suite / name / VERSION, study.suite) for name in names}

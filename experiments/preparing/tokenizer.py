@@ -97,6 +97,7 @@ def make_tokenizer(
         isinstance(config, TokenizerConfig),
         "the study's tokenizer is not one that is trained here; give its directory with --tokenizer",
     )
+    sources = [(spec, path) for spec, path in sources if spec.name not in study.unseen]
     made_from = tokenizer_made_from(study, sources)
     if _in_place(workspace.tokenizer, made_from, replace):
         return

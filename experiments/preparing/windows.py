@@ -27,7 +27,7 @@ def require_same_windows(study: Study, workspace: Workspace, replace: Step | Non
     """Raises ConfigError, before anything is made, if what is known by then differs from the frozen windows."""
     there = _frozen(workspace, replace)
     if there is not None:
-        lines = _setting_differences(there, study.model.frames, study.rate, study.eval.seed, study.dataset_names())
+        lines = _setting_differences(there, study.model.frames, study.rate, study.eval.seed, study.all_names())
         require_same("windows", workspace.manifest, lines, replace)
 
 
@@ -40,7 +40,7 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
     from data_pipelines.windows.evalset import freeze_manifest
 
     store = TokenStore(workspace.store)
-    names, frames = study.dataset_names(), study.model.frames
+    names, frames = study.all_names(), study.model.frames
     manifest = freeze_manifest(
         store, names, frames, study.eval.windows_per_dataset, study.eval.seed,
         prompt=study.eval.prompt_frames, rate=study.rate,
@@ -71,7 +71,7 @@ def windows_are_frozen(study: Study, workspace: Workspace) -> bool:
     from data_pipelines.tokens.store import TokenStore
 
     there = _frozen(workspace, None)
-    return there is not None and there.store == TokenStore(workspace.store).hash(study.dataset_names())
+    return there is not None and there.store == TokenStore(workspace.store).hash(study.all_names())
 
 
 def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) -> None:
@@ -81,7 +81,7 @@ def require_judged(study: Study, workspace: Workspace, judged: Collection[str]) 
 
     empty = EvalManifest.load(workspace.manifest).empty
     summary = json.loads(workspace.data_summary.read_text())
-    names = study.dataset_names()
+    names = study.all_names()
     unjudged = [name for name in names if name in empty and name in judged]
     lines = [f"{name} is judged and has no held-out window: {empty[name]}" for name in unjudged]
     lines += [f"{name} has no training window" for name in names if not summary[name]["windows"]]

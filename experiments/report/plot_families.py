@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
 from experiments.optima import diverged, ends, lowest
-from experiments.report.plot_style import MUTED, plain_log, show_nothing, show_tally
+from experiments.report.plot_style import LABELS, MUTED, plain_log, show_nothing, show_tally
 from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
 from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 
@@ -19,7 +19,8 @@ DRAWN = {
     LOSS: (TRAINING, "training loss, last tenth of steps"),
     "perplexity": (OVERALL, "perplexity, held out"),
 }
-"""Metrics with their scope and label."""
+"""Metrics with their scope and label, where curves are compared by where they are lowest."""
+CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
 CAPTION = (
     "bars: s.e. over seeds; star: lowest, hollow at an end of what was tried\n"
     "cross: diverged; dotted: lowest of the base width"
@@ -29,8 +30,9 @@ CAPTION = (
 def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     """A row of panels per role, a column per metric, a colour per series."""
     series = all_series(rows, sweep.name)
+    drawn = DRAWN if sweep.base else CURVES
     measured = {r.metric for r in rows if r.sweep == sweep.name}
-    metrics = [m for m in DRAWN if m in measured] or list(DRAWN)
+    metrics = [m for m in drawn if m in measured] or list(drawn)
     figure, panels = plt.subplots(
         len(series), len(metrics), figsize=(4.3 * len(metrics), 0.4 + 2.9 * len(series)),
         layout="constrained", sharex=True, sharey="col", squeeze=False,
@@ -38,7 +40,8 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     for line, role in zip(panels, series, strict=True):
         for panel, metric in zip(line, metrics, strict=True):
             _draw(panel, rows, sweep, metric, role, series[role])
-            panel.set_title(ROLES[role], loc="left", fontsize=10)
+            if len(series) > 1:
+                panel.set_title(ROLES[role], loc="left", fontsize=10)
     for panel, metric in zip(panels[-1], metrics, strict=True):
         panel.set_xlabel(sweep.axis)
         if metric == "perplexity":
@@ -47,14 +50,14 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     handles = panels[0, 0].get_legend_handles_labels()[0]
     if handles:
         panels[0, 0].legend(loc="best")
-    figure.supxlabel(CAPTION, fontsize=8.5, color=MUTED)
+    figure.supxlabel(CAPTION if sweep.base else "bars: s.e. over seeds", fontsize=8.5, color=MUTED)
     return figure
 
 
 def _draw(
     panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]
 ) -> None:
-    scope, label = DRAWN[metric]
+    scope, label = (DRAWN if sweep.base else CURVES)[metric]
     xs = sorted({r.x for r in rows if r.sweep == sweep.name})
     for i, name in enumerate(series):
         colour = plt.cm.viridis(0.85 * i / max(len(series) - 1, 1))
@@ -71,6 +74,8 @@ def _draw(
             markersize=4, linewidth=1.6, capsize=2.5, elinewidth=1.1,
             label=name + (" (base)" if name == sweep.base else ""),
         )  # fmt: skip
+        if not sweep.base:
+            continue
         open_ended = best.x in ends(rows, sweep.name, role, name)
         panel.plot(
             best.x, best.mean, "*", markersize=13, color=colour, zorder=4,

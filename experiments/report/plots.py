@@ -37,7 +37,7 @@ def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
     with plt.rc_context(STYLE):
         if sweep.labels:
             figure = plot_names(rows, sweep)
-        elif sweep.base:
+        elif sweep.several:
             figure = plot_family(rows, sweep)
         else:
             metrics = drawn_metrics(rows, [sweep.name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 import math
 from collections.abc import Sequence
@@ -10,8 +11,8 @@ from experiments.optima import Optimum
 from experiments.report.pieces import number, pm, table
 from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import drawn_metrics
-from experiments.rows import CurvePoint, Row, curve, difference
-from experiments.sweeps.sweep import CONTROL, Sweep
+from experiments.rows import CurvePoint, Row, all_series, curve, difference
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 
 HEADINGS = {"perplexity": "perplexity", "delta_psnr": "ΔPSNR (dB)"}
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
@@ -23,6 +24,8 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum]) -> st
         numbers = _names(sweep, rows)
     elif sweep.base:
         numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
+    elif sweep.several:
+        numbers = "".join(_series(sweep, rows, name) for name in all_series(rows, sweep.name).get(POINT, []))
     else:
         numbers = _curve(sweep, rows)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
@@ -36,6 +39,12 @@ def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePo
     """{metric: {x: point}} of the metrics that there are."""
     metrics = drawn_metrics(rows, [sweep.name])
     return {m: {p.x: p for p in curve(rows, sweep.name, m)} for m in metrics}
+
+
+def _series(sweep: Sweep, rows: Sequence[Row], name: str) -> str:
+    """The numbers of one curve of several, as of a sweep that has it alone."""
+    own = [dataclasses.replace(r, series="") for r in rows if r.sweep == sweep.name and r.series == name]
+    return f"<h4>{html.escape(name)}</h4>{_curve(sweep, own)}" if own else ""
 
 
 def _curve(sweep: Sweep, rows: Sequence[Row]) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from experiments.running.former import modernise
+from experiments.running.shared_runs import Shared
 from experiments.running.trial import Trial
 from hma_jax.config import ConfigError, ExecutionConfig
 from hma_jax.config.json import from_dict
 
 
-def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig]:
-    """(the trial, how it is computed). Fields that came after the job was written take their defaults.
+def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, Shared]:
+    """(the trial, how it is computed, what it shares with others). Fields that came after the job was written take their defaults.
 
     Earlier versions counted how a trial is computed to the trial itself. Raises ConfigError for what is no job.
     """
@@ -20,4 +21,5 @@ def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig]:
         execution = record.get("execution") or {"mesh": record["mesh"]}
     except (KeyError, TypeError) as error:
         raise ConfigError(f"job.json: not a job of this project ({error!r}); run its study again") from error
-    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | said)
+    shared = from_dict(Shared, record.get("shared", {}))
+    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | said), shared

@@ -48,6 +48,7 @@ class Job:
     id: str
     title: str
     record: Mapping[str, Any]
+    after: frozenset[str] = frozenset()  # ids of trials that have to end first, of those that run at all
 
 
 class Monitor:
@@ -134,9 +135,10 @@ class _Run:
 
     def _launch(self) -> None:
         room = max(self.launcher.at_once - len(self.running), 0)
-        chosen, self.waiting = self.waiting[:room], self.waiting[room:]
+        chosen = self._ready()[:room]
         if not chosen:
             return
+        self.waiting = [entry for entry in self.waiting if entry not in chosen]
         directories = [self._make_ready(job, state) for job, state in chosen]
         now = time.monotonic()
         for (job, state), directory, handle in zip(
@@ -144,6 +146,11 @@ class _Run:
         ):
             self.running.append(_Attempt(job, directory, handle, now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
+
+    def _ready(self) -> list[tuple[Job, str]]:
+        """Those of `waiting` that wait for no other trial."""
+        pending = {job.id for job, _ in self.waiting} | {a.job.id for a in self.running} | {j.id for j in self.elsewhere}
+        return [(job, state) for job, state in self.waiting if not job.after & pending]
 
     def _make_ready(self, job: Job, state: str) -> Path:
         """The directory of a trial that was left in `state`, ready for the next attempt."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -54,21 +54,50 @@ class Trial:
     weighed: Literal["used", "all"] = "used"  # whose windows weigh in the mixture
     shuffle_actions: bool = False  # the control: actions from another episode
     measure_untrained: bool = False  # also evaluate the model before its first step
+    capped: tuple[str, ...] = ()  # datasets that max_trajectories concerns; (): all of them
+    source: Trial | None = None  # a trained model that `datasets` are added to, and alone trained; None: a new one
+
+    def with_source(self) -> tuple[Trial, ...]:
+        """The trials that must have run for this one, and this one."""
+        return (*self.source.with_source(), self) if self.source else (self,)
 
     @property
     def title(self) -> str:
         """One line that tells this trial from the others of its study."""
         cap = "all" if self.max_trajectories is None else f"{self.max_trajectories}"
+        if self.capped:
+            cap = f"{cap} of {len(self.capped)}, all other"
         control = " · shuffled actions" if self.shuffle_actions else ""
+        after = f" · after {len(self.source.datasets)} datasets" if self.source else ""
         return (
             f"{len(self.datasets)} datasets · {cap} trajectories · width {self.model.width} · "
-            f"seed {self.train.seed}{control}"
+            f"seed {self.train.seed}{after}{control}"
         )
+
+
+def training_of(trial: Trial) -> dict[str, Any]:
+    """What determines a trial's training, but for its number of steps: not on what it is judged, nor how."""
+    fields = to_dict(trial)
+    for name in ("evaluated", "eval", "measure_untrained"):
+        del fields[name]
+    del fields["train"]["steps"]
+    return fields
 
 
 def trial_id(trial: Trial, provenance: Provenance) -> str:
     """The name of a trial: equal exactly when everything that determines it is equal."""
-    return stable_hash({"trial": to_dict(trial), "provenance": to_dict(provenance)})
+    return stable_hash({"trial": _identity(trial), "provenance": to_dict(provenance)})
+
+
+LATER = {"capped": [], "source": None}
+"""Fields that came later: they name a trial where they have another value than this, which all had before."""
+
+
+def _identity(trial: Trial) -> dict[str, Any]:
+    fields = to_dict(trial)
+    if trial.source:
+        fields["source"] = _identity(trial.source)
+    return {name: value for name, value in fields.items() if name not in LATER or value != LATER[name]}
 
 
 @dataclass(frozen=True)
@@ -107,6 +136,7 @@ def loader_of(trial: Trial) -> LoaderConfig:
         shuffle_actions=trial.shuffle_actions,
         rate=trial.rate,
         weighed=trial.weighed,
+        capped=trial.capped,
     )
 
 
@@ -117,6 +147,7 @@ def train_trial(
     *,
     execution: ExecutionConfig = ExecutionConfig(),
     options: RunOptions = UNWATCHED,
+    keep: tuple[int, ...] = (),
     progress: Progress = lambda *_: None,
     table: EmbodimentTable | None = None,
     initial: Params | None = None,
@@ -171,6 +202,7 @@ def train_trial(
             checkpoint_every=checkpoint_every,
             checkpoint_minutes=options.checkpoint_minutes,
             keep_checkpoints=options.keep_checkpoints,
+            keep_steps=keep,
             skip_damaged=options.skip_damaged,
         ),
         validation=Validation(validate_every, lambda: validation_batches(trial, materials, table, execution))
@@ -234,11 +266,14 @@ def run_trial(
     directory: Path,
     *,
     execution: ExecutionConfig = ExecutionConfig(),
+    keep: tuple[int, ...] = (),
+    begin: Callable[[Materials], Mapping[str, Any]] | None = None,
     progress: Progress = lambda *_: None,
 ) -> dict[str, Any]:
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
 
-    Returns what it writes to result.json. Raises ConfigError, DataError, DivergedError or
+    `keep`: steps after which its checkpoint stays, for trials that go on from there. `begin` gives what
+    a trial with a source goes on from (`newcomers`). Returns what it writes to result.json. Raises ConfigError, DataError, DivergedError or
     Interrupted.
     """
     import jax
@@ -251,9 +286,15 @@ def run_trial(
 
     started = time.perf_counter()
     materials = open_materials(workspace)
-    table = training_table(materials.store, loader_of(trial), trial.train.action_scale)
+    if begin is None:
+        beginning = {"table": training_table(materials.store, loader_of(trial), trial.train.action_scale)}
+    else:
+        beginning = begin(materials)
+    table = beginning["table"]
     declared = declare_model(trial.model, table)
-    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress, table=table)
+    trained = train_trial(
+        trial, materials, directory / "run", execution=execution, keep=keep, progress=progress, **beginning
+    )
 
     subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
     evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)

@@ -12,9 +12,10 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, attempt
+from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, RUN, attempt
 from experiments.running.children import enter_child
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
@@ -45,8 +46,10 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from data_pipelines.publishing.files import write_file
     from experiments.running.job import read_job
     from experiments.running.ledger import DIVERGED, FAILED
+    from experiments.running.newcomers import begin_from_trial
     from experiments.running.provenance import inputs_of, record_start
-    from experiments.running.trial import run_trial
+    from experiments.running.shared_runs import begin_shared
+    from experiments.running.trial import run_trial, trial_id
     from experiments.running.workspace import Workspace
     from hma_jax.config import ConfigError
     from hma_jax.training.divergence import DivergedError
@@ -54,9 +57,16 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
 
     report = _ProgressFile(directory / PROGRESS, lost)
     try:
-        trial, execution = read_job(job)
+        trial, execution, shared = read_job(job)
         record_start(directory, inputs_of(job["provenance"]), closure)
-        run_trial(trial, Workspace(directory.parent.parent), directory, execution=execution, progress=report)
+        if begun := begin_shared(directory, shared.before):
+            print(f"goes on from step {begun[1]} of trial {begun[0]}", flush=True)
+        begin = None
+        if trial.source:
+            source = directory.parent / trial_id(trial.source, inputs_of(job["provenance"])) / RUN
+            begin = partial(begin_from_trial, trial, source)
+        workspace = Workspace(directory.parent.parent)
+        run_trial(trial, workspace, directory, execution=execution, keep=shared.keep, begin=begin, progress=report)
         return Exit.DONE
     except Interrupted as request:
         return request.exit

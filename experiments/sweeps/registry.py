@@ -18,9 +18,12 @@ from experiments.sweeps.sweep import Sweep
 from hma_jax.config import ConfigError, require
 
 SCALING = ("datasets", "trajectories", "width")
-"""What `hma study` runs."""
+"""The demonstration: what `hma study` runs, unless its preset says otherwise."""
 
-AXES = (*SCALING, "settings", "conditioning", "lr")
+DESIGNS = ("dilution", "transfer", "newcomers", "fewshot", "episodes", "compute", "horizon", "lr_horizon")
+"""Those of a study that is to be believed (`DesignConfig`)."""
+
+AXES = (*SCALING, "settings", "conditioning", "lr", *DESIGNS)
 """Each is `experiments.sweeps.<name>`."""
 
 Plan = Callable[[Study], Sweep]

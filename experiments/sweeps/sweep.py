@@ -24,6 +24,7 @@ class Point:
     trial: Trial
     role: str = POINT
     series: str = ""  # the curve it lies on, in a sweep of several
+    scope: tuple[str, ...] = ()  # judged here, where the robots are others for every seed; (): the sweep's
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,14 @@ class Sweep:
     base: str = ""  # of several series, the one whose best x the others are to use
 
     @property
+    def several(self) -> bool:
+        """Whether it has several curves."""
+        return any(point.series for point in self.points)
+
+    @property
     def scaling(self) -> bool:
         """Whether it is one curve over a number."""
-        return not self.labels and not self.base
+        return not self.labels and not self.several
 
     def label(self, x: float) -> str:
         """The name of `x`; '' on an axis of numbers."""
@@ -56,24 +62,33 @@ class Sweep:
             return ""
         if self.labels:
             return self.label(point.x)
+        if not self.base:
+            return point.series
         return f"{self.axis} {point.x:g}" + (", no muP" if point.role == STANDARD else "")
 
 
-def reference_trial(study: Study, seed: int) -> Trial:
-    """All datasets, most trajectories, base model: the end of two axes and part of others."""
+def reference_trial(study: Study, seed: int, steps: int | None = None) -> Trial:
+    """All datasets, most trajectories, base model: the end of two axes and part of others. `steps`: other than the
+    study's, a branch of the same run; of that one alone the model before its first step is judged too."""
     names = study.dataset_names()
+    train = study.train if steps is None else replace(study.train, steps=steps)
     return Trial(
         datasets=names,
         max_trajectories=study.trajectory_counts[-1],
         evaluated=names,
         model=study.model,
-        train=replace(study.train, seed=seed),
+        train=replace(train, seed=seed),
         eval=study.eval,
         tau=study.tau,
         rate=study.rate,
         weighed=study.weighed,
-        measure_untrained=True,
+        measure_untrained=train.steps == study.train.steps,
     )
+
+
+def control_of(trial: Trial) -> Trial:
+    """The same, trained on the actions of other episodes: what it says of them it cannot have learned."""
+    return replace(trial, shuffle_actions=True, measure_untrained=False)
 
 
 def make_sweep(
@@ -90,20 +105,22 @@ def make_sweep(
     title: str = "",
     labels: tuple[str, ...] = (),
     seeds: tuple[int, ...] | None = None,
+    steps: int | None = None,
 ) -> Sweep:
-    """The sweep whose trial at x is `change(reference, x)`, for every seed, plus the control.
+    """The sweep whose trial at x is `change(reference, x)`, for every seed, plus the control: at the reference, and
+    at the ends of a numbered axis if the study wants `end_controls`.
 
-    `seeds` are the study's unless given.
+    `seeds` are the study's unless given, `steps` those of every trial.
     """
     seeds = study.seeds if seeds is None else seeds
-    points = []
-    for x in values:
-        for seed in seeds:
-            reference = reference_trial(study, seed)
-            trial = reference if x == reference_x else change(replace(reference, measure_untrained=False), x)
-            points.append(Point(x, trial))
-    control = replace(reference_trial(study, seeds[0]), shuffle_actions=True, measure_untrained=False)
-    points.append(Point(reference_x, control, CONTROL))
+
+    def trial(x: int, seed: int) -> Trial:
+        reference = reference_trial(study, seed, steps)
+        return reference if x == reference_x else change(replace(reference, measure_untrained=False), x)
+
+    points = [Point(x, trial(x, seed)) for x in values for seed in seeds]
+    ends = {values[0], values[-1]} if study.designs.end_controls and not labels else set()
+    points += [Point(x, control_of(trial(x, seeds[0])), CONTROL) for x in sorted({reference_x, *ends})]
     return Sweep(
         name, axis, scope, tuple(points),
         question=question, gain=gain, title=title, labels=labels, reference_x=reference_x,
@@ -130,7 +147,7 @@ def make_ablation(
         study, name, axis, study.dataset_names(), range(len(labels)),
         change=lambda trial, x: variants[labels[x]](trial),
         reference_x=labels.index(default), question=question, gain=gain, title=title, labels=labels,
-        seeds=study.ablation_seeds,
+        seeds=study.ablation_seeds, steps=study.ablation_steps,
     )  # fmt: skip
 
 
@@ -139,17 +156,27 @@ def unique_trials(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, 
     trials: dict[str, Trial] = {}
     for sweep in sweeps:
         for point in sweep.points:
-            trials.setdefault(trial_id(point.trial, provenance), point.trial)
+            for trial in point.trial.with_source():
+                trials.setdefault(trial_id(trial, provenance), trial)
     return trials
 
 
 def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     """A line for every trial of `sweeps`, by id, that tells it from the others."""
     lines: dict[str, str] = {}
+    several = len({trial.train.steps for trial in unique_trials(sweeps, provenance).values()}) > 1
+
+    def add(trial: Trial, remark: str) -> None:
+        steps = f"{trial.train.steps:,} steps" if several else ""
+        lines.setdefault(trial_id(trial, provenance), " · ".join(filter(None, (trial.title, steps, remark))))
+
     for sweep in sweeps:
         for point in sweep.points:
-            parts = filter(None, (point.trial.title, sweep.remark(point)))
-            lines.setdefault(trial_id(point.trial, provenance), " · ".join(parts))
+            add(point.trial, sweep.remark(point))
+    for sweep in sweeps:
+        for point in sweep.points:
+            for source in point.trial.with_source()[:-1]:
+                add(source, "")
     return lines
 
 

@@ -52,13 +52,15 @@ class Checkpoints:
         meta: Description,
         keep: int = 2,
         modernise: Callable[[Description], Description] = lambda described: described,
+        keep_steps: tuple[int, ...] = (),
     ):
-        """`modernise` brings a description that an earlier version wrote to the form of `meta`.
+        """The newest `keep` checkpoints stay, and those of `keep_steps`. `modernise` brings a description that an
+        earlier version wrote to the form of `meta`.
 
         Raises CheckpointError if `directory` cannot be written.
         """
         self.directory = Path(directory).absolute()
-        self.meta, self.keep, self.modernise = meta, keep, modernise
+        self.meta, self.keep, self.modernise, self.keep_steps = meta, keep, modernise, keep_steps
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -134,9 +136,12 @@ class Checkpoints:
         """Made for the first save: what it finds by then is what this run goes on from."""
         if self._orbax is None:
             hush_orbax()
+            policies = ocp.training.preservation_policies
             self._orbax = ocp.training.Checkpointer(
                 self.directory,
-                preservation_policy=ocp.training.preservation_policies.LatestN(self.keep),
+                preservation_policy=policies.AnyPreservationPolicy(
+                    [policies.LatestN(self.keep), policies.CustomSteps(self.keep_steps)]
+                ),
                 # A save cut short by a kill leaves a temporary directory; drop it.
                 cleanup_tmp_directories=True,
             )
@@ -179,10 +184,15 @@ class Checkpoints:
 
     # --- Restoring ---------------------------------------------------------------------------
 
-    def restore(self, shapes: Any, ignore: tuple[str, ...] = (), skip_damaged: bool = False) -> tuple[int, Any]:
+    def restore(
+        self,
+        shapes: Any,
+        may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: (),
+        skip_damaged: bool = False,
+    ) -> tuple[int, Any]:
         """(step, state) of the latest checkpoint, laid out as `shapes` (jax.ShapeDtypeStruct) say.
 
-        `ignore` lists fields of the description ('train.steps') that may differ. With `skip_damaged`,
+        `may_change` says which fields of its description ('train.steps') may differ, at its step. With `skip_damaged`,
         checkpoints after the newest whole one are moved to `damaged` beside this directory. Raises
         CheckpointError naming every other difference, or the file that is damaged.
         """
@@ -201,7 +211,9 @@ class Checkpoints:
                 f"{', '.join(sorted(saved)) or 'nothing'}, not {', '.join(sorted(self.meta))}; use a new "
                 "output directory"
             )
-        changes = [line for line in diff(self.modernise(saved), self.meta) if line.split(":")[0] not in ignore]
+        saved = self.modernise(saved)
+        free = may_change(saved, step)
+        changes = [line for line in diff(saved, self.meta) if line.split(":")[0] not in free]
         if changes:
             raise CheckpointError(
                 f"the checkpoint at {self.directory} (step {step}) was made by another "

@@ -56,11 +56,13 @@ class LoopOptions:
     checkpoint_every: int = 0  # steps
     checkpoint_minutes: float = 10.0  # since the last save: what a kill loses at most
     keep_checkpoints: int = 2  # the newest ones
+    keep_steps: tuple[int, ...] = ()  # saved after these too, and kept: others go on from there
     skip_damaged: bool = False  # go on from the newest checkpoint that is whole
     log_every: int = 10  # steps between lines of timing.jsonl
     flops_per_step: float = 0.0  # by formula, for achieved FLOP/s; 0: unknown
     peak_flops: float | None = None  # of all devices together, for MFU
-    may_change: tuple[str, ...] = ()  # fields of the description that a resumed run may change
+    # Fields of the description that may change where a run resumes: asked with what the checkpoint says, and its step.
+    may_change: Callable[[Description, int], tuple[str, ...]] = lambda saved, step: ()
     clock: Callable[[], float] = time.perf_counter  # seconds
 
 
@@ -122,7 +124,7 @@ def fit(
     with (
         locked_run(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
-            run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise
+            run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise, options.keep_steps
         ) as checkpoints,
         _stop_requests() as stop,
     ):
@@ -219,7 +221,7 @@ STOP, SAVE = 2, 1
 
 def _is_due(step: int, options: LoopOptions) -> bool:
     """Whether `step` is one to save after."""
-    return options.checkpoint_every > 0 and step % options.checkpoint_every == 0
+    return step in options.keep_steps or options.checkpoint_every > 0 and step % options.checkpoint_every == 0
 
 
 def _is_late(seconds: float, options: LoopOptions) -> bool:

@@ -8,6 +8,7 @@ them (reference appendix B.1).
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, get_args
 
 import jax
@@ -54,11 +55,27 @@ def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
     elif config.schedule == "cosine":
         after = optax.cosine_decay_schedule(peak, rest, alpha=config.final_fraction)
     else:
-        decay = max(int(steps * config.decay_fraction), 1)
+        decay = decay_steps(config, steps)
         after = optax.linear_schedule(peak, end, decay, transition_begin=max(rest - decay, 0))
     # Step 0 already moves: the ramp is (step + 1) / warmup, as in the release.
     ramp = optax.linear_schedule(peak / max(warmup, 1), peak, max(warmup - 1, 1))
     return optax.join_schedules([ramp, after], [warmup])
+
+
+def decay_steps(config: OptimizerConfig, steps: int) -> int:
+    """Steps of the decay phase of wsd."""
+    return max(int(steps * config.decay_fraction), 1)
+
+
+def steps_in_common(config: OptimizerConfig, steps: int, others: int) -> float:
+    """Up to which step a run of `steps` and one of `others` are the same: the rate does not depend on how many are to
+    come. All of them where it is constant, those before the earlier decay of wsd, none of cosine, and none where one
+    of them is shorter than the warm-up."""
+    if config.schedule == "cosine" or min(steps, others) < config.warmup_steps:  # the ramp is over by the last step
+        return 0
+    if config.schedule == "constant":
+        return math.inf
+    return min(n - decay_steps(config, n) for n in (steps, others))
 
 
 def learning_rate_multiplier(spec: ParamSpec, config: ModelConfig) -> float:

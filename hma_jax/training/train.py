@@ -23,6 +23,7 @@ from hma_jax.runtime.mesh import check_mesh, make_mesh
 from hma_jax.runtime.sharding import put_batch
 from hma_jax.training.divergence import Records
 from hma_jax.training.loop import FitResult, LoopOptions, Progress, Start, fit
+from hma_jax.training.optimizer import steps_in_common
 from hma_jax.training.runs import describe_run, modernise
 from hma_jax.training.state import init_state, state_shapes
 from hma_jax.training.step import make_train_step
@@ -75,8 +76,12 @@ def train_model(
             # Numbers lie everywhere, so that every process can read them.
             out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), NamedSharding(device_mesh, PartitionSpec())),
         )
-        # A constant rate does not depend on the number of steps: such a run may go on.
-        extendable = ("train.steps",) if config.optimizer.schedule == "constant" else ()
+
+        def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
+            """A run may go on for more steps, or fewer, from where the rate did not depend on their number."""
+            same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
+            return ("train.steps",) if step <= same else ()
+
         return fit(
             step,
             shapes,

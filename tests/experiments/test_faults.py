@@ -8,6 +8,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from data_pipelines.tokens import part_maker
 from experiments.cli.main import main
 from experiments.running import trial as trials
+from experiments.running.shared_runs import ALONE
 from experiments.running import trial_main
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
@@ -110,7 +112,7 @@ def test_a_trial_that_is_asked_to_stop_while_it_evaluates_says_so(tmp_path, monk
 
     inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
     (tmp_path / "job.json").write_text(json.dumps({"provenance": inputs}))
-    monkeypatch.setattr("experiments.running.job.read_job", lambda record: (None, None))
+    monkeypatch.setattr("experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, ALONE))
     monkeypatch.setattr(trials, "run_trial", asked)
     before = signal.getsignal(signal.SIGTERM)
     try:

@@ -11,6 +11,7 @@ import pytest
 from experiments.presets import SMOKE
 from experiments.running.former import modernise
 from experiments.running.job import read_job
+from experiments.running.shared_runs import ALONE, Shared
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
@@ -23,14 +24,17 @@ micro-batches, on a mesh of fsdp 2."""
 def test_a_job_says_the_trial_and_how_it_is_computed():
     trial, execution = reference_trial(SMOKE, 1), ExecutionConfig(dtype="bfloat16", remat="none")
     record = json.loads(json.dumps({"trial": to_dict(trial), "provenance": {}, "execution": to_dict(execution)}))
-    assert read_job(record) == (trial, execution)
+    assert read_job(record) == (trial, execution, ALONE)
+    shared = Shared((("abc", 800),), keep=(1600,))
+    assert read_job(json.loads(json.dumps(record | {"shared": to_dict(shared)})))[2] == shared
 
 
 def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_is_kept():
-    trial, execution = read_job(json.loads(OLD.read_text()))
+    trial, execution, shared = read_job(json.loads(OLD.read_text()))
     data = {"datasets": trial.datasets, "evaluated": trial.evaluated}  # robots of the suite's first edition
     assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train, **data)
     assert (trial.model.width, trial.train.steps) == (SMOKE.model.width, SMOKE.train.steps)
+    assert shared == ALONE
     assert execution == ExecutionConfig("bfloat16", "products", "auto", accumulate=2, mesh=MeshConfig(fsdp=2))
 
 

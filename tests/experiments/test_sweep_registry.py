@@ -7,7 +7,7 @@ import pytest
 
 import experiments.sweeps
 from experiments.cli.main import main
-from experiments.presets import SMOKE
+from experiments.presets import CPU_FULL
 from experiments.report.draw import draw
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.sweeps.registry import AXES, find_axis, keep_axis, plan_sweeps
@@ -25,7 +25,7 @@ def test_every_file_with_a_plan_is_registered():
 
 
 def test_every_axis_says_what_the_page_needs():
-    for axis, sweep in zip(AXES, plan_sweeps(SMOKE, AXES), strict=True):
+    for axis, sweep in zip(AXES, plan_sweeps(CPU_FULL, AXES), strict=True):
         assert sweep.name == axis and sweep.question and sweep.gain
         assert sweep.title or sweep.scaling, f"{axis} has a section of its own, without a title"
 

@@ -1,0 +1,66 @@
+"""How wide should a model be for a given amount of compute?
+
+Question: loss at equal training FLOPs for several budgets: wide models see fewer windows, narrow ones more. The
+    widths are those of the width axis, and every budget is a decay branch of the same run.
+Paper figure: none; the paper fixes the steps.
+Command: python -m experiments.sweeps.compute --preset cpu-full
+Cost: per width and seed one run of the largest budget and a branch for each smaller one; `--dry-run` prints it.
+Expected outcome: at each budget a width that is best, and a wider one at a larger budget. A best width at the end of
+    those tried is marked: the true one may lie beyond.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from experiments.program import run_sweep
+from experiments.running.trial import Trial
+from experiments.study import Study
+from experiments.sweeps.sweep import Point, Sweep, reference_trial
+
+
+def plan(study: Study) -> Sweep:
+    """Steps so that every width spends the FLOPs that the reference spends in each of `designs.compute` steps."""
+    widths = sorted({*study.widths, study.model.width})
+    flops = {width: flops_per_step(of_width(reference_trial(study, study.seeds[0]), width)) for width in widths}
+    budgets = {steps: steps * flops[study.model.width] for steps in study.designs.compute}
+    largest = max(flops.values())
+
+    def point(width: int, budget: float, seed: int) -> Point:
+        steps = max(round(budget / flops[width]), 1)
+        trial = of_width(replace(reference_trial(study, seed, steps), measure_untrained=False), width)
+        return Point(width, trial, series=f"{budget:.2g} FLOP")
+
+    points = [
+        point(width, budget, seed)
+        for budget in budgets.values()
+        if budget / largest > study.train.optimizer.warmup_steps  # a run that only warms up compares nothing
+        for width in widths
+        for seed in study.seeds
+    ]
+    return Sweep(
+        "compute",
+        "width of the trunk",
+        study.dataset_names(),
+        tuple(points),
+        question="How wide should a model be for a given amount of compute? Along a curve every model spends the same "
+        "training FLOPs: wide ones see fewer windows.",
+        gain="compute",
+        title="Equal compute",
+    )
+
+
+def of_width(trial: Trial, width: int) -> Trial:
+    return replace(trial, model=replace(trial.model, width=width))
+
+
+def flops_per_step(trial: Trial) -> float:
+    """Training FLOPs of one step by formula, with action sizes from the registry."""
+    from experiments.cost import declared_table
+    from hma_jax.model.flops import train_flops_per_window
+
+    return train_flops_per_window(trial.model, declared_table(trial.datasets, trial.rate)) * trial.train.batch
+
+
+if __name__ == "__main__":
+    run_sweep("compute")

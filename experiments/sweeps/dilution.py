@@ -1,0 +1,34 @@
+"""What do robots lose when others share their training, the work held fixed?
+
+Question: perplexity and delta PSNR on five robots, drawn anew for every seed, as others join the mixture, at a fixed
+    total number of windows: later points see less of the judged robots.
+Paper figure: 6, left, under the design that measures dilution.
+Command: python -m experiments.sweeps.dilution --preset cpu-full
+Cost: one training run per number of robots and seed, shared with `transfer`; `--dry-run` prints it.
+Expected outcome: the judged robots lose by as much as their share of the windows shrinks, less what transfers.
+"""
+
+from __future__ import annotations
+
+from experiments.program import run_sweep
+from experiments.study import Study
+from experiments.sweeps.robots import plan_robots
+from experiments.sweeps.sweep import Sweep
+
+
+def plan(study: Study) -> Sweep:
+    """Every point trains for the study's steps; all robots are the reference trial."""
+    steps = study.train.steps
+    return plan_robots(
+        study,
+        name="dilution",
+        axis="robots in the mixture, total windows fixed",
+        steps={count: steps for count in study.designs.counts},
+        question="What do robots lose when others share their training? Five robots, drawn anew for every seed, are "
+        "judged; every point sees the same number of windows in all, so that the five see fewer as others join.",
+        gain="sharing a budget",
+    )
+
+
+if __name__ == "__main__":
+    run_sweep("dilution")

@@ -1,0 +1,67 @@
+"""Which robots a design judges and which it adds, drawn anew for every seed: no result hangs on five of them.
+
+Drawn by hash of seed and name, so that nothing depends on an order and every set lies inside the larger ones.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Collection, Sequence
+from typing import Literal
+
+from experiments.study import Study
+from hma_jax.config import require
+
+Kinship = Literal["any", "siblings", "strangers"]
+
+
+def draw_judged(study: Study, seed: int) -> tuple[str, ...]:
+    """The robots that a seed judges, in the study's order. In the suite each is of another family, and none is video
+    alone: no action of such a one could be judged. Raises ConfigError if there are too few."""
+    names, families = study.dataset_names(), _families()
+    found: list[str] = []
+    for name in _drawn(names, seed):
+        if name in families and (families[name][1] or families[name][0] in {families[n][0] for n in found}):
+            continue
+        found.append(name)
+    wanted = study.designs.judged
+    require(len(found) >= wanted, f"designs.judged asks for {wanted} robots to judge; {len(found)} can be drawn")
+    return _in_order(names, found[:wanted])
+
+
+def draw_mixture(study: Study, seed: int, count: int, kinship: Kinship = "any") -> tuple[str, ...]:
+    """The judged robots of a seed and as many newcomers as make `count`, in the study's order.
+
+    `kinship`: newcomers of the judged robots' families alone, or of none of them. Raises ConfigError if there are
+    too few.
+    """
+    names, judged = study.dataset_names(), draw_judged(study, seed)
+    newcomers = [name for name in _drawn(names, seed) if name not in judged]
+    if kinship != "any":
+        families = _families()
+        missing = [name for name in names if name not in families]
+        require(not missing, f"only robots of the suite have families, and {', '.join(missing[:3])} is none of it")
+        own = {families[name][0] for name in judged}
+        newcomers = [name for name in newcomers if (families[name][0] in own) == (kinship == "siblings")]
+    added = count - len(judged)
+    require(
+        0 <= added <= len(newcomers),
+        f"{count} robots with {len(judged)} judged ones and {added} {'newcomers' if kinship == 'any' else kinship}: "
+        f"there are {len(newcomers)}",
+    )
+    return _in_order(names, {*judged, *newcomers[:added]})
+
+
+def _families() -> dict[str, tuple[str, bool]]:
+    """{robot of the suite: (its family, whether it is video alone)}."""
+    from data_pipelines.suite.embodiments import EMBODIMENTS
+
+    return {e.name: (e.family, e.video_only) for e in EMBODIMENTS}
+
+
+def _drawn(names: Sequence[str], seed: int) -> list[str]:
+    return sorted(names, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).hexdigest())
+
+
+def _in_order(names: Sequence[str], chosen: Collection[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if name in chosen)

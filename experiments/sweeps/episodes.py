@@ -1,0 +1,62 @@
+"""What does more data per robot buy, told by what is really there?
+
+Question: perplexity and delta PSNR as every robot's trajectories are capped; x is how many there are then in all,
+    the sum over robots of the smaller of cap and what it has. At fewer and at more steps: where data is scarce the
+    best number of steps is smaller, and is to be chosen on other episodes than those judged.
+Paper figure: 6, middle.
+Command: python -m experiments.sweeps.episodes --preset cpu-full
+Cost: one training run per cap and seed, with a branch for every number of steps; `--dry-run` prints it.
+Expected outcome: perplexity falls and flattens where only the largest robots still have more to give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from experiments.program import run_sweep
+from experiments.study import Study
+from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
+
+
+def plan(study: Study) -> Sweep:
+    """All robots at every point, judged on all; the last point has all trajectories."""
+    caps = (*study.designs.caps, None)
+    budgets = sorted({study.train.steps // 4, study.train.steps} - {0})
+
+    def point(seed: int, cap: int | None, steps: int) -> Point:
+        trial = reference_trial(study, seed, steps)
+        if cap is not None:
+            trial = replace(trial, max_trajectories=cap, measure_untrained=False)
+        return Point(count_episodes(study, cap), trial, series=f"{steps:,} steps")
+
+    points = [point(seed, cap, steps) for steps in budgets for cap in caps for seed in study.seeds]
+    for cap in (caps[0], None):
+        end = point(study.seeds[0], cap, budgets[-1])
+        points.append(replace(end, trial=control_of(end.trial), role=CONTROL, series=""))
+    return Sweep(
+        "episodes",
+        "training trajectories of all robots together",
+        study.dataset_names(),
+        tuple(points),
+        question="What does more data per robot buy? Every robot has at most "
+        f"{', '.join(map(str, study.designs.caps))} or all of its trajectories, the same for all curves of a seed and "
+        "each lot inside the next; x is how many there are in all. All robots weigh the same everywhere.",
+        gain="more data",
+        title="Training trajectories",
+    )
+
+
+def count_episodes(study: Study, cap: int | None) -> int:
+    """Training trajectories of all robots under a cap, as far as they are known: of the suite exactly; of others what
+    the registry says, which counts those that are held out."""
+    from data_pipelines.registry import get_spec
+    from data_pipelines.suite.embodiments import EMBODIMENTS
+    from data_pipelines.suite.generate import episode_count
+
+    simulated = {e.name: episode_count(e, study.suite.scale) for e in EMBODIMENTS}
+    there = [simulated.get(name) or get_spec(name).episodes or cap or 0 for name in study.dataset_names()]
+    return sum(n if cap is None else min(n, cap) for n in there)
+
+
+if __name__ == "__main__":
+    run_sweep("episodes")

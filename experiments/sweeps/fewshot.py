@@ -1,0 +1,61 @@
+"""How much of a new robot must a trained model see, and how many robots must it know by then?
+
+Question: perplexity and delta PSNR on robots that no model was trained on, after adapting (`hma adapt`: the new
+    robots' own parameters alone are trained) with few trajectories of each, for models that know more and more
+    robots, against a new model trained on the same trajectories.
+Paper figure: 7, in spirit.
+Command: python -m experiments.sweeps.fewshot --preset cpu-full
+Cost: one short training run per point, curve and seed, after those of `dilution`; `--dry-run` prints it.
+Expected outcome: adapting is ahead of scratch with few trajectories, more so after more robots.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from experiments.program import run_sweep
+from experiments.running.trial import Trial
+from experiments.study import Study
+from experiments.sweeps.robots import robots_trial
+from experiments.sweeps.sweep import Point, Sweep, reference_trial
+from hma_jax.config import require
+
+
+def plan(study: Study) -> Sweep:
+    """Every model adapts to all unseen robots at once. Raises ConfigError for a study without any."""
+    designs, unseen = study.designs, study.unseen
+    require(bool(unseen), "the axis fewshot needs robots to adapt to; name them with --set unseen=...")
+
+    def trial(seed: int, shots: int, source: Trial | None) -> Trial:
+        fresh = reference_trial(study, seed, designs.shots_steps)
+        train = replace(fresh.train, only=unseen if source else ())
+        return replace(
+            fresh, datasets=unseen, evaluated=unseen, max_trajectories=shots, train=train, source=source,
+            measure_untrained=False,
+        )  # fmt: skip
+
+    def source(seed: int, known: int) -> Trial:
+        return robots_trial(study, seed, known, study.train.steps)
+
+    points = [Point(n, trial(s, n, None), series="from scratch") for n in designs.shots for s in study.seeds]
+    points += [
+        Point(n, trial(s, n, source(s, known)), series=f"after {known} robots")
+        for known in designs.shots_after
+        for n in designs.shots
+        for s in study.seeds
+    ]
+    return Sweep(
+        "fewshot",
+        "trajectories of each new robot",
+        unseen,
+        tuple(points),
+        question=f"How much of a new robot must a trained model see? Judged on {len(unseen)} robots that no model was "
+        f"trained on, after {designs.shots_steps:,} steps in which their own parameters alone are trained; from "
+        "scratch, everything is.",
+        gain="knowing other robots",
+        title="New robots from few trajectories",
+    )
+
+
+if __name__ == "__main__":
+    run_sweep("fewshot")

@@ -1,0 +1,51 @@
+"""Does the best learning rate stay where it is as training gets longer?
+
+Question: held-out loss over learning rates at the shortest and at the longest number of steps. muP carries a rate
+    over width; nothing carries it over the horizon.
+Paper figure: none.
+Command: python -m experiments.sweeps.lr_horizon --preset cpu-full
+Cost: one run per further rate and seed, with a branch at the fewest steps; `--dry-run` prints it.
+Expected outcome: the best rate falls as training gets longer, by less than the grid's step or it is said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from experiments.program import run_sweep
+from experiments.running.trial import Trial
+from experiments.study import Study
+from experiments.sweeps.sweep import Point, Sweep, reference_trial
+
+
+def plan(study: Study) -> Sweep:
+    """The reference trial at other rates, the study's own among them."""
+    rate = study.train.optimizer.learning_rate
+    shortest, longest = study.designs.budgets[0], study.train.steps
+
+    def trial(factor: float, steps: int, seed: int) -> Trial:
+        whole = reference_trial(study, seed, steps)
+        optimizer = replace(whole.train.optimizer, learning_rate=rate * factor)
+        untrained = whole.measure_untrained and factor == 1
+        return replace(whole, train=replace(whole.train, optimizer=optimizer), measure_untrained=untrained)
+
+    return Sweep(
+        "lr_horizon",
+        "learning rate",
+        study.dataset_names(),
+        tuple(
+            Point(rate * factor, trial(factor, steps, seed), series=f"{steps:,} steps")
+            for steps in (shortest, longest)
+            for factor in study.designs.rate_factors
+            for seed in study.seeds
+        ),
+        question="Does the best learning rate stay where it is as training gets longer? muP carries a rate over width, "
+        "nothing over the horizon.",
+        gain="its learning rate",
+        title="Learning rate and horizon",
+        base=f"{longest:,} steps",
+    )
+
+
+if __name__ == "__main__":
+    run_sweep("lr_horizon")

@@ -1,0 +1,44 @@
+"""A run that begins where another one was: what both have in common is trained once.
+
+With the schedule wsd, runs that differ in their number of steps alone are the same until the earlier one decays
+(`optimizer.steps_in_common`). A run that continues from there leaves the same bytes as one that was trained from its
+first step, for an optimiser step depends on the state and the step's number and on nothing else.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+from hma_jax.training.reading import list_steps
+
+CHECKPOINTS = "checkpoints"
+LOGS = ("metrics.jsonl", "validation.jsonl", "timing.jsonl")
+"""Cut after the step from which a run goes on when it starts (`log.RunLog`)."""
+
+
+def last_step(run_dir: Path, latest: int) -> int:
+    """The last step up to `latest` of which a run has a checkpoint; 0 without one."""
+    return max((step for step in list_steps(run_dir / CHECKPOINTS) if step <= latest), default=0)
+
+
+def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
+    """Puts into `run_dir` the last checkpoint of `source` up to step `latest`, and what was logged until then.
+
+    Returns its step; None, and nothing is done, without one, or if `run_dir` has a checkpoint of its own. The
+    checkpoint appears whole or not at all. Whether the two runs agree is checked when it is restored. Raises OSError.
+    """
+    step = last_step(source, latest)
+    if not step or list_steps(run_dir / CHECKPOINTS):
+        return None
+    place = run_dir / CHECKPOINTS / str(step)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    for name in LOGS:
+        if (source / name).exists():
+            shutil.copyfile(source / name, run_dir / name)
+    aside = run_dir / f".{step}.copied"
+    shutil.rmtree(aside, ignore_errors=True)  # of a copy that was cut short
+    shutil.copytree(source / CHECKPOINTS / str(step), aside)
+    os.replace(aside, place)
+    return step

@@ -1,0 +1,108 @@
+"""Trials that share the beginning of their training, and those that go on from another trial."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.presets import CPU_FULL, SMOKE
+from experiments.run_study import make_jobs
+from experiments.running.attempts import RUN
+from experiments.running.runner import Job
+from experiments.running.shared_runs import begin_shared, share_runs
+from experiments.running.trial import trial_id
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.test_runner import events, job, run
+
+SMOKE_ID = "61000971fddf9d6d"
+STEPS = (100, 200, 400)
+WSD = replace(CPU_FULL.train.optimizer, warmup_steps=10)
+
+
+def trial(steps: int, **changes):
+    train = replace(CPU_FULL.train, steps=steps, optimizer=WSD)
+    return replace(reference_trial(replace(CPU_FULL, train=train), 0), **changes)
+
+
+def test_trials_that_differ_in_steps_or_judging_alone_share_their_run():
+    trials = {f"{n}": trial(n) for n in STEPS}
+    trials["judged on five"] = trial(200, evaluated=CPU_FULL.dataset_names()[:5])
+    trials["another seed"] = replace(trial(200), train=replace(trial(200).train, seed=1))
+    trials["control"] = control_of(trial(400))
+    shared = share_runs(trials)
+    assert shared["100"].before == () and shared["100"].keep == (80,)
+    assert shared["200"].before == (("100", 80),) and shared["200"].keep == (160,)
+    assert shared["judged on five"].before == (("100", 80), ("200", 160))
+    assert dict(shared["400"].before) == {"100": 80, "200": 160, "judged on five": 160} and shared["400"].keep == ()
+    for alone in ("another seed", "control"):
+        assert shared[alone].before == () and shared[alone].keep == ()
+
+
+def test_cosine_shares_nothing():
+    cosine = replace(WSD, schedule="cosine")
+    trials = {f"{n}": replace(trial(n), train=replace(trial(n).train, optimizer=cosine)) for n in STEPS}
+    assert all(s.before == () and s.keep == () for s in share_runs(trials).values())
+
+
+def checkpoint(trials: Path, id: str, *steps: int) -> None:
+    for step in steps:
+        (trials / id / RUN / "checkpoints" / str(step)).mkdir(parents=True)
+        (trials / id / RUN / "metrics.jsonl").write_text("{}\n")
+
+
+def test_a_trial_begins_at_the_latest_step_that_it_has_in_common(tmp_path):
+    checkpoint(tmp_path, "100", 80, 100)
+    checkpoint(tmp_path, "200", 160, 200)
+    before = (("100", 80), ("200", 160), ("300", 240))
+    assert begin_shared(tmp_path / "400", before) == ("200", 160)
+    assert (tmp_path / "400" / RUN / "checkpoints/160").is_dir()
+    assert begin_shared(tmp_path / "400", before) is None, "it has begun"
+    assert begin_shared(tmp_path / "other", (("300", 240),)) is None
+    assert begin_shared(tmp_path / "other", (("100", 70),)) is None, "its checkpoints are of the decay"
+
+
+def test_a_job_waits_for_those_that_it_goes_on_from(tmp_path):
+    """Beside others that do not: it is listed first, and its place is given to one that is ready."""
+    jobs = [Job("c", "c", job("c").record, after=frozenset("ab")), job("a"), job("b", "crash"), job("d")]
+    states = run(tmp_path, jobs, workers=2)
+    assert {id: s.event for id, s in states.items()} == {"a": "finished", "b": "failed", "c": "finished", "d": "finished"}
+    lines = [json.loads(line) for line in (tmp_path / "ledger.jsonl").read_text().splitlines()]
+    began = next(i for i, line in enumerate(lines) if line["trial"] == "c")
+    ended = [i for i, line in enumerate(lines) if line["trial"] in "ab" and line["event"] != "running"]
+    assert len(ended) == 2 and began > max(ended) and events(tmp_path, "c")[0] == "running"
+
+
+def test_jobs_of_the_designs_wait_for_their_sources_and_siblings():
+    sweeps = plan_sweeps(CPU_FULL, ("fewshot", "horizon"))
+    trials = unique_trials(sweeps, PROVENANCE)
+    jobs = {j.id: j for j in make_jobs(trials, titles(sweeps, PROVENANCE), PROVENANCE, {})}
+    adapted = {id: t for id, t in trials.items() if t.source}
+    assert len(adapted) == 27
+    for id, one in adapted.items():
+        assert trial_id(one.source, PROVENANCE) in jobs[id].after
+    longest = trial_id(reference_trial(CPU_FULL, 0, 64_000), PROVENANCE)
+    assert len(jobs[longest].after) == 6  # 1,000 to 32,000 steps
+    assert len({j.title for j in jobs.values()}) == len(jobs)
+
+
+def test_fields_that_came_later_do_not_change_the_name_of_a_trial():
+    """The id of the smoke study's reference trial before there were `capped` and `source`."""
+    plain = reference_trial(replace(SMOKE, datasets=("arm", "rover", "pusher")), 0)
+    assert trial_id(plain, PROVENANCE) == SMOKE_ID
+    assert trial_id(replace(plain, capped=("arm",)), PROVENANCE) != trial_id(plain, PROVENANCE)
+    source = replace(plain, source=plain)
+    assert trial_id(source, PROVENANCE) not in (trial_id(plain, PROVENANCE), SMOKE_ID)
+
+
+@pytest.mark.parametrize("seed", CPU_FULL.seeds)
+def test_a_trial_reads_back_from_its_record_with_its_source(seed):
+    from experiments.running.trial import Trial
+    from hma_jax.config.json import from_dict, to_dict
+
+    for one in unique_trials(plan_sweeps(replace(CPU_FULL, seeds=(seed,)), ("fewshot", "newcomers")), PROVENANCE).values():
+        assert from_dict(Trial, json.loads(json.dumps(to_dict(one)))) == one
