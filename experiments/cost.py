@@ -2,22 +2,27 @@
 
 Needs no data and no device: action sizes come from the registry, parameter counts from the declared
 model without making an array. Rates and times are those of the preset's machine (`Study.flops_per_second`,
-`Study.trial_seconds`); what is made before the first trial is not estimated.
+`Study.trial_seconds`). What trials have in common is counted once; what is made before the first one is estimated in
+`preparing_cost`.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from experiments.preparing_cost import describe, estimate_preparing
 from experiments.progress import tidy_table
 from experiments.running.provenance import Provenance
+from experiments.running.shared_runs import share_runs
 from experiments.running.trial import Trial, trial_id
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
+from hma_jax.config import ModelConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 if TYPE_CHECKING:
@@ -39,11 +44,44 @@ class Cost:
         return self.train_flops + self.evaluation_flops
 
 
+ONE_ROBOT = EmbodimentTable((Embodiment("one_robot", 2, 1, mean=(0.0, 0.0), std=(1.0, 1.0)),))
+
+
+def estimate(trial: Trial) -> Cost:
+    """The cost of one trial, by formula (`hma_jax.model.flops`, `hma_jax.generation.flops`)."""
+    from hma_jax.model.flops import train_flops_per_window
+
+    names = trial.datasets if trial.source is None else (*trial.source.datasets, *trial.datasets)
+    table, config = declared_table(names, trial.rate), trial.eval
+    windows = len(trial.evaluated) * config.windows_per_dataset
+    batches = -(-windows // config.batch)  # the last one is filled up
+    if trial.measure_untrained:
+        batches += -(-len(trial.evaluated) * min(config.batch, config.windows_per_dataset) // config.batch)
+    return Cost(
+        parameters=_count_parameters(trial.model, table),
+        parameters_one_robot=_count_parameters(trial.model, ONE_ROBOT),
+        train_flops=train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
+        evaluation_flops=batches * config.batch * evaluation_flops_per_window(trial, table),
+    )
+
+
+@functools.cache
+def _count_parameters(model: ModelConfig, table: EmbodimentTable) -> int:
+    from hma_jax.model.hma import declare_model
+
+    return declare_model(model, table).count()
+
+
 def declared_table(names: Sequence[str], rate: float | None = 2.0) -> EmbodimentTable:
     """Embodiments with the right action sizes and no statistics.
 
     Raises ConfigError for a name that the registry does not know.
     """
+    return _declare(tuple(names), rate)
+
+
+@functools.cache
+def _declare(names: tuple[str, ...], rate: float | None) -> EmbodimentTable:
     from data_pipelines.registry import get_spec
 
     def entry(spec: DatasetSpec) -> Embodiment:
@@ -51,27 +89,6 @@ def declared_table(names: Sequence[str], rate: float | None = 2.0) -> Embodiment
         return Embodiment(spec.name, dim, spec.stride_at(rate), mean=(0.0,) * dim, std=(1.0,) * dim)
 
     return EmbodimentTable(tuple(entry(get_spec(name)) for name in names))
-
-
-ONE_ROBOT = EmbodimentTable((Embodiment("one_robot", 2, 1, mean=(0.0, 0.0), std=(1.0, 1.0)),))
-
-
-def estimate(trial: Trial) -> Cost:
-    """The cost of one trial, by formula (`hma_jax.model.flops`, `hma_jax.generation.flops`)."""
-    from hma_jax.model.flops import train_flops_per_window
-    from hma_jax.model.hma import declare_model
-
-    table, config = declared_table(trial.datasets, trial.rate), trial.eval
-    windows = len(trial.evaluated) * config.windows_per_dataset
-    batches = -(-windows // config.batch)  # the last one is filled up
-    if trial.measure_untrained:
-        batches += -(-len(trial.evaluated) * min(config.batch, config.windows_per_dataset) // config.batch)
-    return Cost(
-        parameters=declare_model(trial.model, table).count(),
-        parameters_one_robot=declare_model(trial.model, ONE_ROBOT).count(),
-        train_flops=train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
-        evaluation_flops=batches * config.batch * evaluation_flops_per_window(trial, table),
-    )
 
 
 def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
@@ -97,51 +114,86 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
     return flops
 
 
-def plan_table(study: Study, sweeps: Sequence[Sweep]) -> Table:
-    """Every trial once, with the axes it belongs to, its size and its cost."""
+@dataclass(frozen=True)
+class TrialPlan:
+    """What one trial of a study will take, after those that it shares the beginning of its training with."""
+
+    trial: Trial
+    cost: Cost
+    flops: float  # that it has to itself
+    seconds: float
+
+
+def plan_trials(study: Study, sweeps: Sequence[Sweep]) -> dict[str, TrialPlan]:
+    """Every trial of `sweeps` by id."""
     trials = unique_trials(sweeps, UNKNOWN)
-    costs = {id: estimate(trial) for id, trial in trials.items()}
-    total = sum(c.flops for c in costs.values())
+    shared = share_runs(trials)
+    plans = {}
+    for id, trial in trials.items():
+        cost = estimate(trial)
+        begun = max((step for _, step in shared[id].before), default=0) / trial.train.steps
+        flops = cost.flops - begun * cost.train_flops
+        plans[id] = TrialPlan(trial, cost, flops, flops / study.flops_per_second + study.trial_seconds)
+    return plans
+
+
+def plan_table(study: Study, sweeps: Sequence[Sweep], given: bool = False, trained: bool = True, workers: int = 1) -> Table:
+    """Every trial once, with the axes it belongs to, its size and its cost. `given`: the user has the data, `trained`:
+    the tokenizer is trained here, `workers`: so many trials at a time."""
+    plans = plan_trials(study, sweeps)
+    several = len({plan.trial.train.steps for plan in plans.values()}) > 1
     budget = f"{all_steps(sweeps)} steps x batch {study.train.batch}"
     table = tidy_table(
-        f"Study '{study.name}': {len(trials)} trials of {budget}",
-        "trial", "sets", "videos", "width", "params", "one robot", "FLOPs", "time",
+        f"Study '{study.name}': {len(plans)} trials of {budget}",
+        "trial", "sets", "videos", "width", *["steps"] * several, "params", "one robot", "FLOPs", "time",
     )  # fmt: skip
-    seconds = {id: c.flops / study.flops_per_second + study.trial_seconds for id, c in costs.items()}
-    table.caption = (
-        f"About {_duration(sum(seconds.values()))} for the trials, one after the other: {_flops(total)} at "
-        f"{_flops(study.flops_per_second)}/s (flops_per_second), and {study.trial_seconds:g} s for each to start, "
-        "compile and write (trial_seconds). Not counted: simulating, tokenizer and tokens, before the first of them. "
-        "'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are per dataset. "
-        "'Control': trained on shuffled actions."
-    )
-    seeds = {trial.train.seed for trial in trials.values()}
+    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
+    table.caption = _caption(study, list(plans.values()), given, trained, workers)
+    seeds = {p.trial.train.seed for p in plans.values()}
     shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in seeds}
-    for id, trial in trials.items():
-        cost = costs[id]
+    axes = _axes(sweeps)
+    for id, plan in plans.items():
+        trial, cost = plan.trial, plan.cost
         seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
         table.add_row(
-            ("reference" if id in shared else _axes_of(id, sweeps)) + seed,
+            ("reference" if id in shared else axes.get(id, "source")) + seed,
             f"{len(trial.datasets)}",
             "all" if trial.max_trajectories is None else _short_count(trial.max_trajectories),
             f"{trial.model.width}",
+            *[f"{trial.train.steps:,}"] * several,
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
-            _flops(cost.flops).removesuffix("FLOP"),
-            _duration(seconds[id]),
+            _flops(plan.flops).removesuffix("FLOP"),
+            _duration(plan.seconds),
         )
     return table
 
 
-def _axes_of(id: str, sweeps: Sequence[Sweep]) -> str:
-    """What a trial is: the control, a variant, or a point of one axis or several."""
-    names: dict[str, str] = {}
+def _caption(study: Study, plans: Sequence[TrialPlan], given: bool, trained: bool, workers: int) -> str:
+    """What it all comes to, and of what."""
+    trials, flops = sum(p.seconds for p in plans), sum(p.flops for p in plans)
+    before = estimate_preparing(study, simulated=not given, trained=trained)
+    alone = max(p.seconds for p in plans)
+    spent = max(trials / workers, alone)
+    at_once = "one after the other" if workers == 1 else f"{workers} at a time"
+    return (
+        f"About {_duration(before.seconds + spent)} in all: {_duration(before.seconds)} to prepare "
+        f"({describe(before, _duration)}) and {_duration(spent)} for the trials, {at_once}: {_flops(flops)} at "
+        f"{_flops(study.flops_per_second)}/s (flops_per_second) to train and to evaluate, sampler steps included, and "
+        f"{study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). What trials have in "
+        "common is counted once. 'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are "
+        "per dataset. 'Control': trained on shuffled actions."
+    )
+
+
+def _axes(sweeps: Sequence[Sweep]) -> dict[str, str]:
+    """What every trial is, by id: the control, a variant, or a point of one axis or several."""
+    names: dict[str, dict[str, str]] = {}
     for sweep in sweeps:
         for point in sweep.points:
-            if trial_id(point.trial, UNKNOWN) == id:
-                own = "control" if point.role == CONTROL else sweep.remark(point) or sweep.name
-                names.setdefault(sweep.name, own)
-    return " + ".join(dict.fromkeys(names.values()))
+            own = "control" if point.role == CONTROL else sweep.remark(point) or sweep.name
+            names.setdefault(trial_id(point.trial, UNKNOWN), {}).setdefault(sweep.name, own)
+    return {id: " + ".join(dict.fromkeys(own.values())) for id, own in names.items()}
 
 
 def _count(parameters: int) -> str:

@@ -76,7 +76,9 @@ def _run(
     if running.dry_run:
         from experiments.cost import plan_table
 
-        console.print(plan_table(setting.study, plan_sweeps(setting.study, axes)))
+        sweeps, workers = plan_sweeps(setting.study, axes), running.workers or 1
+        trained = setting.tokenizer is None
+        console.print(plan_table(setting.study, sweeps, bool(setting.data), trained, workers))
         return
     from experiments.run_study import run_study
 

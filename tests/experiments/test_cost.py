@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from experiments.cli.main import main
-from experiments.cost import estimate, evaluation_flops_per_window
+from experiments.cost import estimate, evaluation_flops_per_window, plan_trials
+from experiments.preparing_cost import estimate_preparing
 from experiments.presets import SMOKE, SMOKE_CONTINUOUS
-from experiments.sweeps.sweep import reference_trial
+from experiments.sweeps.registry import find_axis
+from experiments.sweeps.sweep import POINT, reference_trial
 from hma_jax.config import EvalConfig, ExecutionConfig, MaskingConfig
 from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model
@@ -63,9 +65,39 @@ def test_samplers_of_latents_are_paid_for_step_by_step():
     assert flops(100) > 3 * flops(10)  # the rest is the trunk's
 
 
-def test_the_plan_says_what_it_counts_and_what_not(capsys):
-    assert main(["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=60"]) == 0
+def test_the_plan_says_what_it_counts(capsys):
+    plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=60"]
+    assert main(plan) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert "About 5.0 min for the trials, one after the other" in said
-    assert "60 s for each to start, compile and write" in said
-    assert "Not counted: simulating, tokenizer and tokens" in said
+    assert "5.0 min for the trials, one after the other" in said
+    assert "60 s for each to start, compile, decode and write" in said
+    assert "to prepare (simulating " in said and "the tokenizer " in said and "tokens " in said
+    assert main([*plan, "--workers", "2"]) == 0
+    assert "2.5 min for the trials, 2 at a time" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_prepared_is_paid_for():
+    """The tokenizer by its steps, tokens by the frames that are kept, what is given not at all."""
+    whole = estimate_preparing(SMOKE)
+    longer = estimate_preparing(replace(SMOKE, tokenizer_train=replace(SMOKE.tokenizer_train, steps=300)))
+    assert longer.tokenizer > 2 * whole.tokenizer and longer.tokens == whole.tokens
+    larger = estimate_preparing(replace(SMOKE, suite=replace(SMOKE.suite, scale=1.0)))
+    assert larger.simulating > 2 * whole.simulating and larger.tokens > 2 * whole.tokens
+    native = estimate_preparing(replace(SMOKE, rate=None))
+    assert native.tokens > 2 * whole.tokens and native.simulating == whole.simulating
+    given = estimate_preparing(SMOKE, simulated=False, trained=False)
+    assert given.simulating == given.tokenizer == 0 < given.tokens
+    assert estimate_preparing(replace(SMOKE, unseen=("omni_mint",))).simulating > whole.simulating
+
+
+def test_what_trials_have_in_common_is_paid_for_once():
+    """Of two numbers of steps the longer one pays for what comes after the common part."""
+    optimizer = replace(SMOKE.train.optimizer, schedule="wsd")
+    study = replace(SMOKE, train=replace(SMOKE.train, steps=1000, optimizer=optimizer),
+                    designs=replace(SMOKE.designs, budgets=(500, 1000)))  # fmt: skip
+    sweep = find_axis("horizon")(study)
+    points = tuple(p for p in sweep.points if p.role == POINT)
+    plans = {p.trial.train.steps: p for p in plan_trials(study, [replace(sweep, points=points)]).values()}
+    per_step = plans[500].cost.train_flops / 500
+    own = {steps: plan.flops - plan.cost.evaluation_flops for steps, plan in plans.items()}
+    assert own[500] == pytest.approx(500 * per_step) and own[1000] == pytest.approx((1000 - 400) * per_step)

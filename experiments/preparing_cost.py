@@ -1,0 +1,116 @@
+"""What is made before the first trial of a study will cost: simulating, the tokenizer, tokens, and starting up.
+
+By formula and by what was measured on one core of the machine that the `cpu` preset is meant for; nothing is made and
+no data is read. What the registry does not say of a dataset (episodes, length) is not counted, and named.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from experiments.study import Study
+from hma_jax.config import TokenizerConfig
+
+SIMULATED = 3000.0
+"""Native frames of the suite that a core simulates, draws and writes in a second."""
+DECODED = 1500.0
+"""Frames that a core reads, decodes and resizes in a second, on the way to the tokenizer."""
+QUALITY_FRAMES = 1024
+START = 30.0
+"""Seconds of importing and compiling, of the whole preparation."""
+
+
+@dataclass(frozen=True)
+class PreparingCost:
+    """Seconds of one core, or of the accelerator for what the tokenizer computes."""
+
+    simulating: float = 0.0
+    tokenizer: float = 0.0
+    tokens: float = 0.0
+    unknown: tuple[str, ...] = field(default=())  # datasets of which nobody says how many frames they have
+
+    @property
+    def seconds(self) -> float:
+        return START + self.simulating + self.tokenizer + self.tokens
+
+
+@dataclass(frozen=True)
+class Frames:
+    native: float
+    kept: float  # at the study's rate
+
+
+def estimate_preparing(study: Study, simulated: bool = True, trained: bool = True) -> PreparingCost:
+    """`simulated`: the suite is made, no data is given. `trained`: the tokenizer is trained, none is given."""
+    counts = {name: count_frames(study, name) for name in study.all_names()}
+    known = [frames for frames in counts.values() if frames]
+    kept = sum(frames.kept for frames in known)
+    encode, step = tokenizer_flops(study)
+    rate, train = study.flops_per_second, study.tokenizer_train
+    training = train.steps * train.batch * (step / rate + 1 / DECODED)
+    return PreparingCost(
+        simulating=sum(frames.native for frames in known) / SIMULATED if simulated else 0.0,
+        tokenizer=training + QUALITY_FRAMES * step / 3 / rate if trained and step else 0.0,
+        tokens=kept * (encode / rate + 1 / DECODED),
+        unknown=tuple(name for name, frames in counts.items() if frames is None),
+    )
+
+
+def count_frames(study: Study, name: str) -> Frames | None:
+    """Of all episodes of a dataset, held-out ones included; None where the registry does not say it."""
+    from data_pipelines.registry import get_spec
+    from data_pipelines.suite.embodiments import EMBODIMENTS
+    from data_pipelines.suite.generate import episode_count
+
+    spec = get_spec(name)
+    robot = next((e for e in EMBODIMENTS if e.name == name), None)
+    if robot is not None:
+        low, high = robot.seconds
+        seconds = (high - low) / math.log(high / low) if high > low else low  # lengths are uniform in the logarithm
+        native = (episode_count(robot, study.suite.scale) + study.suite.validation) * seconds * robot.hz
+    elif spec.episodes and (spec.median_steps or spec.mean_steps):
+        native = spec.episodes * (spec.mean_steps or spec.median_steps)
+    else:
+        return None
+    every = study.store.frame_step or spec.stride_at(study.rate)
+    return Frames(native, native / every)
+
+
+def tokenizer_flops(study: Study) -> tuple[float, float]:
+    """(to encode an image, to train on one) by counting matrix products; 0 for a tokenizer that is not declared here,
+    whose time is then that of reading frames alone."""
+    import jax
+    import jax.numpy as jnp
+
+    from hma_jax.diagnostics.products import count_products, total_flops
+    from hma_jax.tokenizers.autoencoder import declare_tokenizer
+    from hma_jax.tokenizers.network import from_pixels
+    from hma_jax.tokenizers.train import tokenizer_loss
+
+    config = study.tokenizer
+    if not isinstance(config, TokenizerConfig):
+        return 0.0, 0.0
+    declared = declare_tokenizer(config)
+    image = jax.ShapeDtypeStruct((1, config.image_size, config.image_size, 3), jnp.uint8)
+    key = jax.eval_shape(lambda: jax.random.key(0))
+
+    def encode(params, images):
+        return declared.merge(params).encoder(from_pixels(images))
+
+    def train(params, images, key):
+        return jax.grad(lambda p: tokenizer_loss(declared, p, images, config, key)[0])(params)
+
+    shapes = declared.shapes()
+    return total_flops(count_products(encode, shapes, image)), total_flops(count_products(train, shapes, image, key))
+
+
+def describe(cost: PreparingCost, duration: Callable[[float], str]) -> str:
+    """In words; `duration` writes seconds."""
+    parts = {"simulating": cost.simulating, "the tokenizer": cost.tokenizer, "tokens": cost.tokens}
+    said = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds)
+    unknown = f"; not counted, for the registry does not say their frames: {len(cost.unknown)} datasets" if cost.unknown else ""
+    return said + unknown
+
+
