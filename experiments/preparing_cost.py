@@ -13,10 +13,13 @@ from dataclasses import dataclass, field
 from experiments.study import Study
 from hma_jax.config import TokenizerConfig
 
-SIMULATED = 3000.0
+SIMULATED = 1500.0
 """Native frames of the suite that a core simulates, draws and writes in a second."""
 DECODED = 1500.0
 """Frames that a core reads, decodes and resizes in a second, on the way to the tokenizer."""
+LARGE_PRODUCTS = 3.0
+"""How many times the FLOPs of a small world model a tokenizer computes in a second: its products are larger, and it
+has all cores."""
 QUALITY_FRAMES = 1024
 START = 30.0
 """Seconds of importing and compiling, of the whole preparation."""
@@ -40,6 +43,7 @@ class PreparingCost:
 class Frames:
     native: float
     kept: float  # at the study's rate
+    simulated: bool
 
 
 def estimate_preparing(study: Study, simulated: bool = True, trained: bool = True) -> PreparingCost:
@@ -47,11 +51,11 @@ def estimate_preparing(study: Study, simulated: bool = True, trained: bool = Tru
     counts = {name: count_frames(study, name) for name in study.all_names()}
     known = [frames for frames in counts.values() if frames]
     kept = sum(frames.kept for frames in known)
-    encode, step = tokenizer_flops(study)
+    encode, step = (flops / LARGE_PRODUCTS for flops in tokenizer_flops(study))
     rate, train = study.flops_per_second, study.tokenizer_train
     training = train.steps * train.batch * (step / rate + 1 / DECODED)
     return PreparingCost(
-        simulating=sum(frames.native for frames in known) / SIMULATED if simulated else 0.0,
+        simulating=sum(frames.native for frames in known if frames.simulated) / SIMULATED if simulated else 0.0,
         tokenizer=training + QUALITY_FRAMES * step / 3 / rate if trained and step else 0.0,
         tokens=kept * (encode / rate + 1 / DECODED),
         unknown=tuple(name for name, frames in counts.items() if frames is None),
@@ -75,7 +79,7 @@ def count_frames(study: Study, name: str) -> Frames | None:
     else:
         return None
     every = study.store.frame_step or spec.stride_at(study.rate)
-    return Frames(native, native / every)
+    return Frames(native, native / every, robot is not None)
 
 
 def tokenizer_flops(study: Study) -> tuple[float, float]:

@@ -123,7 +123,7 @@ class Study:
     model: ModelConfig
     train: TrainConfig
     eval: EvalConfig
-    dataset_counts: tuple[int, ...]
+    dataset_counts: tuple[int, ...]  # the first of them is of the robots that the axis is judged on
     trajectory_counts: tuple[int, ...]  # per dataset
     widths: tuple[int, ...]  # of the width axis, which has the reference trial's as well
     tokenizer: AnyTokenizerConfig = field(default_factory=TokenizerConfig)
@@ -144,6 +144,7 @@ class Study:
     transfer: TransferConfig = field(default_factory=TransferConfig)
     designs: DesignConfig = field(default_factory=DesignConfig)
     axes: tuple[str, ...] = ("datasets", "trajectories", "width")  # what `hma study` runs
+    judged: Literal["first", "drawn"] = "first"  # on the datasets axis: the first datasets, or random ones per seed
     unseen: tuple[str, ...] = ()  # robots that no model is trained on but to adapt to them
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)  # how trials are computed; names none
     flops_per_second: float = 1e13  # sustained; as the next only for the estimates of --dry-run

@@ -15,8 +15,8 @@ from hma_jax.config import require
 Kinship = Literal["any", "siblings", "strangers"]
 
 
-def draw_judged(study: Study, seed: int) -> tuple[str, ...]:
-    """The robots that a seed judges, in the study's order. In the suite each is of another family, and none is video
+def draw_judged(study: Study, seed: int, count: int | None = None) -> tuple[str, ...]:
+    """The robots that a seed judges, `designs.judged` or as many as given, in the study's order. In the suite each is of another family, and none is video
     alone: no action of such a one could be judged. Raises ConfigError if there are too few."""
     names, families = study.dataset_names(), _families()
     found: list[str] = []
@@ -24,32 +24,34 @@ def draw_judged(study: Study, seed: int) -> tuple[str, ...]:
         if name in families and (families[name][1] or families[name][0] in {families[n][0] for n in found}):
             continue
         found.append(name)
-    wanted = study.designs.judged
-    require(len(found) >= wanted, f"designs.judged asks for {wanted} robots to judge; {len(found)} can be drawn")
+    wanted = study.designs.judged if count is None else count
+    require(len(found) >= wanted, f"{wanted} robots are to be judged, each of another family; {len(found)} can be drawn")
     return _in_order(names, found[:wanted])
 
 
-def draw_mixture(study: Study, seed: int, count: int, kinship: Kinship = "any") -> tuple[str, ...]:
+def draw_mixture(
+    study: Study, seed: int, count: int, kinship: Kinship = "any", judged: int | None = None
+) -> tuple[str, ...]:
     """The judged robots of a seed and as many newcomers as make `count`, in the study's order.
 
     `kinship`: newcomers of the judged robots' families alone, or of none of them. Raises ConfigError if there are
     too few.
     """
-    names, judged = study.dataset_names(), draw_judged(study, seed)
-    newcomers = [name for name in _drawn(names, seed) if name not in judged]
+    names, own = study.dataset_names(), draw_judged(study, seed, judged)
+    newcomers = [name for name in _drawn(names, seed) if name not in own]
     if kinship != "any":
         families = _families()
         missing = [name for name in names if name not in families]
         require(not missing, f"only robots of the suite have families, and {', '.join(missing[:3])} is none of it")
-        own = {families[name][0] for name in judged}
-        newcomers = [name for name in newcomers if (families[name][0] in own) == (kinship == "siblings")]
-    added = count - len(judged)
+        kin = {families[name][0] for name in own}
+        newcomers = [name for name in newcomers if (families[name][0] in kin) == (kinship == "siblings")]
+    added = count - len(own)
     require(
         0 <= added <= len(newcomers),
-        f"{count} robots with {len(judged)} judged ones and {added} {'newcomers' if kinship == 'any' else kinship}: "
+        f"{count} robots with {len(own)} judged ones and {added} {'newcomers' if kinship == 'any' else kinship}: "
         f"there are {len(newcomers)}",
     )
-    return _in_order(names, {*judged, *newcomers[:added]})
+    return _in_order(names, {*own, *newcomers[:added]})
 
 
 def _families() -> dict[str, tuple[str, bool]]:

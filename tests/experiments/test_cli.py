@@ -92,7 +92,7 @@ def test_debug_shows_the_traceback(tmp_path):
 def test_paper_plan_prints_the_papers_sizes(capsys):
     assert main(["sweep", "width", "--preset", "paper", "--dry-run"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    for width, size in (("256", "43.6"), ("1024", "678.7")):
+    for width, size in (("64", "3.0"), ("256", "43.6"), ("768", "383.0")):
         assert any(width in words and size in words for words in lines)
 
 

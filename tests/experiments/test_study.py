@@ -199,7 +199,7 @@ def test_command_line_offers_every_preset():
 
 
 def test_unknown_preset_lists_the_known():
-    with pytest.raises(ConfigError, match="smoke, cpu, accelerator, paper"):
+    with pytest.raises(ConfigError, match="smoke, cpu, cpu-full, accelerator, paper"):
         get_preset("gpu")
 
 

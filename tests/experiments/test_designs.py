@@ -1,0 +1,130 @@
+"""The designs of `cpu-full`: what they hold fixed, whom they judge, what they share, and that they fit."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+
+from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
+from experiments.cost import plan_trials
+from experiments.preparing_cost import estimate_preparing
+from experiments.presets import CPU_FULL, PAPER
+from experiments.sweeps.draws import draw_judged, draw_mixture
+from experiments.sweeps.episodes import count_episodes
+from experiments.sweeps.registry import AXES, find_axis, plan_sweeps
+from experiments.sweeps.sweep import CONTROL, POINT, reference_trial, unique_trials
+from hma_jax.config import ConfigError
+from tests.experiments.fakes import PROVENANCE
+
+FAMILY = {e.name: e.family for e in EMBODIMENTS}
+SWEEPS = dict(zip(CPU_FULL.axes, plan_sweeps(CPU_FULL, CPU_FULL.axes), strict=True))
+LONG = set(CPU_FULL.designs.long)
+
+
+def points(axis: str, role: str = POINT):
+    return [p for p in SWEEPS[axis].points if p.role == role]
+
+
+@pytest.mark.parametrize("axis", CPU_FULL.axes)
+def test_every_point_has_three_seeds(axis):
+    """But for the long reference, which says that it has one."""
+    seeds = Counter((p.series, p.x) for p in points(axis) if p.trial.train.steps not in LONG)
+    assert set(seeds.values()) == {3}
+    assert {p.trial.train.seed for p in points(axis)} == {0, 1, 2}
+
+
+@pytest.mark.parametrize("axis", ["dilution", "transfer", "episodes", "width"])
+def test_both_ends_of_an_axis_have_a_control(axis):
+    controls = {p.x: p.trial for p in points(axis, CONTROL)}
+    ends = {min(p.x for p in points(axis)), max(p.x for p in points(axis))}
+    assert ends <= controls.keys() and all(t.shuffle_actions for t in controls.values())
+    trained = {p.x: p.trial for p in points(axis) if p.trial.train.seed == 0 and p.trial.train.steps == 8000}
+    for x, control in controls.items():
+        if x in trained:
+            changed = replace(control, shuffle_actions=False, measure_untrained=trained[x].measure_untrained)
+            assert changed == trained[x]
+
+
+@pytest.mark.parametrize("axis", ["dilution", "transfer", "episodes", "width", "horizon", "compute"])
+def test_the_reference_is_a_point(axis):
+    budgets = {CPU_FULL.train.steps, *CPU_FULL.designs.compute}
+    references = {reference_trial(CPU_FULL, seed, n) for seed in CPU_FULL.seeds for n in budgets}
+    assert len(references & {p.trial for p in points(axis)}) >= 3
+
+
+def test_judged_robots_are_others_for_every_seed_and_each_of_another_family():
+    drawn = [draw_judged(CPU_FULL, seed) for seed in range(20)]
+    assert len(set(drawn)) == 20
+    silent = {e.name for e in EMBODIMENTS if e.video_only}
+    for judged in drawn:
+        assert len({FAMILY[name] for name in judged}) == len(judged) == 5 and not silent & set(judged)
+
+
+def test_sets_of_robots_are_nested_and_hold_the_judged():
+    for seed in CPU_FULL.seeds:
+        sets = [set(draw_mixture(CPU_FULL, seed, n)) for n in (5, 10, 20, 40)]
+        assert sets[0] == set(draw_judged(CPU_FULL, seed)) and all(a < b for a, b in zip(sets, sets[1:], strict=False))
+
+
+def test_dilution_holds_all_windows_and_transfer_those_of_the_judged():
+    """Under the uniform mixture a robot's share is one over their number."""
+    assert {p.trial.train.steps for p in points("dilution")} == {8000}
+    assert {p.trial.train.steps / len(p.trial.datasets) for p in points("transfer")} == {200.0}
+    for p in (*points("dilution"), *points("transfer")):
+        assert p.scope == draw_judged(CPU_FULL, p.trial.train.seed) and set(p.scope) <= set(p.trial.evaluated)
+    with pytest.raises(ConfigError, match="uniform mixture"):
+        find_axis("transfer")(replace(CPU_FULL, tau=3.0))
+
+
+def test_newcomers_are_whole_and_of_the_kin_that_is_said():
+    sweep = SWEEPS["newcomers"]
+    for p in points("newcomers"):
+        judged, added = set(p.scope), set(p.trial.datasets) - set(p.scope)
+        assert set(p.trial.capped) == judged and p.trial.max_trajectories == 8
+        kin = {FAMILY[name] for name in added} & {FAMILY[name] for name in judged}
+        label = sweep.labels[int(p.x)]
+        assert not ("strangers" in label and kin)
+        assert "siblings" not in label or {FAMILY[name] for name in added} <= {FAMILY[name] for name in judged}
+        assert len(added) == {"alone": 0, "20": 15, "all robots": 35}[label.split(",")[0]]
+
+
+def test_every_width_spends_the_same_compute():
+    plans = plan_trials(CPU_FULL, [SWEEPS["compute"]])
+    for series in {p.series for p in points("compute")}:
+        trials = {p.trial for p in points("compute") if p.series == series}
+        spent = [plan.cost.train_flops for plan in plans.values() if plan.trial in trials]
+        assert max(spent) < 1.01 * min(spent)
+
+
+def test_trajectories_are_counted_as_they_are():
+    there = [e.episodes for e in TRAINED]  # at scale 1
+    for cap in (4, 64, 10_000):
+        assert count_episodes(CPU_FULL, cap) == sum(min(n, cap) for n in there)
+    assert {p.x for p in points("episodes")} >= {160, sum(there)}
+
+
+def test_few_shots_start_from_trials_of_other_axes():
+    others = unique_trials([SWEEPS["dilution"]], PROVENANCE).values()
+    sources = {p.trial.source for p in points("fewshot")} - {None}
+    assert sources <= set(others) and len(sources) == 9
+    assert all(p.trial.train.only == CPU_FULL.unseen for p in points("fewshot") if p.trial.source)
+
+
+def test_the_whole_fits_into_twelve_hours_of_two_cores():
+    plans = plan_trials(CPU_FULL, list(SWEEPS.values()))
+    seconds = estimate_preparing(CPU_FULL).seconds + sum(p.seconds for p in plans.values()) / 2
+    assert 8 * 3600 < seconds < 12 * 3600
+    alone = sum(p.cost.flops for p in plans.values()) / sum(p.flops for p in plans.values())
+    assert alone > 1.15, "sharing runs should save a seventh of all computing"
+
+
+def test_the_paper_judges_on_a_random_five_with_a_given_tokenizer():
+    sweep = find_axis("datasets")(PAPER)
+    assert sweep.scope == draw_judged(PAPER, 0, 5) != PAPER.datasets[:5]
+    for p in sweep.points:
+        assert p.scope == sweep.scope and set(sweep.scope) <= set(p.trial.datasets)
+    assert [len(p.trial.datasets) for p in sweep.points] == [5, 10, 20, 30, 40, 40]
+    assert PAPER.tokenizer.kind == "magvit2" and PAPER.widths[-1] == 768
+    assert set(CPU_FULL.axes) <= set(AXES)
