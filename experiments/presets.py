@@ -91,8 +91,7 @@ CPU_FULL = replace(
     seeds=(0, 1, 2),
     widths=(24, 32, 48, 64, 80),  # a decade of trunk parameters
     transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(24, 48, 96), datasets=10, steps=1000),
-    ablation_steps=4000,
-    designs=DesignConfig(long=(16_000, 32_000, 64_000), end_controls=True),
+    designs=DesignConfig(long=(16_000, 32_000, 64_000), ablation_steps=4000, end_controls=True),
     axes=(
         "horizon", "dilution", "transfer", "newcomers", "episodes", "width", "compute", "lr", "lr_horizon", "fewshot",
         "settings", "conditioning",

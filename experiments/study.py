@@ -97,6 +97,7 @@ class DesignConfig:
     long: tuple[int, ...] = ()  # more steps of the reference, of the first seed alone
     compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # steps of the reference whose FLOPs every width may use
     rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the first and last of `budgets`
+    ablation_steps: int | None = None  # of `settings` and `conditioning`; None: as many as every other trial
     end_controls: bool = False  # controls at both ends of an axis, not at the reference alone
 
     def __post_init__(self):
@@ -140,7 +141,6 @@ class Study:
     weighed: Literal["used", "all"] = "used"
     seeds: tuple[int, ...] = (0,)  # of initial values, order of data and subsets of trajectories together
     ablation_seeds: tuple[int, ...] = (0, 1, 2)  # of the ablations, whose error bars are over seeds
-    ablation_steps: int | None = None  # None: as many as every other trial
     transfer: TransferConfig = field(default_factory=TransferConfig)
     designs: DesignConfig = field(default_factory=DesignConfig)
     axes: tuple[str, ...] = ("datasets", "trajectories", "width")  # what `hma study` runs

@@ -147,7 +147,7 @@ def make_ablation(
         study, name, axis, study.dataset_names(), range(len(labels)),
         change=lambda trial, x: variants[labels[x]](trial),
         reference_x=labels.index(default), question=question, gain=gain, title=title, labels=labels,
-        seeds=study.ablation_seeds, steps=study.ablation_steps,
+        seeds=study.ablation_seeds, steps=study.designs.ablation_steps,
     )  # fmt: skip
 
 

@@ -17,8 +17,8 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_window
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
-from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.audit import audit_sharding, plan_sharding
+from hma_jax.runtime.devices import peak_flops
 from hma_jax.runtime.mesh import check_mesh, make_mesh
 from hma_jax.runtime.sharding import put_batch
 from hma_jax.training.divergence import Records

@@ -11,6 +11,7 @@ from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
 from experiments.cost import plan_trials
 from experiments.preparing_cost import estimate_preparing
 from experiments.presets import CPU_FULL, PAPER
+from experiments.running.trial import trial_id
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.registry import AXES, find_axis, plan_sweeps
@@ -52,6 +53,13 @@ def test_the_reference_is_a_point(axis):
     budgets = {CPU_FULL.train.steps, *CPU_FULL.designs.compute}
     references = {reference_trial(CPU_FULL, seed, n) for seed in CPU_FULL.seeds for n in budgets}
     assert len(references & {p.trial for p in points(axis)}) >= 3
+
+
+def test_ablations_share_their_default_with_the_horizon():
+    longer = unique_trials([SWEEPS["horizon"]], PROVENANCE)
+    for axis in ("settings", "conditioning"):
+        default = [p for p in points(axis) if p.x == SWEEPS[axis].reference_x]
+        assert len(default) == 3 and all(trial_id(p.trial, PROVENANCE) in longer for p in default)
 
 
 def test_judged_robots_are_others_for_every_seed_and_each_of_another_family():

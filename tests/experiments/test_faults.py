@@ -16,8 +16,8 @@ import pytest
 from data_pipelines.tokens import part_maker
 from experiments.cli.main import main
 from experiments.running import trial as trials
-from experiments.running.shared_runs import ALONE
 from experiments.running import trial_main
+from experiments.running.shared_runs import ALONE
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
