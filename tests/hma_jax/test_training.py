@@ -14,9 +14,9 @@ from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.runs import load_run
 from hma_jax.training.train import train_model
-from tests.tiny import TABLE, batches, model_config, train_config
+from tests.tiny import TABLE, batches, shallow_config, train_config
 
-MODEL = model_config(layers=1)  # how a run goes on does not depend on how many there are, compiling does
+MODEL = shallow_config()
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
 
 
