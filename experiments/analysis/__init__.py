@@ -1,0 +1,1 @@
+"""From per-window numbers to statistics: tables, intervals, fits."""
