@@ -70,11 +70,11 @@ class PowerFit:
         return interval(self.all_at(x))
 
     def formula(self) -> str:
-        """In words: 'L = 1.5 + 98 N^-0.5'."""
-        terms = [f"{self['E'].value:.3g}"]
-        for (scale, exponent), x in zip(NAMES, "ND" if len(self.axes) == 2 else "x", strict=False):
-            terms.append(f"{self[scale].value:.3g} {x}^\u2212{self[exponent].value:.3g}")
-        return "L = " + " + ".join(terms)
+        """In words: 'L = 1.5 + 98 x^-0.5'."""
+        names = ("N", "D") if len(self.axes) == 2 else ("x",)
+        powers = zip(NAMES, names, strict=False)
+        terms = [f"{self[scale].value:.3g} {x}^-{self[exponent].value:.3g}" for (scale, exponent), x in powers]
+        return " + ".join([f"L = {self['E'].value:.3g}", *terms])
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
