@@ -80,8 +80,8 @@ def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp
 
 def test_wrong_choice_exits_with_2(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["sweep", "widths"])
-    assert end.value.code == 2
+        main(["sweep", "width", "--preset", "gpu"])
+    assert end.value.code == 2 and "cpu" in capsys.readouterr().err
 
 
 def test_debug_shows_the_traceback(tmp_path):

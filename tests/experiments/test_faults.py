@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import pytest
 
 from data_pipelines.tokens import part_maker
-from experiments import trial as trials
 from experiments.cli.main import main
+from experiments.running import trial as trials
 from experiments.running import trial_main
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit

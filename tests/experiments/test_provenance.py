@@ -287,7 +287,7 @@ def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, 
         run()
         assert len(ran) == len(ids_of()) and ran[0].record["code"] == trace(ROOTS)
     else:
-        with pytest.raises(CodeChanged, match=r"differs in experiments\.trial"):
+        with pytest.raises(CodeChanged, match=r"differs in experiments\.running\.trial"):
             run()
         assert not ran and "hma study" in find_record(workspace).command
 

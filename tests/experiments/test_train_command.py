@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import trial as trials
 from experiments.cli.main import main
+from experiments.running import trial as trials
 from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
