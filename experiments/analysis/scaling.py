@@ -9,7 +9,7 @@ fit, and over parameters and training FLOPs, for the best size of a budget.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -76,12 +76,17 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tup
         for point in sweep.points:
             if point.role == POINT and sweep.scaling:
                 groups[_all_but_size(point.trial)][trial_id(point.trial, provenance)] = point.trial
-    both = [g for g in groups.values() if len({t.model.width for t in g.values()}) > 1 < len({_seen(t) for t in g.values()})]
+
+    def varies(group: dict[str, Trial], what: Callable[[Trial], float]) -> bool:
+        return len({what(trial) for trial in group.values()}) > 1
+
+    both = [g for g in groups.values() if varies(g, lambda t: t.model.width) and varies(g, _seen)]
     if not both:
         return {}
     group = max(both, key=len)
     places = tuple(
-        Place(id, f"width {t.model.width}", t.train.seed, (trunk_parameters(t.model), _seen(t))) for id, t in group.items()
+        Place(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)))
+        for id, t in group.items()
     )
     curve = Curve("joint", (TRUNK, WINDOWS), next(iter(group.values())).evaluated, places)
     return {id: (trial, curve) for id, trial in group.items()}
@@ -126,22 +131,16 @@ def fit_budgets(
     return measured, fit_isoflop(measured, draws=draws)
 
 
-def position(sweep: Sweep, point: Point) -> tuple[str, float]:
-    """(axis, where on it a point of a sweep stands): TRUNK where the sweep's trials differ in width."""
-    widths = {p.trial.model.width for p in sweep.points if p.role == POINT}
-    return (TRUNK, float(trunk_parameters(point.trial.model))) if len(widths) > 1 else (sweep.axis, float(point.x))
+def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Provenance) -> Curve:
+    """Over TRUNK where its trials differ in width."""
+    wider = len({p.trial.model.width for p in points}) > 1
 
+    def place(p: Point) -> Place:
+        x = float(trunk_parameters(p.trial.model)) if wider else float(p.x)
+        return Place(trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,))
 
-def curve_name(sweep: Sweep, series: str) -> str:
-    return "-".join(filter(None, (sweep.name, series)))
-
-
-def _curve(sweep: Sweep, series: str, points: Iterable[Point], provenance: Provenance) -> Curve:
-    points = list(points)
-    places = tuple(
-        Place(trial_id(p.trial, provenance), f"{p.x:g}", p.trial.train.seed, (position(sweep, p)[1],)) for p in points
-    )
-    return Curve(curve_name(sweep, series), (position(sweep, points[0])[0],), sweep.scope, places)
+    name = "-".join(filter(None, (sweep.name, series)))
+    return Curve(name, (TRUNK if wider else sweep.axis,), sweep.scope, tuple(map(place, points)))
 
 
 @lru_cache
@@ -158,14 +157,24 @@ def _seen(trial: Trial) -> float:
     return float(trial.train.steps * trial.train.batch)
 
 
+def _run_of(trial: Trial) -> str:
+    """Equal for trials that differ in steps and seed alone: the branches of one run, for each of its seeds."""
+    return stable_hash(_without_steps(trial))
+
+
 def _all_but_size(trial: Trial) -> str:
     """Equal for trials that differ in width, steps and seed alone."""
-    values: dict[str, Any] = to_dict(trial)
+    values = _without_steps(trial)
     values["model"].pop("width")
+    return stable_hash(values)
+
+
+def _without_steps(trial: Trial) -> dict[str, Any]:
+    values: dict[str, Any] = to_dict(trial)
     for name in ("steps", "seed"):
         values["train"].pop(name)
     values.pop("measure_untrained")
-    return stable_hash(values)
+    return values
 
 
 def noise_at(measured: Measured) -> float:

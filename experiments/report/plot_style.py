@@ -74,6 +74,8 @@ class LogTicks(Locator):
             ticks = MaxNLocator(nbins=5, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high)
         elif high > 300 * low:
             ticks = LogLocator().tick_values(low, high)
+        elif high > 20 * low:
+            ticks = LogLocator(subs=(1, 2, 5)).tick_values(low, high)
         return [t for t in ticks if t > 0]
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.report.pieces import pm, table
-from experiments.rows import OVERALL, Row, curve
+from experiments.rows import OVERALL, CurvePoint, Row, curve
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Sweep
@@ -65,7 +65,7 @@ def _ahead(rows: Sequence[Row], sweep: Sweep, name: str, tables: Sequence[Window
     return (psnr.mean - copy.mean if psnr and copy else math.nan), math.nan
 
 
-def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str):
+def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) -> CurvePoint | None:
     return next((p for p in curve(rows, sweep.name, metric, scope=scope) if p.x == sweep.reference_x), None)
 
 
@@ -93,11 +93,16 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
             *counts,
         ])  # fmt: skip
     beyond = sum(r.control > 2 for r in robots)
-    sorted_by = f"Sorted by how many standard errors the {order} lies above zero; {beyond} of {len(robots)} are beyond two. " if order else ""
+    sorted_by = (
+        f"Sorted by how many standard errors the {order} lies above zero; {beyond} of {len(robots)} are beyond two. "
+        if order
+        else ""
+    )
+    head = ["robot", "s.e. above zero", "ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"]
     return (
         f"<p>{sorted_by}PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of "
         "repeating the last given frame. Errors are standard errors over episodes and seeds.</p>"
-        + table(["robot", "s.e. above zero", "ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"], lines)
+        + table(head, lines)
     )
 
 

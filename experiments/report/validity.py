@@ -97,15 +97,16 @@ def check_numbers(
     lost = {_key(r) for r in rows if (r.sweep, r.trial) in before} - {_key(r) for r in written}
     if edited or lost:
         example = _key(edited[0]) if edited else min(lost, key=str)
-        where = ", ".join(str(part) for part in example if part != "")
-        return Check(name, "bad", f"{len(edited) + len(lost)} lines of the table differ from the trials' results, such as {where}; it was drawn again from them.")
+        where, count = ", ".join(str(part) for part in example if part != ""), len(edited) + len(lost)
+        differ = "1 line of the table differs" if count == 1 else f"{count} lines of the table differ"
+        return Check(name, "bad", f"{differ} from the trials' results, such as {where}; it was drawn again from them.")
     wrong = [id for id in results if id in windows and not _follows(results[id], windows[id], group)]
     if wrong:
         return Check(name, "bad", f"The results of {len(wrong)} trials do not follow from their windows: {wrong[0]}.")
     missing = [id for id in results if id not in windows]
     if missing or not results:
-        what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows" if results else "No trial is finished"
-        return Check(name, "open", f"{what}.")
+        what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows."
+        return Check(name, "open", what if results else "No trial is finished.")
     count = sum(len(w) for w in windows.values())
     return Check(name, "good", f"Table and results of {len(results)} trials were computed again from {count:,} windows.")
 
@@ -139,7 +140,8 @@ def _trials(states: Mapping[str, State]) -> Check:
             without[state.event] = without.get(state.event, 0) + 1
     done = len(states) - sum(without.values())
     rest = "".join(f", {n} {event}" for event, n in sorted(without.items()))
-    return Check("Every planned trial is here.", "bad" if without else "good", f"{done} of {len(states)} finished{rest}.")
+    text = f"{done} of {len(states)} finished{rest}."
+    return Check("Every planned trial is here.", "bad" if without else "good", text)
 
 
 def _seeds(sweeps: Sequence[Sweep], states: Mapping[str, State], rows: Sequence[Row]) -> Check:
@@ -155,7 +157,10 @@ def _seeds(sweeps: Sequence[Sweep], states: Mapping[str, State], rows: Sequence[
     counted = f"{least}" if least == most else f"{least} to {most}"
     text = f"{counted} per point"
     if few:
-        text += f"; {len(few)} of {len(seeds)} points have fewer than {SEEDS}, so that their errors hold little or nothing of what another seed would change"
+        text += (
+            f"; {len(few)} of {len(seeds)} points have fewer than {SEEDS}, so that their errors hold little or nothing of "
+            "what another seed would change"
+        )
     return Check(f"At least {SEEDS} seeds.", "bad" if few else "good", f"{text}.")
 
 
@@ -186,7 +191,8 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
     text = f"{len(controls)} controls: at most {far:.1f} standard errors from zero, their mean {_errors(mean, sem):+.1f}"
     if len(controls) == 1:
         text = f"One control: {_errors(mean, sem):+.1f} standard errors from zero"
-    return Check(name, "good" if fine else "bad", f"{text} (allowed: {EACH:g} each, {MEAN:g} for the mean).".replace("-", "\u2212"))
+    text = f"{text} (allowed: {EACH:g} each, {MEAN:g} for the mean).".replace("-", "\u2212")
+    return Check(name, "good" if fine else "bad", text)
 
 
 def _errors(mean: float, sem: float) -> float:
