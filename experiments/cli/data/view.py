@@ -86,10 +86,10 @@ def _view_one(
     from data_pipelines.inspection.suggest import suggest_entry, window_facts
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_spec
-    from data_pipelines.sources.rlds.schema import dataset_name
+    from data_pipelines.sources.open import source_name
     from experiments.report.data_page import CLIP_FRAMES, Viewed
 
-    known = find_spec(dataset_name(directory))
+    known = find_spec(source_name(directory))
     split = split or (known.split if known else "train")
     sample = inspect_dataset(directory, split, episodes=episodes, shown=shown, frames=CLIP_FRAMES)
     facts = sample.facts
