@@ -119,7 +119,8 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     logs = np.stack([line.at(flops) for line in covering]) if covering else np.zeros((0, 1))
     loss = np.exp(logs[:, 0])
     if len(sizes) < LEAST_SIZES:
-        return Budget(flops, sizes, loss, refused=f"{len(sizes)} sizes; at least {LEAST_SIZES} are needed"), np.array([])
+        few = f"{len(sizes)} sizes; at least {LEAST_SIZES} are needed"
+        return Budget(flops, sizes, loss, refused=few), np.array([])
     least = int(np.argmin(loss))
     first = max(min(least - NEAR, len(sizes) - 2 * NEAR - 1), 0)
     near = slice(first, first + 2 * NEAR + 1)
@@ -135,7 +136,8 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     common = dict(parabola=parabolas[:, 0], centre=float(x.mean()))
     if not opens_up[0] or lowest[0] in (x[0], x[-1]):
         end = "smallest" if lowest[0] == x[0] else "largest"
-        return Budget(flops, sizes, loss, **common, refused=f"the {end} size is best: the minimum may lie beyond"), lowest
+        refused = f"the {end} size is best: the minimum may lie beyond"
+        return Budget(flops, sizes, loss, **common, refused=refused), lowest
     part = float(np.isin(lowest[1:], (x[0], x[-1])).mean())
     doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OFTEN else ""
     best = Coefficient("N_opt", *(float(np.exp(v)) for v in (lowest[0], *interval(lowest[1:]))))

@@ -2,8 +2,8 @@
 
 A prediction is a small JSON file, sealed with a hash of itself: the fit, the hash of every result it was made from,
 which trials were finished then, and the loss that the trials of one position will have on the frozen windows, with an
-interval. The interval holds the bootstraps of the fit over seeds and the noise of the new trials' own seeds; not that of
-episodes, since the windows are the same, and not that of the form, which is what the prediction puts to the test.
+interval. The interval holds the bootstraps of the fit over seeds and the noise of the new trials' own seeds; not that
+of episodes, since the windows are the same, and not that of the form, which is what the prediction puts to the test.
 Its date is that of the commit that brings it.
 """
 

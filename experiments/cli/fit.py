@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +21,9 @@ if TYPE_CHECKING:
 def fit(
     study: Annotated[Positional[Path], arg(metavar="STUDY")],
     predict: Annotated[str | None, arg(metavar="AXIS=X")] = None,
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: STUDY/predictions/AXIS-X.json)")] = None,
+    out: Annotated[
+        Path | None, arg(metavar="FILE", help_behavior_hint="(default: STUDY/predictions/AXIS-X.json)")
+    ] = None,
     settings: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="PATH=VALUE")] = (),
 ) -> None:
     """Fit power laws to the scaling curves of a study, or predict a trial of it that has not run.
@@ -74,10 +75,10 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     from experiments.report.numbers import read_results, result_hashes
     from experiments.running.attempts import read_states
     from experiments.running.ledger import MISSING, Ledger
+    from experiments.running.trial import trial_id
     from experiments.study import override
     from experiments.sweeps.registry import plan_sweeps
     from experiments.sweeps.sweep import POINT, unique_trials
-    from experiments.running.trial import trial_id
 
     workspace = Workspace(root.absolute())
     record = load_record(workspace)
@@ -104,7 +105,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     for id, state in states.items():
         require(
             state.event == MISSING,
-            f"--predict {asked}: trial {id} exists already ({state.event}); a prediction is made before its trial is run",
+            f"--predict {asked}: trial {id} exists already ({state.event}); a prediction is made before its trial runs",
         )
     trials = list(unique_trials(sweeps, record.provenance))
     results, windows = read_results(workspace, trials)

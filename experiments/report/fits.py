@@ -13,6 +13,8 @@ from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import Fitted
 from experiments.report.pieces import table
 
+VERDICTS = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}
+
 DIGITS = 6
 """Significant ones in the table of fits: it is the same bytes on machines that round the rest otherwise."""
 
@@ -71,10 +73,10 @@ def describe_fits(fits: Sequence[Fitted], isoflop: IsoFlop | None, outcomes: Seq
         ])  # fmt: skip
     head = ["curve", "over", "L, nats per token", "exponent", "E", "remarks"]
     return (
-        "<p>Fitted is L = E + A x<sup>\u2212\u03b1</sup>, the loss in nats per held-out token over the axis: Huber loss in "
-        "the logarithm, points weighted by the noise that seeds were measured to have. Brackets hold "
-        f"{LEVEL:.0%} of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, this tokenizer and "
-        "this range; beyond its last point it is a guess until a prediction has come true.</p>"
+        "<p>Fitted is L = E + A x<sup>\u2212\u03b1</sup>, the loss in nats per held-out token over the axis: Huber loss "
+        "in the logarithm, points weighted by the noise that seeds were measured to have. Brackets hold "
+        f"{LEVEL:.0%} of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, this tokenizer "
+        "and this range; beyond its last point it is a guess until a prediction has come true.</p>"
         f"{drawn}{table(head, lines, text=6)}{_outcomes(outcomes)}{_isoflop(isoflop)}"
     )
 
@@ -97,10 +99,10 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
         p = o.prediction
         where = ", ".join(f"{x:,.0f} {axis}" for x, axis in zip(p.x, p.axes, strict=True))
         came = "not run yet" if o.observed is None else f"{o.observed:.4f}"
-        verdict = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}[o.inside]
+        said = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
         lines.append([
-            html.escape(p.curve), where, f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>", came, verdict,
-            f"{o.seeds} of {len(p.trials)}", html.escape("; ".join(o.marks)),
+            html.escape(p.curve), where, said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
+            html.escape("; ".join(o.marks)),
         ])  # fmt: skip
     head = ["curve", "at", "predicted", "came", "", "seeds", "remarks"]
     return f"<h3>Written down before</h3>{table(head, lines, text=7)}"
@@ -109,10 +111,10 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
 def _isoflop(isoflop: IsoFlop | None) -> str:
     if isoflop is None:
         return ""
-    lines = [
-        [f"{b.flops:.3g}", str(len(b.sizes)), _with_interval(b.best) if b.best else "–", html.escape(b.refused or b.doubt)]
-        for b in isoflop.budgets
-    ]
+    lines = []
+    for b in isoflop.budgets:
+        best = _with_interval(b.best) if b.best else "–"
+        lines.append([f"{b.flops:.3g}", str(len(b.sizes)), best, html.escape(b.refused or b.doubt)])
     a = isoflop.exponent
     said = (
         f"The best size grows as C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>."

@@ -47,7 +47,7 @@ def write_report(
     numbers: Numbers,
     checked: Check,
 ) -> None:
-    """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` says whether they agree."""
+    """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
     home = _home(sweeps)
     reference = trial_id(_reference(home), provenance) if home else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
@@ -64,7 +64,9 @@ def write_report(
         *_curves(workspace, sweeps, rows, optima),
         _fits(workspace, numbers),
         _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
-        section("Robots, the most controllable first", describe_robots(rows, home, robots, workspace.data_summary)) if shown else "",
+        section("Robots, the most controllable first", describe_robots(
+            rows, home, robots, workspace.data_summary
+        )) if shown else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, result)),
     ]  # fmt: skip

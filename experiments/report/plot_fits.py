@@ -79,7 +79,8 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
         figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.8), layout="constrained")
         for i, budget in enumerate(isoflop.budgets):
             colour = plt.cm.viridis(0.85 * i / max(len(isoflop.budgets) - 1, 1))
-            left.plot(budget.sizes, budget.loss, "o", color=colour, markersize=4.5, label=f"{count(budget.flops)} FLOPs")
+            label = f"{count(budget.flops)} FLOPs"
+            left.plot(budget.sizes, budget.loss, "o", color=colour, markersize=4.5, label=label)
             if budget.parabola is not None:
                 line = np.geomspace(budget.sizes[0], budget.sizes[-1], 80)
                 left.plot(line, budget.at(line), color=colour, linewidth=1.4, linestyle="--" if budget.refused else "-")

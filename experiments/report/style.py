@@ -32,12 +32,15 @@ td:nth-child(3).text { white-space: normal; min-width: 8rem; }
 .checks { list-style: none; margin: .6rem 0; padding: 0; border: 1px solid var(--line); border-radius: 8px; }
 .checks li { display: flex; gap: .7rem; padding: .5rem .9rem; border-top: 1px solid var(--line); font-size: .95rem; }
 .checks li:first-child { border-top: 0; } .checks .mark { flex: 0 0 1.1rem; font-weight: 700; text-align: center; }
-.checks div { min-width: 0; overflow-wrap: anywhere; } .checks .bad { background: color-mix(in srgb, var(--bad) 9%, transparent); }
+.checks div { min-width: 0; overflow-wrap: anywhere;
+  } .checks .bad { background: color-mix(in srgb, var(--bad) 9%, transparent); }
 .good .mark { color: var(--good); } .bad .mark, .bad b { color: var(--bad); } .open .mark { color: var(--muted); }
-.clips { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1.1rem 1.2rem; margin: .8rem 0; }
+.clips { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1.1rem 1.2rem;
+  margin: .8rem 0; }
 .trio { margin: 0; min-width: 0; } .trio figcaption { font-weight: 600; font-size: .9rem; margin-bottom: .2rem; }
 .trio img { display: block; width: 100%; image-rendering: pixelated; background: white; border-radius: 4px; }
-.trio div { display: grid; grid-auto-flow: column; grid-auto-columns: 1fr; font-size: .76rem; color: var(--muted); text-align: center; }
+.trio div { display: grid; grid-auto-flow: column; grid-auto-columns: 1fr; font-size: .76rem; color: var(--muted);
+  text-align: center; }
 .paper { display: none; }
 .strip { margin: 1.1rem 0; } .strip figcaption { font-weight: 600; font-size: .92rem; }
 .strip div { display: flex; align-items: center; gap: .8rem; margin: 3px 0; }
@@ -49,8 +52,10 @@ code, pre { font: .86em/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, mono
 pre { background: var(--soft); padding: 1rem; border-radius: 8px; overflow-x: auto; }
 summary { cursor: pointer; color: var(--muted); margin: .8rem 0; }
 td.text:last-child:nth-child(n+4) { white-space: normal; min-width: 16rem; }
-@media (max-width: 560px) { main { padding: 1.2rem .9rem 3rem; } h1 { font-size: 1.5rem; } .cards { grid-template-columns: 1fr 1fr; }
-  .strip div { display: block; } .plot { padding: .2rem; width: auto; min-width: 100%; height: 24rem; max-width: none; } dl { grid-template-columns: 1fr; } dd { margin-bottom: .5rem; } }
+@media (max-width: 560px) { main { padding: 1.2rem .9rem 3rem; } h1 { font-size: 1.5rem;
+  } .cards { grid-template-columns: 1fr 1fr; }
+  .strip div { display: block; } .plot { padding: .2rem; width: auto; min-width: 100%; height: 24rem;
+  max-width: none; } dl { grid-template-columns: 1fr; } dd { margin-bottom: .5rem; } }
 @media print { :root { color-scheme: light; --ink: #000; --muted: #444; --line: #bbb; --paper: #fff; --soft: #f5f7f8;
     --good: #1d5c36; --bad: #9c2415; }
   @page { margin: 14mm; } body { font-size: 10.5pt; } main { max-width: none; padding: 0; }

@@ -52,7 +52,8 @@ def draw_box(checks: Sequence[Check]) -> str:
     bad = sum(c.verdict == "bad" for c in checks)
     unknown = sum(c.verdict == "open" for c in checks)
     counted = [f"{len(checks) - bad - unknown} of {len(checks)} hold"]
-    counted += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad) + [f"{unknown} cannot be checked"] * bool(unknown)
+    counted += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad)
+    counted += [f"{unknown} cannot be checked"] * bool(unknown)
     lines = "".join(
         f'<li class={c.verdict}><span class=mark>{MARKS[c.verdict]}</span><div><b>{html.escape(c.name)}</b> '
         f"{html.escape(c.text)}</div></li>"
@@ -108,7 +109,8 @@ def check_numbers(
         what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows."
         return Check(name, "open", what if results else "No trial is finished.")
     count = sum(len(w) for w in windows.values())
-    return Check(name, "good", f"Table and results of {len(results)} trials were computed again from {count:,} windows.")
+    text = f"Table and results of {len(results)} trials were computed again from {count:,} windows."
+    return Check(name, "good", text)
 
 
 def _key(row: Row) -> tuple[Any, ...]:
@@ -158,8 +160,8 @@ def _seeds(sweeps: Sequence[Sweep], states: Mapping[str, State], rows: Sequence[
     text = f"{counted} per point"
     if few:
         text += (
-            f"; {len(few)} of {len(seeds)} points have fewer than {SEEDS}, so that their errors hold little or nothing of "
-            "what another seed would change"
+            f"; {len(few)} of {len(seeds)} points have fewer than {SEEDS}, so that their errors hold little or nothing "
+            "of what another seed would change"
         )
     return Check(f"At least {SEEDS} seeds.", "bad" if few else "good", f"{text}.")
 
@@ -188,9 +190,10 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
     mean = sum(r.mean for r in controls.values()) / len(controls)
     sem = math.sqrt(sum(r.sem**2 for r in controls.values())) / len(controls)
     fine = far <= EACH and abs(_errors(mean, sem)) <= MEAN  # nan: not fine
-    text = f"{len(controls)} controls: at most {far:.1f} standard errors from zero, their mean {_errors(mean, sem):+.1f}"
+    off = f"{_errors(mean, sem):+.1f}"
+    text = f"{len(controls)} controls: at most {far:.1f} standard errors from zero, their mean {off}"
     if len(controls) == 1:
-        text = f"One control: {_errors(mean, sem):+.1f} standard errors from zero"
+        text = f"One control: {off} standard errors from zero"
     text = f"{text} (allowed: {EACH:g} each, {MEAN:g} for the mean).".replace("-", "\u2212")
     return Check(name, "good" if fine else "bad", text)
 
@@ -217,7 +220,8 @@ def _held_out(optima: Sequence[Optimum]) -> bool:
 
 
 def _optima(optima: Sequence[Optimum]) -> list[Check]:
-    """Of muP's curves, on held-out data where there is a likelihood; where the standard parametrisation is best is a finding, not a condition."""
+    """Of muP's curves, on held-out data where there is a likelihood. Where the standard parametrisation is best is a
+    finding, not a condition."""
     mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT if _held_out(optima) else LOSS)]
     if not mup:
         return []

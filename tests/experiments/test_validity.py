@@ -9,9 +9,10 @@ import pytest
 
 from experiments.report.draw import draw
 from experiments.running.sealed import RESULT, write_result
+from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import CONTROL, unique_trials
+from experiments.sweeps.sweep import CONTROL
 from hma_jax.evaluation.windows import FILE, WindowTable
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, judged_study
@@ -57,7 +58,7 @@ def trials_of(record, **wanted):
     for point in plan_sweeps(record.study, record.axes)[0].points:
         facts = {"width": point.x, "seed": point.trial.train.seed, "role": point.role}
         if all(facts[k] == v for k, v in wanted.items()):
-            found.append(next(id for id, t in unique_trials(plan_sweeps(record.study, record.axes), PROVENANCE).items() if t == point.trial))
+            found.append(trial_id(point.trial, PROVENANCE))
     return found
 
 

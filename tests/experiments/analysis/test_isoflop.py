@@ -6,10 +6,12 @@ import pytest
 from experiments.analysis.isoflop import fit_isoflop
 from tests.experiments.analysis.curves import measured, power
 
+SIZES, BUDGETS = np.geomspace(1e4, 1e7, 7), np.geomspace(6e10, 6e12, 5)
 
-def runs(rng, noise=1e-3, sizes=np.geomspace(1e4, 1e7, 7), budgets=np.geomspace(6e10, 6e12, 5)):
+
+def runs(rng, noise=1e-3, sizes=SIZES):
     """L = 1 + (N / 1e4)^-0.5 + (D / 1e4)^-0.5 at C = 6 N D: N_opt = (C / 6)^0.5."""
-    x = np.array([(n, c) for n in sizes for c in budgets])
+    x = np.array([(n, c) for n in sizes for c in BUDGETS])
     tokens = np.stack([x[:, 0], x[:, 1] / (6 * x[:, 0])], 1)
     return measured(x, power(tokens, 1.0, (1.0, 0.5), (1.0, 0.5)), noise, 3, rng)
 
