@@ -4,7 +4,7 @@ A trial's directory holds
     job.json        the trial and its provenance (written by the runner)
     run/            the training run (`hma_jax.training`): log, checkpoints
     samples.npz     true and predicted frames of a few windows per dataset
-    windows.csv.gz  every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
+    windows.parquet every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
     provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
     result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
 """
@@ -286,10 +286,10 @@ def run_trial(
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
-    """Writes windows.csv.gz and samples.npz into `directory`."""
+    """Writes windows.parquet and samples.npz into `directory`."""
     from hma_jax.evaluation.windows import FILE
 
-    evaluation.windows.save(directory / FILE)
+    evaluation.windows.save(directory / FILE, directory.name)
     write_samples(directory / "samples.npz", evaluation.samples)
 
 

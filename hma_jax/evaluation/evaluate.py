@@ -224,4 +224,6 @@ def _rows_of(batch: dict[str, Any], found: dict[str, jax.Array]) -> WindowTable:
         f"predicted latents are not finite ({', '.join(sorted(set(dataset[~finite])))}); did the model diverge?",
     )
     episode, start = (np.asarray(batch[name], np.int64)[valid] for name in ("episode", "start"))
-    return WindowTable(dataset, episode, start, {m: np.asarray(x, np.float64) for m, x in columns.items()})
+    real = batch.get("real", np.ones(np.shape(batch["tokens"])[:2], bool))
+    frames = np.sum(real, axis=1, dtype=np.int64)[valid]
+    return WindowTable(dataset, episode, start, frames, {m: np.asarray(x, np.float64) for m, x in columns.items()})
