@@ -49,6 +49,11 @@ class Workspace:
         return self.root / "eval_manifest.json"
 
     @property
+    def counterfactual(self) -> Path:
+        """What would be seen in them under other actions, of the suite."""
+        return self.root / "counterfactual.npz"
+
+    @property
     def data_summary(self) -> Path:
         """Episodes and windows per dataset, as JSON."""
         return self.root / "data.json"

@@ -89,9 +89,9 @@ def test_the_same_seed_draws_the_same_and_a_thousand_draws_are_quick():
     rng = np.random.default_rng(0)
     table = judged(rng, robots=40, episodes=24, each=1)
     panel = make_panel([under_seeds(table, rng, 3, 0.1) for _ in range(5)], LOSS)
-    began = time.perf_counter()
+    began = time.process_time()
     first = resample(panel, 1000, seed=7).drawn
-    assert time.perf_counter() - began < 2.0  # about 0.1 s
+    assert time.process_time() - began < 3.0  # about 0.1 s
     np.testing.assert_array_equal(first, resample(panel, 1000, seed=7).drawn)
     assert not np.array_equal(first, resample(panel, 1000, seed=8).drawn)
     assert first.shape == (1000, 5)
