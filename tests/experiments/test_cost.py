@@ -56,7 +56,7 @@ def test_batches_hold_windows_of_several_datasets_and_the_last_is_filled_up():
 
 
 def test_samplers_of_latents_are_paid_for_step_by_step():
-    trial = reference_trial(SMOKE_CONTINUOUS, 0)
+    trial = reference_trial(replace(SMOKE_CONTINUOUS, eval=replace(SMOKE_CONTINUOUS.eval, other_actions=0)), 0)
     sampler = trial.eval.decode.sampler
 
     def flops(steps: int) -> float:
