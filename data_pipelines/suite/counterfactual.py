@@ -28,8 +28,7 @@ def frames_under(
         row[: len(own)] = own[:steps]
     rollout = simulate(spec, seeds, executed)
     rows, columns = np.repeat(np.arange(len(seeds)), times.shape[1]), times.ravel()
-    frames = render_frames(
-        spec, draw_appearance(spec, rollout.seeds), rollout.goals, rollout.q[rows, columns], rollout.objects[rows, columns], rows
-    )
+    looks, q, objects = draw_appearance(spec, rollout.seeds), rollout.q[rows, columns], rollout.objects[rows, columns]
+    frames = render_frames(spec, looks, rollout.goals, q, objects, rows)
     seen = [fit_image(decode_image(encode_jpeg(frame)), size) for frame in frames]
     return np.stack(seen).reshape(*times.shape, size, size, 3)

@@ -1,7 +1,7 @@
 """Other episodes' actions for a frozen window: what a model is shown in place of the true ones.
 
-They come from the same robot and from other episodes than the window's own, held-out ones as far as there are enough, and
-cover every real frame of the window, so that each sequence is one that the robot was given, in all its frames.
+They come from the same robot and from other episodes than the window's own, held-out ones as far as there are
+enough, and cover every real frame of the window: each sequence is one that the robot was given, whole.
 """
 
 from __future__ import annotations

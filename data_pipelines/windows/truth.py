@@ -44,5 +44,6 @@ class OtherTruth:
                 return cls(**json.loads(frames.pop(META).tobytes()), frames=frames)
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise DataError(
-                f"{path}: the frames under other actions cannot be read ({error}). Remove the file; the next command makes it again."
+                f"{path}: the frames under other actions cannot be read ({error}). Remove the file and prepare the study "
+                "again, with `hma tokenize` or `hma study`."
             ) from error

@@ -76,7 +76,8 @@ def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
     shared = [seed for seed in a.seeds if seed in b.seeds]
     if not shared:
         raise NotComparable(
-            f"{a.name} has seeds {', '.join(map(str, a.seeds))} and {b.name} {', '.join(map(str, b.seeds))}: none in common"
+            f"{a.name} has seeds {', '.join(map(str, a.seeds))} and {b.name} {', '.join(map(str, b.seeds))}: none in "
+            "common"
         )
     return [(a.seeds[seed], b.seeds[seed]) for seed in shared]
 
@@ -94,7 +95,8 @@ def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
 
 def _difference(scope: str, metric: str, a: Panel, b: Panel) -> Difference:
     interval = _interval(a.minus(b))
-    means = (float(np.mean([p.points[0][:, p.robot == r].mean() for r in dict.fromkeys(p.robot.tolist())])) for p in (a, b))
+    robots = dict.fromkeys(a.robot.tolist())
+    means = (float(np.mean([p.points[0][:, p.robot == robot].mean() for robot in robots])) for p in (a, b))
     ratio = interval.exp() if metric in NATS[:1] else None
     return Difference(
         scope, metric, *means, interval.mean, interval.sem, interval.low, interval.high, interval.errors,

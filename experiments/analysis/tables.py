@@ -8,10 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments.job import read_job
+from experiments.analysis.compare import Side
+from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.running.sealed import RESULT, read_result
-from experiments.trial import Trial
+from experiments.running.trial import Trial, trial_id
+from experiments.running.workspace import Workspace, load_record
+from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import FILE, WindowTable
 
@@ -60,3 +63,39 @@ def long_table(trials: Iterable[Judged]) -> pa.Table:
     import pyarrow as pa
 
     return pa.concat_tables([judged.windows.to_arrow(judged.id) for judged in trials]).unify_dictionaries()
+
+
+def read_side(path: Path) -> Side:
+    """What `hma compare` takes: a study (its reference trials, by seed), a finished trial, or an evaluated model.
+
+    Raises ConfigError for what is none of them, or whose trials have no result.
+    """
+    workspace = Workspace(path.absolute())
+    if workspace.record.exists():
+        record = load_record(workspace)
+        if record.provenance is None:
+            raise ConfigError(f"the study in {path} has not run yet; run `{record.command}`")
+        ids = {s: trial_id(reference_trial(record.study, s), record.provenance) for s in record.study.seeds}
+        found = read_trials(workspace.trials, ids.values()) if workspace.trials.is_dir() else {}
+        seeds = {seed: found[id].windows for seed, id in ids.items() if id in found}
+        if not seeds:
+            raise ConfigError(
+                f"{path}: no reference trial of this study ({', '.join(ids.values())}) is finished here; run "
+                f"`{record.command}`, or name two trials"
+            )
+        return Side(path.name, seeds, record.provenance.tokenizer)
+    if (path / RESULT).exists():
+        judged = read_trial(path)
+        return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer)
+    if (path / FILE).exists():
+        return Side(path.name, {0: WindowTable.load(path / FILE)}, _tokenizer_of(path))
+    raise ConfigError(f"{path}: neither a study, nor a finished trial, nor a model that was evaluated (no {FILE})")
+
+
+def _tokenizer_of(run: Path) -> str:
+    """Of a training run's latest checkpoint; "" where it does not say."""
+    from hma_jax.training.reading import list_steps, read_description
+
+    steps = list_steps(run / "checkpoints")
+    described = read_description(run / "checkpoints" / str(steps[-1])) if steps else {}
+    return described.get("provenance", {}).get("tokenizer", "")

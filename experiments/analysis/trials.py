@@ -24,7 +24,7 @@ from typing import Any
 
 from data_pipelines.publishing.files import write_file
 from experiments.running.provenance import Provenance
-from experiments.trial import Trial
+from experiments.running.trial import Trial
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.summary import Summary
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from experiments.progress import step
+from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.workspace import Workspace
 
 if TYPE_CHECKING:
     from data_pipelines.suite.spec import EmbodimentSpec
@@ -32,7 +32,8 @@ def make_counterfactual(study: Study, workspace: Workspace) -> None:
     from data_pipelines.windows.others import OtherWindows
     from data_pipelines.windows.truth import OtherTruth
 
-    store, manifest, prompt = TokenStore(workspace.store), EvalManifest.load(workspace.manifest), study.eval.prompt_frames
+    store, manifest = TokenStore(workspace.store), EvalManifest.load(workspace.manifest)
+    prompt = study.eval.prompt_frames
     if workspace.counterfactual.exists():
         try:
             there = OtherTruth.load(workspace.counterfactual)

@@ -9,8 +9,8 @@ import pytest
 from experiments.analysis.tables import long_table, read_trial, read_trials
 from experiments.analysis.trials import trial_row, write_trials
 from experiments.running.sealed import read_result
-from experiments.sweep import reference_trial
-from experiments.trial import trial_id
+from experiments.running.trial import trial_id
+from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import FILE
 from tests.experiments.analysis.trials import as_stored, write_trial
