@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
@@ -23,6 +23,9 @@ from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ConfigError
+
+if TYPE_CHECKING:
+    from hma_jax.evaluation.statistics import Stat
 
 OVERALL = "overall"
 """The scope that averages over all datasets of a sweep, each counting equally."""
@@ -87,7 +90,7 @@ def collect(
 def _rows(
     sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, origin: dict[str, Any]
 ) -> list[Row]:
-    from hma_jax.evaluation.statistics import Stat, mean_and_sem
+    from hma_jax.evaluation.statistics import Stat
     from hma_jax.evaluation.summary import Summary
 
     def row(role: str, scope: str, metric: str, stat: Stat) -> Row:
@@ -105,8 +108,7 @@ def _rows(
     parts = [(point.role, Summary.from_dict(result["evaluation"]))]
     if result["untrained"]:
         parts.append((UNTRAINED, Summary.from_dict(result["untrained"])))
-    last = result["losses"][-max(round(LAST * len(result["losses"])), 1) :]
-    rows = [row(point.role, TRAINING, LOSS, mean_and_sem(last))]
+    rows = [row(point.role, TRAINING, LOSS, last_loss(result["losses"]))]
     for role, summary in parts:
         judged = [name for name in sweep.scope if name in summary.datasets]  # those with windows
         scopes = {OVERALL: summary.over(judged)}
@@ -114,6 +116,13 @@ def _rows(
         for scope, metrics in scopes.items():
             rows += [row(role, scope, m, s) for m, s in sorted(metrics.items())]
     return rows
+
+
+def last_loss(losses: Sequence[float]) -> Stat:
+    """The mean of a run's last steps."""
+    from hma_jax.evaluation.statistics import mean_and_sem
+
+    return mean_and_sem(losses[-max(round(LAST * len(losses)), 1) :])
 
 
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:

@@ -1,1 +1,4 @@
-"""From per-window numbers to statistics: tables, intervals, fits."""
+"""Statistics of finished trials, from every window's numbers: tables, means, differences, resampling.
+
+Everything here reads what trials left behind (`tables`), so that no statistic needs another run.
+"""

@@ -15,6 +15,7 @@ from tyro.extras import SubcommandApp
 
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
+from experiments.cli.compare import compare
 from experiments.cli.data import app as data
 from experiments.cli.evaluate import evaluate
 from experiments.cli.fit import fit
@@ -34,6 +35,7 @@ app.command(name="tokenize")(tokenize)
 app.command(name="train")(train)
 app.command(name="adapt")(adapt)
 app.command(name="evaluate")(evaluate)
+app.command(name="compare")(compare)
 app.command(name="report")(study.report)
 app.command(name="fit")(fit)
 app.command(data.data_app, name="data", help=data.HELP)

@@ -39,6 +39,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers
     from experiments.report.page import write_report
+    from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
     from experiments.rows import Row, collect, read_csv, write_csv
 
@@ -56,7 +57,8 @@ def _draw(workspace: Workspace, record: Record) -> None:
         console.print(f"note: {checked.text}", markup=False, soft_wrap=True)
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
-    tables = [workspace.results, workspace.fits]
+    others = write_tables(workspace, record, sweeps, states, provenance)
+    tables = [workspace.results, workspace.fits, *others]
     optima = find_optima(rows, sweeps)
     if optima:
         write_csv(workspace.optima, Optimum, optima)

@@ -86,4 +86,5 @@ def windows_of(trial: Trial) -> WindowTable:
         "delta_psnr": steers + 0.3 * own.standard_normal(count),
     }
     names = np.repeat(np.array(trial.evaluated), per_robot)
-    return WindowTable(names, episode, np.tile(np.arange(WINDOWS), count // WINDOWS), metrics)
+    frames = np.full(count, trial.model.frames)
+    return WindowTable(names, episode, np.tile(np.arange(WINDOWS), count // WINDOWS), frames, metrics)

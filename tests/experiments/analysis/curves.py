@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from experiments.analysis.bootstrap import Panel
 from experiments.analysis.measured import Measured
 
 DATASETS, EPISODES = 10, 8
@@ -19,12 +20,13 @@ def measured(
     x, loss = np.repeat(x, seeds, 0), np.repeat(loss, seeds)
     loss = loss * np.exp(noise * rng.standard_normal(len(loss)))
     hard = np.exp(episode_noise * rng.standard_normal(DATASETS * EPISODES))
-    sums = loss[:, None] * (hard / hard.mean() + 0.01 * rng.standard_normal((len(loss), len(hard))))
+    values = loss[:, None] * (hard / hard.mean() + 0.01 * rng.standard_normal((len(loss), len(hard))))
+    robot, episode = np.repeat([f"robot{d}" for d in range(DATASETS)], EPISODES), np.tile(np.arange(EPISODES), DATASETS)
+    names = tuple((i % seeds,) for i in range(len(x)))
     return Measured(
         ("trunk parameters", "windows")[: x.shape[1]], x,
-        run=np.array([f"{row[0]:.0f}" for row in x]), seed=np.arange(len(x)) % seeds,
-        trial=tuple(f"t{i}" for i in range(len(x))), sums=sums, windows=np.ones(len(hard)),
-        dataset=np.repeat(np.arange(DATASETS), EPISODES),
+        run=np.array([f"{row[0]:.0f}" for row in x]), trial=tuple(f"t{i}" for i in range(len(x))),
+        panel=Panel(robot, episode, tuple(row[None] for row in values), names),
     )  # fmt: skip
 
 

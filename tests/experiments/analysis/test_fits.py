@@ -59,7 +59,7 @@ def test_episodes_widen_the_interval_of_the_level(rng):
 def test_one_run_that_went_wrong_does_not_bend_the_curve(rng):
     x = sizes(6)
     points = measured(x, power(x, 1.5, (1.0, 0.5)), 2e-3, 3, rng)
-    points.sums[4] *= 1.2  # far beyond the noise
+    points.panel.points[4][:] *= 1.2  # far beyond the noise
     assert fit_power(points, 20)["alpha"].value == pytest.approx(0.5, abs=0.06)
 
 
@@ -67,7 +67,8 @@ def test_a_noisy_point_weighs_less(rng):
     x = sizes(5)
     points = measured(x, power(x, 1.5, (1.0, 0.5)), 1e-3, 4, rng)
     last = np.flatnonzero(points.x[:, 0] == points.x[:, 0].max())
-    points.sums[last] *= np.array([0.9, 0.95, 0.98, 1.04])[:, None]
+    for i, factor in zip(last, (0.9, 0.95, 0.98, 1.04), strict=True):
+        points.panel.points[i][:] *= factor
     noise = points.noise()
     assert noise[last[0]] > 2 * noise[0]
     assert fit_power(points, 20)["alpha"].value == pytest.approx(0.5, abs=0.1)
@@ -111,7 +112,8 @@ def test_branches_of_a_run_share_their_seed(rng):
     """What a seed does to a run it does to all of its branches; drawn apart, the slope over them would look noisy."""
     x = np.array([(n, d) for n in np.geomspace(1e4, 3e5, 4) for d in (1e3, 1e4)])
     points = measured(x, power(x, 1.0, (1.0, 0.5), (1.0, 0.5)), 0.0, 3, rng, episode_noise=0.0)
-    points.sums[:] *= np.exp(0.05 * np.array([-1, 0, 1]))[points.seed][:, None]
+    for (seed,), values in zip(points.panel.seeds, points.panel.points, strict=True):
+        values *= np.exp(0.05 * (seed - 1))
     draws = points.draw(50, rng, episodes=False)
     first = points.run == points.run[0]
     short, long = (first & (points.x[:, 1] == d) for d in (1e3, 1e4))

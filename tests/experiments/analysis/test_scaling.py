@@ -48,7 +48,7 @@ def branches():
                 count = 4 * len(ROBOTS)
                 windows[id] = WindowTable(
                     np.repeat(ROBOTS, 4), np.tile(np.arange(4), len(ROBOTS)), np.zeros(count, int),
-                    {"cross_entropy": np.full(count, loss)},
+                    np.full(count, 4), {"cross_entropy": np.full(count, loss)},
                 )  # fmt: skip
                 flops[id] = 6.0 * n * d
                 points.append(Point(steps, trial, series=f"width {width}"))
