@@ -4,7 +4,8 @@ Owns the form, its gradient and the minimisation; what a fit means, and whether 
 
 Minimised is sum_i huber(w_i (log L(x_i) - log y_i)) with a Huber threshold of DELTA in the logarithm, as in
 Hoffmann et al. 2022, "Training Compute-Optimal Large Language Models": small residuals count as squares, large ones
-as absolute values, so that one run that went wrong does not bend the curve. Residuals are taken with the parameters in logarithms,
+as absolute values, so that one run that went wrong does not bend the curve. Residuals are taken with the parameters in
+logarithms,
 
     log L = logsumexp(e, a_1 - alpha_1 z_1, ...),   z_k = log(x_k / geometric mean of x_k),
 

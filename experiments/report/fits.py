@@ -73,8 +73,8 @@ def describe_fits(fits: Sequence[Fitted], isoflop: IsoFlop | None, outcomes: Seq
         ])  # fmt: skip
     head = ["curve", "over", "L, nats per token", "exponent", "E", "remarks"]
     return (
-        "<p>Fitted is L = E + A x<sup>\u2212\u03b1</sup>, the loss in nats per held-out token over the axis: Huber loss "
-        "in the logarithm, points weighted by the noise that seeds were measured to have. Brackets hold "
+        "<p>Fitted is L = E + A x<sup>\u2212\u03b1</sup>, the loss in nats per held-out token over the axis: Huber "
+        "loss in the logarithm, points weighted by the noise that seeds were measured to have. Brackets hold "
         f"{LEVEL:.0%} of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, this "
         "tokenizer and this range; beyond its last point it is a guess until a prediction has come true.</p>"
         f"{drawn}{table(head, lines, text=6)}{_outcomes(outcomes)}{_isoflop(isoflop)}"

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from experiments.analysis.controllability import Controlled, beyond, controllability
 from experiments.report.pieces import pm, table
 from experiments.rows import OVERALL, CurvePoint, Row, curve
 from experiments.running.provenance import Provenance
@@ -18,8 +19,12 @@ from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
 COLUMNS = {
-    "perplexity": "perplexity", "accuracy": "accuracy", "action_nats": "action-nats", "delta_psnr": "ΔPSNR (dB)",
-    "psnr": "PSNR (dB)", "psnr_copy": "copying (dB)", "ssim": "SSIM",
+    "perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)", "psnr_copy": "copying (dB)",
+    "ssim": "SSIM",
+}  # fmt: skip
+FOLLOWS = {
+    "action_nats": "action-nats", "retrieval": "retrieval", "delta_psnr": "ΔPSNR (dB)",
+    "counterfactual_gain": "counterfactual (dB)",
 }  # fmt: skip
 ORDER = ("action_nats", "delta_psnr")
 """Controllability: by the first that was measured."""
@@ -30,25 +35,37 @@ class Robot:
     """What the reference trials, of all seeds, say of one robot."""
 
     name: str
-    control: float  # standard errors of ORDER from zero; nan if it was not measured
+    errors: float  # standard errors of ORDER from zero; nan if it was not measured
     ahead: float  # dB of PSNR ahead of copying the last given frame
     ahead_sem: float
+    follows: Mapping[str, Controlled]  # by metric; {} without per-window numbers
 
 
 def robots_of(
     rows: Sequence[Row], sweep: Sweep, provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[Robot]:
     """Of the scope of the sweep that shows the reference trial, the most controllable first."""
-    measured = {r.metric for r in rows if r.sweep == sweep.name}
-    metric = next((m for m in ORDER if m in measured), None)
-    ids = [trial_id(p.trial, provenance) for p in sweep.points if p.role == POINT and p.x == sweep.reference_x]
-    tables = [windows[id] for id in ids if id in windows]
+    tables = {}
+    for p in sweep.points:
+        id = trial_id(p.trial, provenance)
+        if p.role == POINT and p.x == sweep.reference_x and id in windows:
+            tables[p.trial.train.seed] = windows[id]
+    follows: dict[str, dict[str, Controlled]] = {name: {} for name in sweep.scope}
+    for line in controllability(tables) if tables else ():
+        follows.setdefault(line.robot, {})[line.metric] = line
     found = []
     for name in sweep.scope:
-        at = _at_reference(rows, sweep, metric, name) if metric else None
-        control = at.mean / at.sem if at and at.sem > 0 else math.nan
-        found.append(Robot(name, control, *_ahead(rows, sweep, name, tables)))
-    return sorted(found, key=lambda r: -r.control if not math.isnan(r.control) else math.inf)
+        errors = next((follows[name][m].errors for m in ORDER if m in follows[name]), math.nan)
+        if not follows[name]:
+            errors = _errors_of_rows(rows, sweep, name)
+        found.append(Robot(name, errors, *_ahead(rows, sweep, name, list(tables.values())), follows[name]))
+    return sorted(found, key=lambda r: -r.errors if not math.isnan(r.errors) else math.inf)
+
+
+def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
+    """Of trials that kept no numbers of their windows."""
+    points = (_at_reference(rows, sweep, metric, name) for metric in ORDER)
+    return next((p.mean / p.sem for p in points if p and p.sem > 0), math.nan)
 
 
 def _ahead(rows: Sequence[Row], sweep: Sweep, name: str, tables: Sequence[WindowTable]) -> tuple[float, float]:
@@ -74,35 +91,53 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
     data = json.loads(data_summary.read_text()) if data_summary.exists() else {}
     measured = {r.metric for r in rows if r.sweep == sweep.name}
     metrics = [m for m in COLUMNS if m in measured]
-    order = next((COLUMNS[m].split(" (")[0] for m in ORDER if m in measured), None)
+    follows = [m for m in FOLLOWS if any(m in r.follows for r in robots)]
+    shares = {r.name: line.explained for r in robots for line in r.follows.values() if not math.isnan(line.explained)}
 
     def cell(name: str, metric: str) -> str:
         at = _at_reference(rows, sweep, metric, name)
         return pm(at.mean, at.sem) if at else "–"
 
+    def followed(robot: Robot, metric: str) -> str:
+        line = robot.follows.get(metric)
+        return pm(line.mean, line.sem) if line else "–"
+
     lines = []
-    for robot in (*robots, None):
-        name = robot.name if robot else OVERALL
-        facts = data.get(name, {})
-        counts = [str(facts.get(k, "–")) for k in ("episodes", "windows")]
+    for robot in robots:
+        facts = data.get(robot.name, {})
+        share = [f"{shares[robot.name]:.0%}" if robot.name in shares else "–"] if shares else []
         lines.append([
-            html.escape(name) if robot else "<b>all</b>",
-            _errors(robot.control) if robot else "",
-            _ahead_words(robot) if robot else "",
-            *(cell(name, metric) for metric in metrics),
-            *counts,
+            html.escape(robot.name), *share, _errors(robot.errors), *(followed(robot, m) for m in follows),
+            _ahead_words(robot), *(cell(robot.name, m) for m in metrics),
+            *(str(facts.get(k, "–")) for k in ("episodes", "windows")),
         ])  # fmt: skip
-    beyond = sum(r.control > 2 for r in robots)
-    sorted_by = (
-        f"Sorted by how many standard errors the {order} lies above zero; {beyond} of {len(robots)} are beyond two. "
-        if order
-        else ""
-    )
-    head = ["robot", "s.e. above zero", "ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"]
-    return (
-        f"<p>{sorted_by}PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of "
-        "repeating the last given frame. Errors are standard errors over episodes and seeds.</p>"
-        + table(head, lines)
+    blank = [""] * (1 + bool(shares))
+    means = [cell(OVERALL, m) for m in follows]
+    lines.append(["<b>all</b>", *blank, *means, "", *(cell(OVERALL, m) for m in metrics), "", ""])
+    head = ["robot", *["decided by actions"] * bool(shares), "s.e. above zero", *(FOLLOWS[m] for m in follows)]
+    head += ["ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"]
+    return f"<p>{_words(robots, follows, bool(shares))}</p>" + table(head, lines)
+
+
+def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool) -> str:
+    lines = [line for robot in robots for line in robot.follows.values()]
+    counted = {m: beyond(lines, m) for m in follows}
+    parts = [f"{FOLLOWS[m].split(' (')[0]} of {more} among {of}" for m, (more, of) in counted.items()]
+    order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
+    said = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
+    said += f"Beyond two standard errors lie the {', the '.join(parts)} robots. " if parts else ""
+    if shares:
+        said += "<em>Decided by actions</em>: the share of the change of its pixels that actions explain in truth. "
+    if "retrieval" in follows:
+        said += "<em>Retrieval</em>: how often the true actions are found among all that were tried. "
+    if "counterfactual_gain" in follows:
+        said += (
+            "<em>Counterfactual</em>: dB that frames under other actions are nearer to the simulator's under these "
+            "than frames under the recorded ones. "
+        )
+    return said + (
+        "PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of repeating the "
+        "last given frame. Errors are standard errors over episodes and seeds."
     )
 
 

@@ -120,8 +120,8 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
     head = ["", "curve", "loss", "best rate", "steps moved", "lowest", "base width's best rate", "penalty"]
     return f"<p>{_transfer(optima)}</p>" + table(head, lines, text=3) + (
         "<p><em>Steps moved</em>: of the grid of rates, from the best of the base width. The penalty is what the loss "
-        "is higher by when a width takes the rate that is best at the base width (bold); that of the held-out loss is in "
-        "nats per token. Errors are over seeds, where there are several; the grid is not interpolated. "
+        "is higher by when a width takes the rate that is best at the base width (bold); that of the held-out loss is "
+        "in nats per token. Errors are over seeds, where there are several; the grid is not interpolated. "
         "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
         "beyond.</p>"
     )

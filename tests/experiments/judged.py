@@ -50,7 +50,7 @@ def finish(workspace: Workspace, id: str, trial: Trial) -> None:
     (directory / "job.json").write_text(json.dumps(job))
     (directory / "provenance.json").write_text(json.dumps(to_dict(RECORD)))
     windows = windows_of(trial)
-    windows.save(directory / FILE)
+    windows.save(directory / FILE, id)
     write_samples(directory / "samples.npz", samples_of(trial))
     first = math.log(trial.model.vocab_size)
     untrained = {"cross_entropy": {"mean": first, "sem": 0.0, "n": 2, "episodes": 2}}
@@ -85,6 +85,7 @@ def windows_of(trial: Trial) -> WindowTable:
         "ssim": np.full(count, 0.8),
         "delta_psnr": steers + 0.3 * own.standard_normal(count),
     }
+    metrics = {name: column.astype(np.float32).astype(np.float64) for name, column in metrics.items()}  # as judged
     names = np.repeat(np.array(trial.evaluated), per_robot)
     frames = np.full(count, trial.model.frames)
     return WindowTable(names, episode, np.tile(np.arange(WINDOWS), count // WINDOWS), frames, metrics)

@@ -68,8 +68,9 @@ def rejudge(workspace, id, change):
 
     directory = workspace.trials / id
     windows = WindowTable.load(directory / FILE)
-    windows = replace(windows, metrics=change(dict(windows.metrics)))
-    windows.save(directory / FILE)
+    metrics = change(dict(windows.metrics))
+    windows = replace(windows, metrics={k: v.astype(np.float32).astype(np.float64) for k, v in metrics.items()})
+    windows.save(directory / FILE, id)
     result = json.loads((directory / RESULT).read_text())
     result.pop("hash")
     write_result(directory, result | {"evaluation": summarise(windows, 1).to_dict()})

@@ -36,7 +36,7 @@ def test_both_axes_at_once(rng):
 
 def test_about_nine_of_ten_intervals_hold_the_truth():
     """Of exponent, smallest loss, and the curve where there is no point, in forty studies of one law. Three seeds
-    per point know their own noise badly: over 600 studies the shares are 0.90, 0.86 and 0.83."""
+    per point know their own noise badly: over 450 studies the shares are 0.90, 0.85 and 0.83."""
     x, beyond, held, rng = sizes(6), np.array([[1e6]]), [], np.random.default_rng(5)
     for _ in range(40):
         fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 0.01, 3, rng), draws=50, episodes=False)
@@ -44,7 +44,7 @@ def test_about_nine_of_ten_intervals_hold_the_truth():
         curve = low[0] <= power(beyond, 1.5, (1.0, 0.5))[0] <= high[0]
         held.append([*(fit[n].low <= truth <= fit[n].high for n, truth in (("alpha", 0.5), ("E", 1.5))), curve])
     share = np.mean(held, axis=0)
-    assert (share >= 0.75).all(), share
+    assert (share >= 0.7).all(), share  # these, less two standard deviations of 40 tries
     assert (share < 1).any(), share  # intervals that hold everything say nothing
 
 
