@@ -69,16 +69,17 @@ def expected_loss(model: ModelConfig) -> float:
 
 def windows_of(trial: Trial) -> WindowTable:
     """Windows that are as hard in every trial, and a loss and a ΔPSNR that follow from width, seed and control."""
-    shared, own = np.random.default_rng(1), np.random.default_rng(zlib.crc32(trial.title.encode()))
+    own = np.random.default_rng(zlib.crc32(trial.title.encode()))
     loss = expected_loss(trial.model) * math.exp(NOISE * own.standard_normal())
     per_robot = EPISODES * WINDOWS
     count = per_robot * len(trial.evaluated)
     episode = np.tile(np.repeat(np.arange(EPISODES), WINDOWS), len(trial.evaluated))
-    hard = np.exp(0.2 * shared.standard_normal(count))
+    of_robots = [np.random.default_rng(zlib.crc32(name.encode())) for name in trial.evaluated]  # whatever others there are
+    hard = np.concatenate([np.exp(0.2 * rng.standard_normal(per_robot)) for rng in of_robots])
+    copy = np.concatenate([18 + rng.standard_normal(per_robot) for rng in of_robots])
     steers = np.repeat(np.linspace(0.0, 3.0, len(trial.evaluated)), per_robot) * (not trial.shuffle_actions)
-    copy = 18 + shared.standard_normal(count)
     metrics = {
-        "cross_entropy": loss * hard / hard.mean(),
+        "cross_entropy": loss * hard,
         "accuracy": np.full(count, 0.5),
         "psnr": copy + 2 + 0.3 * own.standard_normal(count),
         "psnr_copy": copy,
