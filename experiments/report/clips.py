@@ -39,13 +39,13 @@ def describe_clips(path: Path, prompt: int, order: Sequence[str]) -> str:
         clips = {n: {k: samples[f"{n}/{k}"][0] for k in KINDS if f"{n}/{k}" in samples.files} for n in chosen}
     figures = [_figure(name, kinds, prompt) for name, kinds in clips.items()]
     rest = "".join(figures[SHOWN:])
-    more = f"<details><summary>{len(figures) - SHOWN} more robots</summary><div class=clips>{rest}</div></details>"
+    more = f"<details><summary>{len(figures) - SHOWN} more robots</summary><div class=trios>{rest}</div></details>"
     paper = "".join(_strip(name, kinds, prompt) for name, kinds in list(clips.items())[:ON_PAPER])
     return (
         f"<p>The first validation window of each robot. Of its frames the first {prompt} are given (grey bar); the "
         "rest is predicted from actions alone: once from those that were recorded, once from others, drawn at random. "
         "Where the model listens, the right clip leaves the left one and the middle one stays with it.</p>"
-        f'<div class=clips>{"".join(figures[:SHOWN])}</div>{more if rest else ""}<div class=paper>{paper}</div>'
+        f'<div class=trios>{"".join(figures[:SHOWN])}</div>{more if rest else ""}<div class=paper>{paper}</div>'
     )
 
 
