@@ -20,7 +20,8 @@ p { margin: .4rem 0 .8rem; max-width: 46rem; }
 .card small { display: block; color: var(--muted); } .card b { font-size: 1.4rem; font-weight: 600; }
 .card b { white-space: nowrap; } .card b .sem { font-size: .95rem; font-weight: 400; }
 .warning { color: var(--bad); }
-.plot { display: block; max-width: 100%; max-height: 46rem; margin: 0 auto; border-radius: 8px; background: white; padding: .5rem; }
+.plot { display: block; max-width: 100%;
+  max-height: 46rem; margin: 0 auto; border-radius: 8px; background: white; padding: .5rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; margin: .5rem 0 .8rem; }
 th, td { text-align: right; padding: .28rem .8rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
@@ -62,5 +63,6 @@ td.text:last-child:nth-child(n+4) { white-space: normal; min-width: 11rem; }
   @page { margin: 14mm; } body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
   details, .trios { display: none; } .paper { display: block; } .scroll { overflow: visible; }
   table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; }
-  .plot { max-height: 100mm; } figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3 { break-after: avoid; } }
+  .plot { max-height: 100mm; }
+  figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3 { break-after: avoid; } }
 """

@@ -74,7 +74,7 @@ def windows_of(trial: Trial) -> WindowTable:
     per_robot = EPISODES * WINDOWS
     count = per_robot * len(trial.evaluated)
     episode = np.tile(np.repeat(np.arange(EPISODES), WINDOWS), len(trial.evaluated))
-    of_robots = [np.random.default_rng(zlib.crc32(name.encode())) for name in trial.evaluated]  # whatever others there are
+    of_robots = [np.random.default_rng(zlib.crc32(name.encode())) for name in trial.evaluated]
     hard = np.concatenate([np.exp(0.2 * rng.standard_normal(per_robot)) for rng in of_robots])
     copy = np.concatenate([18 + rng.standard_normal(per_robot) for rng in of_robots])
     steers = np.repeat(np.linspace(0.0, 3.0, len(trial.evaluated)), per_robot) * (not trial.shuffle_actions)
