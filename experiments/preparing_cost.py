@@ -1,6 +1,6 @@
 """What is made before the first trial of a study will cost: simulating, the tokenizer, tokens, and starting up.
 
-By formula and by what was measured on one core of the machine that the `cpu` preset is meant for; nothing is made and
+By formula and by what was measured on two cores of the machine that the `cpu` preset is meant for; nothing is made and
 no data is read. What the registry does not say of a dataset (episodes, length) is not counted, and named.
 """
 
@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from experiments.study import Study
 from hma_jax.config import TokenizerConfig
 
-SIMULATED = 1500.0
-"""Native frames of the suite that a core simulates, draws and writes in a second."""
+SIMULATED = 3000.0
+"""Native frames of the suite that two cores simulate, draw and write in a second."""
 DECODED = 1500.0
 """Frames that a core reads, decodes and resizes in a second, on the way to the tokenizer."""
 LARGE_PRODUCTS = 3.0
@@ -27,7 +27,7 @@ START = 30.0
 
 @dataclass(frozen=True)
 class PreparingCost:
-    """Seconds of one core, or of the accelerator for what the tokenizer computes."""
+    """In seconds."""
 
     simulating: float = 0.0
     tokenizer: float = 0.0

@@ -93,8 +93,8 @@ CPU_FULL = replace(
     train=replace(CPU.train, steps=8000),
     tau=1000.0,  # every robot weighs the same, whatever others there are and however much each has
     seeds=(0, 1, 2),
-    widths=(24, 32, 48, 64, 80),  # a decade of trunk parameters
-    transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(24, 48, 96), datasets=10, steps=1000),
+    widths=(20, 32, 48, 64, 80),  # over a decade of trunk parameters
+    transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(20, 48, 80), datasets=10, steps=1000),
     designs=DesignConfig(long=(16_000, 32_000, 64_000), ablation_steps=4000, end_controls=True),
     axes=(
         "horizon", "dilution", "transfer", "newcomers", "episodes", "width", "compute", "lr", "lr_horizon", "fewshot",

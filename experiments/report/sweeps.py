@@ -126,18 +126,19 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
         ]
         for o in optima
     ]
-    head = ["", "curve", "loss", "best rate", "steps moved", "lowest", "base width's best rate", "penalty"]
-    return f"<p>{_transfer(optima)}</p>" + table(head, lines, text=3) + (
-        "<p><em>Steps moved</em>: of the grid of rates, from the best of the base width. The penalty is what the loss "
-        "is higher by when a width takes the rate that is best at the base width (bold); that of the held-out loss is "
+    kind = "width" if sweep.name == "lr" else "curve"
+    head = ["", "curve", "loss", "best rate", "steps moved", "lowest", f"base {kind}'s best rate", "penalty"]
+    return f"<p>{_transfer(optima, kind)}</p>" + table(head, lines, text=3) + (
+        f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the loss "
+        f"is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the held-out loss is "
         "in nats per token. Errors are over seeds, where there are several; the grid is not interpolated. "
         "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
         "beyond.</p>"
     )
 
 
-def _transfer(optima: Sequence[Optimum]) -> str:
-    """How far the best rate moves from that of the base width, with muP and without, on held-out data."""
+def _transfer(optima: Sequence[Optimum], kind: str) -> str:
+    """How far the best rate moves from that of the base `kind`, with muP and without, on held-out data."""
     parts = []
     for role, words in ROLES.items():
         own = [o for o in optima if o.role == role and o.metric == "cross_entropy" and not math.isnan(o.moved)]
@@ -145,7 +146,7 @@ def _transfer(optima: Sequence[Optimum]) -> str:
             far = max(own, key=lambda o: abs(o.moved))
             open_ended = ", at an end of the grid, so perhaps further" if far.edge else ""
             steps = f"{abs(far.moved):.0f} step{'s' * (abs(far.moved) != 1)}"
-            parts.append(f"{words}: the best rate of {len(own)} widths moves by at most {steps}{open_ended}")
+            parts.append(f"{words}: the best rate of {len(own)} {kind}s moves by at most {steps}{open_ended}")
     return f"{'; '.join(parts)} (held-out loss)." if parts else ""
 
 
