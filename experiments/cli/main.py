@@ -14,7 +14,9 @@ from collections.abc import Sequence
 from tyro.extras import SubcommandApp
 
 from experiments.cli import bench, convert, data, study, tokenizer
+from experiments.cli.check import check
 from experiments.cli.plan import plan
+from experiments.cli.play import play
 from experiments.commands.study import TrialsFailed
 from experiments.program import PROGRAM
 from experiments.progress import errors
@@ -34,6 +36,8 @@ app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)
 app.command(convert.convert_app, name="convert", help=convert.HELP)
 app.command(bench.bench_app, name="bench", help=bench.HELP)
 app.command(name="plan")(plan)
+app.command(name="play")(play)
+app.command(name="check")(check)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
