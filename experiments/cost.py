@@ -15,9 +15,9 @@ from rich.table import Table
 
 from experiments.progress import tidy_table
 from experiments.running.provenance import Provenance
+from experiments.running.trial import Trial, trial_id
 from experiments.study import Study
-from experiments.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
-from experiments.trial import Trial, trial_id
+from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference
 from experiments.running.ledger import DIVERGED, FINISHED
-from experiments.sweep import Sweep
+from experiments.sweeps.sweep import Sweep
 
 LOSSES = {"cross_entropy": OVERALL, LOSS: TRAINING}
 """What optima are taken of, with scopes: nats per held-out token, and the training objective."""

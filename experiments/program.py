@@ -12,7 +12,7 @@ PROGRAM = "hma"
 
 
 def run_sweep(axis: str) -> NoReturn:
-    """The main of an experiment module: `python -m experiments.scale_width` is `hma sweep width`."""
+    """The main of an experiment module: `python -m experiments.sweeps.width` is `hma sweep width`."""
     os.execv(sys.executable, [sys.executable, "-m", "experiments.cli", "sweep", axis, *sys.argv[1:]])
 
 

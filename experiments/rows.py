@@ -20,8 +20,8 @@ from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
 from experiments.running.sealed import read_result
-from experiments.sweep import POINT, Point, Sweep
-from experiments.trial import trial_id
+from experiments.running.trial import trial_id
+from experiments.sweeps.sweep import POINT, Point, Sweep
 
 OVERALL = "overall"
 """The scope that averages over all datasets of a sweep, each counting equally."""

@@ -1,6 +1,6 @@
 """What the user asked for, the study that follows from it, and the commands that ask for the same again.
 
-A command that is printed is made of every field of `Where`, so nothing that the user gave is lost on the way
+A command that is printed is made of every field of `StudyArguments`, so nothing that the user gave is lost on the way
 from one command to the next. What holds for one command only (--workers, --replace) is not part of it.
 """
 
@@ -16,8 +16,8 @@ from tyro.conf import UseAppendAction, arg
 
 from experiments.presets import get_preset
 from experiments.program import PROGRAM
+from experiments.running.workspace import Workspace
 from experiments.study import Study, on_tokenizer, on_user_data, override
-from experiments.workspace import Workspace
 from hma_jax.config import ConfigError
 from hma_jax.training.claim import is_address
 
@@ -28,7 +28,7 @@ UNSET = arg(help_behavior_hint="")
 
 
 @dataclass(frozen=True)
-class Where:
+class StudyArguments:
     """Which study, on which data, in which directory, on which devices."""
 
     preset: Preset = "cpu"
@@ -51,7 +51,7 @@ class Where:
     """Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
     Short for --set execution.mesh.data=... and so on. No result depends on it."""
 
-    def anywhere(self) -> Where:
+    def anywhere(self) -> StudyArguments:
         """The same, meant in the same way from any working directory. Raises ConfigError for an `out` at a URL."""
         from data_pipelines.sources.rlds.location import absolute
 
@@ -88,7 +88,7 @@ class Where:
 class Setting:
     """A study, its data and where it lives: what every command works on."""
 
-    asked: Where
+    asked: StudyArguments
     study: Study
     data: tuple[str, ...]  # RLDS directories, in the study's order; () for the suite
     workspace: Workspace
@@ -122,7 +122,7 @@ def command_words(*arguments: str | Path) -> str:
     return shlex.join(map(_word, arguments))
 
 
-def make_setting(where: Where) -> Setting:
+def make_setting(where: StudyArguments) -> Setting:
     """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing.
 
     Raises ConfigError, and DataError for directories that are no datasets.

@@ -32,7 +32,7 @@ MENTIONED = re.compile(r"(?<!`)`([^`\s]+)`|\]\(([^)\s#]+)\)")
 QUICK = (
     "hma data list open-x",
     "hma bench report experiments/results/bench/cpu",
-    "python -m experiments.scale_width --preset cpu --dry-run",
+    "python -m experiments.sweeps.width --preset cpu --dry-run",
 )
 """Of the documented commands, those that take a moment and need no data; tests run them."""
 
@@ -133,9 +133,9 @@ def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bo
     if code:
         missing = "equired" in said and "nrecognized" not in said and "invalid" not in said.lower()
         return None if missing and not whole else said
-    where = calls[-1].get("where") if calls else None
-    if where is not None and where.set:
-        override(get_preset(where.preset or "cpu"), list(where.set))  # raises ConfigError
+    asked = calls[-1].get("asked") if calls else None
+    if asked is not None and asked.set:
+        override(get_preset(asked.preset or "cpu"), list(asked.set))  # raises ConfigError
     return None
 
 
@@ -182,7 +182,7 @@ def test_every_command_in_backticks_parses(parsed, capsys):
         ("python -m tests.stress.tokenize_kills --kills 3", None),
         ("python -m tests.stress.tokenize_kills --kill 3", "--kill"),
         ("python -m tests.stress.nothing", "no module"),
-        ("python -m experiments.scale_width --dry-runs", "--dry-runs"),
+        ("python -m experiments.sweeps.width --dry-runs", "--dry-runs"),
     ],
 )
 def test_what_is_wrong_is_found(command, wrong, parsed, capsys):
@@ -206,7 +206,7 @@ def test_a_documented_command_of_a_moment_runs(command, monkeypatch, capsys):
     assert command in commands(inline), "it is documented no longer"
     monkeypatch.chdir(ROOT)
     words = shlex.split(command)
-    arguments = words[1:] if words[0] == "hma" else ["sweep", words[2].split("_")[-1], *words[3:]]
+    arguments = words[1:] if words[0] == "hma" else ["sweep", words[2].split(".")[-1], *words[3:]]
     assert program.main(arguments) == 0
     assert capsys.readouterr().out.count("\n") > 3
 

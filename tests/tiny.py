@@ -85,7 +85,9 @@ def lively_params(config: ModelConfig, table=TABLE, scale: float = 0.2):
     """(declarations, parameters away from their start, where much is zero or tiny)."""
     declared = declare_model(config, table)
     params = declared.init(0)
-    leaves, treedef = jax.tree.flatten(params)
-    keys = jax.random.split(jax.random.key(1), len(leaves))
-    moved = [x + scale * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
-    return declared, jax.tree.unflatten(treedef, [jnp.asarray(x) for x in moved])
+    rng = np.random.default_rng(2)  # not jax.random, which compiles a program for every shape
+
+    def moved(x: jax.Array) -> jax.Array:
+        return jnp.asarray(np.asarray(x) + scale * rng.standard_normal(x.shape, dtype=np.float32))
+
+    return declared, jax.tree.map(moved, params)

@@ -17,7 +17,7 @@ from pathlib import Path
 from hma_jax.runtime.locks import Held, Lock, exclusive
 
 FIRST_WAIT, LONGEST_WAIT = 0.1, 5.0
-"""Seconds between two looks at what another process holds; from one to the next half as long again."""
+"""Seconds between two checks of what another process holds; from one to the next half as long again."""
 
 
 class Claim:
@@ -47,7 +47,7 @@ def claim(place: Path, *, wait: bool = False) -> Iterator[Claim]:
     """
     place.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
-        pauses = pauses_between_looks()
+        pauses = waiting_times()
         while True:
             try:
                 lock = stack.enter_context(exclusive(lock_file(place), lease=True, remove=True))
@@ -81,8 +81,8 @@ def living_claim(directory: Path) -> Held | None:
     return None
 
 
-def pauses_between_looks() -> Iterator[float]:
-    """Seconds to wait before the next look, for ever."""
+def waiting_times() -> Iterator[float]:
+    """Seconds to wait before the next check, for ever."""
     pause = FIRST_WAIT
     while True:
         yield pause

@@ -96,7 +96,7 @@ def _suite() -> tuple[DatasetSpec, ...]:
 
 @functools.cache
 def _simulators() -> tuple[DatasetSpec, ...]:
-    from data_pipelines.sim.embodiments import EMBODIMENTS
+    from data_pipelines.simulators.embodiments import EMBODIMENTS
 
     return tuple(
         DatasetSpec(

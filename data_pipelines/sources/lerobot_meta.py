@@ -17,6 +17,7 @@ from typing import Any
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_lines, read_object
 from data_pipelines.names import inside, shown
+from data_pipelines.sources.parquet_pages import check_pages
 from data_pipelines.sources.rlds.location import is_failure, retried
 from data_pipelines.sources.units import require_module
 
@@ -56,7 +57,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     version = info.get("codebase_version")
     if version not in VERSIONS:
         raise DataError(
-            f"{info_path}: codebase_version is {version!r}; {', '.join(VERSIONS)} can be read. Convert the "
+            f"{info_path}: codebase_version is {shown(version)}; {', '.join(VERSIONS)} can be read. Convert the "
             "dataset with LeRobot's own scripts first."
         )
     for field in ("fps", "features", "data_path"):
@@ -148,6 +149,7 @@ def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> 
 
     def read() -> Any:
         try:
+            _check_pages(parquet.read_metadata(path), path)
             table = parquet.read_table(path, columns=columns, partitioning=None, **options)
             table.column_names  # noqa: B018  that they are text is found out here
             return table
@@ -157,6 +159,15 @@ def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> 
             raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
 
     return retried(path, read)
+
+
+def _check_pages(metadata: Any, path: Path) -> None:
+    """Raises ValueError for a page that no reader should take memory for."""
+    with path.open("rb") as file:
+        for group in map(metadata.row_group, range(metadata.num_row_groups)):
+            for column in map(group.column, range(group.num_columns)):
+                starts = [at for at in (column.dictionary_page_offset, column.data_page_offset) if at]
+                check_pages(file, min(starts, default=0), column.total_compressed_size)
 
 
 _PLACE = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")

@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from data_pipelines.errors import DataError
-from data_pipelines.publishing.claims import claim, living_claim, pauses_between_looks
+from data_pipelines.publishing.claims import claim, living_claim, waiting_times
 from data_pipelines.publishing.files import remove, sync
 from data_pipelines.tokens.manifest import FILE, SPLITS, LostEpisodes, Manifest, SplitFacts
 from data_pipelines.tokens.manifest_file import load_manifest
@@ -70,7 +70,7 @@ def write_dataset(
         if overwrite:
             _remove_others(root, plan, parts)
         maker = PartMaker(_work_directory(root, plan, parts), final, plan, parts, tuple(lost), max_lost)
-        pauses = pauses_between_looks()
+        pauses = waiting_times()
         while True:
             try:
                 manifest = _attempt(maker, make, progress)

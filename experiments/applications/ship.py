@@ -28,7 +28,7 @@ from data_pipelines.publishing.files import publish, write_file
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_starts
 from experiments.applications.simulators import load_simulator, true_simulator
-from experiments.machine import describe_machine
+from experiments.running.machine import describe_machine
 from hma_jax.config import require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params

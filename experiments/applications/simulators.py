@@ -11,7 +11,7 @@ import numpy as np
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
 from data_pipelines.tokens.store import TokenStore
-from experiments.workspace import Workspace
+from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.simulator.folder import ROBOTS
 from hma_jax.simulator.interface import AnySimulator

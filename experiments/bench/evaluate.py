@@ -1,6 +1,6 @@
 """Evaluation of a model: the protocol in one compiled call against the protocol taken literally.
 
-Literally means a pass over the whole window for every frame, look and action sequence. Where every
+Literally means a pass over the whole window for every frame, unmasking step and action sequence. Where every
 frame follows recorded ones, as the official release evaluates, that is M (T - 1) passes for each of
 the 1 + draws sequences, the likelihood included; where frames follow generated ones, T - 1 for the
 likelihood and M (T - prompt) for each sequence. Both give the same numbers, which is checked.
@@ -85,15 +85,15 @@ def _every_frame(
     hidden = hma.align_hidden(None, tokens.shape[:2])
 
     def one(t: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def look(frame: Frame) -> jax.Array:
+        def predict(frame: Frame) -> jax.Array:
             later = jnp.broadcast_to((jnp.arange(tokens.shape[1]) >= t)[None, :, None], tokens.shape)
             values, masked = tokens.at[:, t].set(frame.values), later.at[:, t].set(frame.masked)
             return hma(values, masked, aligned, robots, hidden_BT=hidden).said[:, t]
 
-        first = look(blank_frame(hma.config, len(tokens)))
+        first = predict(blank_frame(hma.config, len(tokens)))
         keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)
         entropy = factored_cross_entropy(first, tokens[:, t]).mean(-1)
-        return entropy, decode_frame(hma, first, look, keys, decode)
+        return entropy, decode_frame(hma, first, predict, keys, decode)
 
     entropies, frames = jax.lax.map(one, jnp.arange(1, tokens.shape[1]))
     return entropies.mean(0), jnp.moveaxis(frames, 0, 1)

@@ -1,7 +1,7 @@
 """Generation, frame by frame: every way of making the next frame, on one model, by turns.
 
 `recompute` is what our oracle and the official release do: M passes over the whole window.
-`fill` is a frame while the window fills (its commit fused with the next frame's first look),
+`fill` is a frame while the window fills (its commit fused with the next frame's first pass),
 `slide` an exact frame past the window, `stream` an approximate one. `whole` is one pass over the
 whole window, the unit that the others are compared with, and `plain` the same with attention over
 all frames at once.

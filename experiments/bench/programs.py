@@ -26,7 +26,7 @@ def program(
     subject: Subject, name: str, sampler: tuple[str, int] = RELEASED, rows: int = 1
 ) -> tuple[Callable[..., Any], *tuple[Any, ...]]:
     """(a function to be jitted, its arguments) for step, forward, fill or slide. The last two make a frame with
-    two looks at it, `fill` as the last of a window."""
+    two passes over it, `fill` as the last of a window."""
     declared, batch, config = subject.declared, subject.batch(rows), subject.config
     if name == "step":
         step = make_train_step(declared, subject.table, config, TrainConfig(batch=rows, seed=subject.seed))

@@ -2,7 +2,7 @@
 beside the time per frame, decoding by decoding, on the same held-out windows.
 
 The first decoding is the reference. For latents the sampler's kind and steps vary, for ids the
-looks at each frame; where windows are longer than the model's, so does what happens past it.
+passes over each frame; where windows are longer than the model's, so does what happens past it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from hma_jax.evaluation.evaluate import evaluate
 from hma_jax.evaluation.summary import paired_difference
 
 SAMPLER_STEPS = {"ddpm": (100, 50, 25, 12, 8, 4), "ddim": (100, 50, 25, 12, 8, 4), "dpm++": (12, 10, 8)}
-LOOKS = (8, 4, 2, 1)
+PASSES = (8, 4, 2, 1)
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def decodings(model: ModelConfig, config: EvalConfig, frames: int) -> dict[str, 
     if frames > model.frames:
         return {slide: changed(slide=slide) for slide in ("exact", "streaming")}
     if model.diffusion is None:
-        return {f"M = {m}": changed(unmask_steps=m) for m in LOOKS if m <= model.tokens}
+        return {f"M = {m}": changed(unmask_steps=m) for m in PASSES if m <= model.tokens}
     return {
         f"{kind} {steps}": changed(sampler=replace(config.decode.sampler, kind=kind, steps=steps))
         for kind, counts in SAMPLER_STEPS.items()

@@ -13,7 +13,7 @@ import jax
 
 from data_pipelines.publishing.files import write_file
 from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
-from experiments.machine import describe_machine
+from experiments.running.machine import describe_machine
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 

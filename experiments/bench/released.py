@@ -80,7 +80,7 @@ class Released:
             model.compute_logits(self.ids, action_ids=self.actions, domain=[ROBOT])
 
     def frame(self) -> None:
-        """Two looks at one frame, each over the whole window: the release has no other way."""
+        """Two passes over one frame, each over the whole window: the release has no other way."""
         model = self.discrete().eval()
         self._generate(model, self.ids.clone(), model.mask_token_id)
 

@@ -1,4 +1,4 @@
-"""The `hma` command line: arguments, help and error messages; one file per group of commands.
+"""The `hma` command line: one file per group of commands, each with its signature, its help and what it does.
 
-What the commands do is in `experiments.commands`, file by file. Nothing here imports JAX.
+Heavy imports happen inside the commands: help and errors need no JAX.
 """

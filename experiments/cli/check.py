@@ -8,8 +8,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, step, tidy_table
+from experiments.running.workspace import Workspace
 from experiments.setting import UNSET, require_local
-from experiments.workspace import Workspace
 from hma_jax.config import require
 
 

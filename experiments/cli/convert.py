@@ -1,16 +1,21 @@
-"""`hma convert`: arguments and help. What the commands do is in `commands.convert`."""
+"""`hma convert`: checkpoints to and from other formats."""
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from experiments.commands import convert as commands
+from experiments.progress import console
+from experiments.wrote import wrote
 from hma_jax.config import Weights
 from hma_jax.config.evaluation import SamplerKind
+
+if TYPE_CHECKING:
+    from hma_jax.training.runs import Run
 
 convert_app = SubcommandApp()
 
@@ -33,7 +38,15 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
         checkpoint: Directory with config.json and model.safetensors (or pytorch_model.bin, model.bin).
         out: The run to write.
     """
-    commands.from_official(checkpoint, out)
+    from hma_jax.convert import read_official, require_free, write_run
+
+    require_free(out)
+    run = read_official(checkpoint)
+    write_run(run, out)
+    if run.model.conditioning == "cross_attention":
+        console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
+    _describe(run)
+    wrote(out, then=f"hma convert to-safetensors {_quoted(out)} --out DIR (or to-stablehlo, to-official)")
 
 
 @convert_app.command(name="to-official")
@@ -50,7 +63,20 @@ def to_official(run: Positional[Path], out: Path, weights: Weights = "auto") -> 
         out: Directory to write: config.json and model.safetensors.
         weights: The last weights, their moving average, or the average where there is one.
     """
-    commands.to_official(run, out, weights)
+    from hma_jax.convert import loads_in_release, require_free, write_official
+    from hma_jax.convert.official import read_config
+    from hma_jax.training.runs import load_run
+
+    require_free(out)
+    loaded = load_run(run, weights)
+    for remark in write_official(loaded, out):
+        console.print(f"note: {remark}", markup=False, soft_wrap=True)
+    _describe(loaded)
+    again = f"hma convert from-official {_quoted(out)} --out RUN"
+    if loads_in_release(read_config(out)):
+        name = "STMAR" if loaded.model.diffusion else "STMaskGIT"
+        again = f"load it in the official release with {name}.from_pretrained({str(out)!r}), or read it again: {again}"
+    wrote(out, then=again)
 
 
 @convert_app.command(name="to-safetensors")
@@ -62,7 +88,15 @@ def to_safetensors(run: Positional[Path], out: Path, weights: Weights = "auto") 
         out: Directory to write: model.json and model.safetensors.
         weights: The last weights, their moving average, or the average where there is one.
     """
-    commands.to_safetensors(run, out, weights)
+    from hma_jax.convert import require_free, write_neutral
+    from hma_jax.training.runs import load_run
+
+    require_free(out)
+    loaded = load_run(run, weights)
+    write_neutral(loaded, out)
+    _describe(loaded)
+    back = f"hma convert from-safetensors {_quoted(out)} --out RUN"
+    wrote(out, then=f"{_quoted(out / 'model.json')} explains the weights; back with {back}")
 
 
 @convert_app.command(name="from-safetensors")
@@ -73,7 +107,13 @@ def from_safetensors(directory: Positional[Path], out: Path) -> None:
         directory: Directory with model.json and model.safetensors.
         out: The run to write.
     """
-    commands.from_safetensors(directory, out)
+    from hma_jax.convert import read_neutral, require_free, write_run
+
+    require_free(out)
+    run = read_neutral(directory)
+    write_run(run, out)
+    _describe(run)
+    wrote(out, then=f"hma evaluate {_quoted(out)} with the --preset and --out of its study")
 
 
 @convert_app.command(name="to-stablehlo")
@@ -108,16 +148,32 @@ def to_stablehlo(
         platforms: Where the program can run.
         weights: The last weights, their moving average, or the average where there is one.
     """
-    commands.to_stablehlo(
-        run,
-        out,
-        batch=batch,
-        prompt=prompt,
-        frames=frames,
-        unmask_steps=unmask_steps,
-        temperature=temperature,
-        sampler_steps=sampler_steps,
-        sampler=sampler,
-        platforms=platforms,
-        weights=weights,
+    from hma_jax.config import DecodeConfig, SamplerConfig
+    from hma_jax.convert import ProgramConfig, require_free, write_stablehlo
+    from hma_jax.training.runs import load_run
+
+    require_free(out)
+    latents = SamplerConfig(sampler, sampler_steps, temperature)
+    decode = DecodeConfig(unmask_steps, temperature, sampler=latents)
+    config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
+    loaded = load_run(run, weights)
+    write_stablehlo(loaded, out, config)
+    _describe(loaded)
+    wrote(out, then=f"read {_quoted(out / 'model.json')} for the program's inputs and outputs")
+
+
+def _describe(run: Run) -> None:
+    from hma_jax.model.hma import declare_model
+
+    variant = "continuous" if run.model.diffusion else "discrete"
+    count = declare_model(run.model, run.table).count()
+    console.print(
+        f"{variant} model, width {run.model.width}, {run.model.layers} layers, {count:,} parameters, robots: "
+        + ", ".join(run.table.names),
+        markup=False,
+        soft_wrap=True,
     )
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

@@ -13,23 +13,28 @@ from collections.abc import Sequence
 
 from tyro.extras import SubcommandApp
 
-from experiments.cli import bench, convert, data, study, tokenizer
+from experiments.cli import convert, study, tokenizer
+from experiments.cli.bench import app as bench
 from experiments.cli.check import check
+from experiments.cli.data import app as data
+from experiments.cli.evaluate import evaluate
 from experiments.cli.plan import plan
 from experiments.cli.play import play
-from experiments.commands.study import TrialsFailed
+from experiments.cli.tokenize import tokenize
+from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 from experiments.progress import errors
+from experiments.run_study import TrialsFailed
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
 app = SubcommandApp()
 app.command(name="study")(study.study)
 app.command(name="sweep")(study.sweep)
-app.command(name="tokenize")(study.tokenize)
-app.command(name="train")(study.train)
-app.command(name="adapt")(study.adapt)
-app.command(name="evaluate")(study.evaluate)
+app.command(name="tokenize")(tokenize)
+app.command(name="train")(train)
+app.command(name="adapt")(adapt)
+app.command(name="evaluate")(evaluate)
 app.command(name="report")(study.report)
 app.command(data.data_app, name="data", help=data.HELP)
 app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)

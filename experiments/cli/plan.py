@@ -1,4 +1,4 @@
-"""`hma plan`: arguments and help, and the report. The compiling is in `bench.plan`."""
+"""`hma plan` and its report. The compiling is in `bench.plan`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from experiments.cli.bench import Model
+from experiments.cli.bench.arguments import Model
 from experiments.progress import console, step, tidy_table
 from hma_jax.config import ExecutionConfig, MeshConfig, TrainConfig
 from hma_jax.config.execution import Dtype, Remat

@@ -1,17 +1,21 @@
-"""`hma tokenizer`: arguments and help. What the commands do is in `commands.tokenizer`."""
+"""`hma tokenizer`: the image tokenizer is trained here, made of published weights, or none."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 from tyro.extras import SubcommandApp
 
-from experiments.cli.how import Remake
-from experiments.commands import study as study_commands
-from experiments.commands import tokenizer as commands
-from experiments.setting import Where, make_setting
+from experiments.cli.arguments import Remake
+from experiments.preparing.made_from import Step
+from experiments.progress import console, step
+from experiments.setting import Setting, StudyArguments, command, make_setting, short
+from experiments.wrote import wrote
+
+if TYPE_CHECKING:
+    from hma_jax.tokenizers.shared import BaseTokenizer
 
 tokenizer_app = SubcommandApp()
 
@@ -19,9 +23,9 @@ HELP = "The image tokenizer: trained here, made of published weights, or none."
 
 
 @tokenizer_app.command(name="train")
-def tokenizer_train(where: OmitArgPrefixes[Where], remake: OmitArgPrefixes[Remake]) -> None:
+def tokenizer_train(asked: OmitArgPrefixes[StudyArguments], remake: OmitArgPrefixes[Remake]) -> None:
     """Train the study's image tokenizer on its datasets."""
-    study_commands.train_tokenizer(make_setting(where), remake.replace)
+    train_tokenizer(make_setting(asked), remake.replace)
 
 
 @tokenizer_app.command(name="import")
@@ -44,7 +48,16 @@ def import_(
         patch: Of the VAE: cells along the side of one token; 2 is what released models take.
         dtype: What the network computes in; bfloat16 is faster on accelerators and what the release used.
     """
-    commands.import_tokenizer(source, out, image_size=image_size, patch=patch, dtype=dtype)
+    from hma_jax.convert import find_reader, read_svd_vae, require_free
+
+    require_free(out)
+    reader = find_reader(source)
+    options = {"image_size": image_size, "compute_dtype": dtype}
+    if reader is read_svd_vae:
+        options["patch"] = patch
+    with step(f"read {short(source)}"):
+        tokenizer = reader(source, **options)
+    _write(tokenizer, out)
 
 
 @tokenizer_app.command(name="pixels")
@@ -58,4 +71,41 @@ def pixels(
         image_size: Side of the square images in pixels.
         patch: Side of a token in pixels.
     """
-    commands.pixel_tokenizer(out, image_size=image_size, patch=patch)
+    from hma_jax.config import PixelsConfig
+    from hma_jax.convert import require_free
+    from hma_jax.tokenizers.pixels import PixelTokenizer
+
+    require_free(out)
+    _write(PixelTokenizer(PixelsConfig(image_size=image_size, patch=patch)), out)
+
+
+def train_tokenizer(setting: Setting, replace: Step | None) -> None:
+    from experiments.preparing.sources import find_sources
+    from experiments.preparing.suite import make_suite
+    from experiments.preparing.tokenizer import make_tokenizer
+
+    study, workspace = setting.study, setting.workspace
+    with workspace.locked():
+        sources = find_sources(study, setting.data) if setting.data else make_suite(study, workspace, replace)
+        make_tokenizer(study, workspace, sources, replace)
+    wrote(workspace.tokenizer, then=setting.command("tokenize"))
+
+
+def _write(tokenizer: BaseTokenizer, out: Path) -> None:
+    from hma_jax.convert.aside import written_aside
+    from hma_jax.tokenizers.io import save_tokenizer
+
+    with written_aside(out) as aside:
+        save_tokenizer(tokenizer, aside)
+    if tokenizer.channels:
+        what = f"latents of {tokenizer.channels} channels"
+    else:
+        what = f"ids of {tokenizer.factors} factors with {tokenizer.factor_vocab} entries"
+    side = tokenizer.image_size
+    console.print(
+        f"{tokenizer.kind} {tokenizer.identity}: {side} x {side} pixels to {tokenizer.tokens} tokens, {what}",
+        soft_wrap=True,
+    )
+    preset = "cpu-continuous" if tokenizer.channels else "cpu"
+    wrote(out, then=command("tokenize", "--preset", preset, "--tokenizer", out))
+    console.print("that takes the simulated suite; with --data DIR ... your own, with --preset another study")

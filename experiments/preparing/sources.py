@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
-from experiments.workspace import Workspace
 from hma_jax.config import require
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import Pace, step
+from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.words import few
-from experiments.workspace import Workspace
 from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:

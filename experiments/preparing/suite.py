@@ -9,9 +9,9 @@ from pathlib import Path
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source
 from experiments.progress import console, step
+from experiments.running.workspace import Workspace
 from experiments.study import Study, SuiteConfig
 from experiments.words import few
-from experiments.workspace import Workspace
 from hma_jax.config import require
 
 

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from data_pipelines.publishing.files import publish, write_file
-from experiments.machine import describe_machine
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -25,10 +24,11 @@ from experiments.preparing.made_from import (
 )
 from experiments.preparing.sources import Source, open_source
 from experiments.progress import console, step
-from experiments.run_options import CHECKPOINTS
 from experiments.running.closure import closure_hash, trace
+from experiments.running.machine import describe_machine
+from experiments.running.run_options import CHECKPOINTS
+from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.workspace import Workspace
 from hma_jax.config import ConfigError, TokenizerConfig, require
 from hma_jax.config.json import to_dict
 

@@ -10,9 +10,9 @@ from data_pipelines.publishing.files import write_file
 from experiments.preparing.made_from import Step, dataset_differences, require_same
 from experiments.progress import console
 from experiments.running.provenance import Provenance
+from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
 from experiments.words import few
-from experiments.workspace import Workspace
 from hma_jax.config import require
 
 if TYPE_CHECKING:

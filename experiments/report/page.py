@@ -19,7 +19,7 @@ from experiments.optima import Optimum
 from experiments.report.pieces import card, frames, picture, pm, section, table
 from experiments.report.plot_style import drawn_metrics
 from experiments.report.style import CSS
-from experiments.report.sweeps import GAINS, TITLES, describe
+from experiments.report.sweeps import describe
 from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve
 from experiments.running.agreement import describe as describe_sources
 from experiments.running.agreement import group_by_sources
@@ -27,9 +27,9 @@ from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance
 from experiments.running.sealed import read_result
-from experiments.sweep import CONTROL, POINT, Sweep, all_steps, titles
-from experiments.trial import Trial, trial_id
-from experiments.workspace import Record, Workspace
+from experiments.running.trial import Trial, trial_id
+from experiments.running.workspace import Record, Workspace
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from hma_jax.config.json import to_json
 
 SHOWN_STRIPS = 6
@@ -118,7 +118,7 @@ def _headline(
     when = result["run"]["finished"] if result else "no trial finished"
     unfinished = sum(state.event != FINISHED for state in states.values())
     warning = f'<p class="warning">{unfinished} trial(s) have no result; see the table of trials.</p>'
-    *others, final = [GAINS[s.name] for s in sweeps]
+    *others, final = [s.gain or s.axis for s in sweeps]
     gains = f"{', '.join(others)} and {final}" if others else final
     return (
         f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
@@ -146,8 +146,9 @@ def _curves(
         sections.append(section("Scaling curves", overview, *(describe(s, rows, optima) for s in scaling)))
     for sweep in sweeps:
         if not sweep.scaling:
-            figure = picture(workspace.figures / f"{sweep.name}.png", TITLES[sweep.name])
-            sections.append(section(TITLES[sweep.name], figure, describe(sweep, rows, optima)))
+            title = sweep.title or sweep.axis.capitalize()
+            figure = picture(workspace.figures / f"{sweep.name}.png", title)
+            sections.append(section(title, figure, describe(sweep, rows, optima)))
     return sections
 
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import NullLocator
 from experiments.optima import diverged, ends, lowest
 from experiments.report.plot_style import MUTED, plain_log, show_nothing, show_tally
 from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
-from experiments.sweep import POINT, STANDARD, Sweep
+from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 
 ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}
 DRAWN = {

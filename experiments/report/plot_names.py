@@ -18,7 +18,7 @@ from experiments.report.plot_style import (
     show_tally,
 )
 from experiments.rows import Row, curve
-from experiments.sweep import CONTROL, Sweep
+from experiments.sweeps.sweep import CONTROL, Sweep
 
 CAPTION = (
     "dots: seeds; bars: mean ± s.e. over seeds, all judged on the same windows\n"

@@ -29,7 +29,7 @@ from experiments.report.plot_style import (
     show_tally,
 )
 from experiments.rows import UNTRAINED, CurvePoint, Row, curve
-from experiments.sweep import CONTROL, Sweep
+from experiments.sweeps.sweep import CONTROL, Sweep
 
 
 def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:

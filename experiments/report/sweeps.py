@@ -11,36 +11,8 @@ from experiments.report.pieces import number, pm, table
 from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import drawn_metrics
 from experiments.rows import CurvePoint, Row, curve, difference
-from experiments.sweep import CONTROL, Sweep
+from experiments.sweeps.sweep import CONTROL, Sweep
 
-QUESTIONS = {
-    "datasets": "Does training on more robots help or hurt those already there? All points are judged "
-    "on the smallest set of datasets and see the same number of windows in training.",
-    "trajectories": "What does more data per robot buy? Subsets are nested; the number of optimiser "
-    "steps is the same everywhere.",
-    "width": "What does a wider model buy? The learning rate is set once, at the base width, and "
-    "carried over by muP.",
-    "settings": "Does it help a video model to be told the actions, or to predict them too? Passive "
-    "prediction sees no actions, so that its ΔPSNR is zero by construction.",
-    "conditioning": "By which way should actions enter the trunk?",
-    "lr": "Does the best learning rate stay where it is as the model widens? Both parametrisations are "
-    "the same function at the base width.",
-}
-TITLES = {
-    "settings": "Ablation: dynamics setting",
-    "conditioning": "Ablation: action conditioning",
-    "lr": "Transfer of the learning rate",
-}
-"""Sections of the page, for sweeps that have one of their own."""
-GAINS = {
-    "datasets": "more robots",
-    "trajectories": "more data",
-    "width": "more width",
-    "settings": "knowing actions",
-    "conditioning": "the way actions enter",
-    "lr": "muP",
-}
-"""What a video model may gain from, by sweep; for the headline."""
 HEADINGS = {"perplexity": "perplexity", "delta_psnr": "ΔPSNR (dB)"}
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
@@ -55,7 +27,7 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum]) -> st
         numbers = _curve(sweep, rows)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
     return (
-        f"{heading}<p>{html.escape(QUESTIONS[sweep.name])} "
+        f"{heading}<p>{html.escape(sweep.question)} "
         f"Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
     )
 

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.job import read_job
 from experiments.running.closure import Closure, changed, closure_hash
+from experiments.running.job import read_job
 from experiments.running.provenance import CodeChanged, inputs_of, read_record
 from experiments.running.sealed import RESULT, read_result
-from experiments.trial import trial_id
+from experiments.running.trial import trial_id
 from experiments.words import few
 from hma_jax.config import ConfigError, require
 

@@ -1,6 +1,6 @@
 """Child processes: their share of the machine, and their end with the parent.
 
-The parent puts its wishes into the environment; the child calls `settle` before it imports
+The parent puts its wishes into the environment; the child calls `enter_child` before it imports
 JAX, whose thread pools take their size from the cores a process may use.
 """
 
@@ -41,7 +41,7 @@ def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str
     return environment
 
 
-def settle() -> None:
+def enter_child() -> None:
     """Called first in a child: takes its cores, arranges to die with its parent and to end in order when asked to."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked

@@ -2,7 +2,7 @@
 
 One JSON object per line, on disk before `append` returns. A process killed while it writes
 leaves a torn last line, which the next writer cuts off. There is one writer, the command that
-holds the study's directory (`Workspace.claimed`), wherever its trials run: what a trial's process
+holds the study's directory (`Workspace.locked`), wherever its trials run: what a trial's process
 has to say stands in the trial's own directory (`attempts`).
 """
 

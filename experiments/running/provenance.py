@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.publishing.files import write_file
-from experiments.machine import describe_machine
 from experiments.running.closure import Closure, changed, closure_hash, imported_modules, trace
+from experiments.running.machine import describe_machine
 from experiments.running.results_version import RESULTS_VERSION
 from experiments.words import few
 from hma_jax.config import ConfigError
@@ -27,7 +27,7 @@ from hma_jax.config.json import from_dict, to_dict
 
 FILE = "provenance.json"
 
-ROOTS = ("experiments.running.trial_main", "experiments.trial")
+ROOTS = ("experiments.running.trial_main", "experiments.running.trial")
 """The modules whose closure is what a trial runs."""
 
 

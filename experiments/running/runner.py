@@ -38,7 +38,7 @@ TRIES = 3
 """How often in one command a trial may be lost: what kills it may be its own size."""
 
 LOOK_EVERY = 5.0
-"""Seconds between two looks at trials that an earlier runner started elsewhere."""
+"""Seconds between two checks of trials that an earlier runner started elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def run_missing(
 
     Failed and diverged trials of earlier runs are left alone unless `retry_failed`; a failed one then goes on from
     its checkpoint, a diverged one starts anew. On KeyboardInterrupt the running trials save their state before it is
-    raised again. One runner at a time: see `Workspace.claimed`.
+    raised again. One runner at a time: see `Workspace.locked`.
     """
     run = _Run(trials, ledger, launcher, monitor or Monitor())
     before = read_states([job.id for job in jobs], trials, ledger)

@@ -15,17 +15,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, attempt
-from experiments.running.children import settle
+from experiments.running.children import enter_child
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
 LOOK_EVERY = 30.0
-"""Seconds between two looks whether the trial is still ours."""
+"""Seconds between two checks that the trial is still ours."""
 
 
 def main(directory: Path) -> int:
     """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; STOPPED or INTERRUPTED: the
     next attempt goes on from here."""
-    settle()  # before anything imports JAX
+    enter_child()  # before anything imports JAX
     try:
         with terminated_like_interrupted(), attempt(directory) as held:
             if (directory / RESULT).exists():  # another attempt finished while this one waited
@@ -43,11 +43,11 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
 
     from data_pipelines.errors import DataError
     from data_pipelines.publishing.files import write_file
-    from experiments.job import read_job
+    from experiments.running.job import read_job
     from experiments.running.ledger import DIVERGED, FAILED
     from experiments.running.provenance import inputs_of, record_start
-    from experiments.trial import run_trial
-    from experiments.workspace import Workspace
+    from experiments.running.trial import run_trial
+    from experiments.running.workspace import Workspace
     from hma_jax.config import ConfigError
     from hma_jax.training.divergence import DivergedError
     from hma_jax.training.loop import Interrupted

@@ -1,4 +1,4 @@
-"""Generation: whole rollouts, one frame at a time, teacher-forced looks, and policies.
+"""Generation: whole rollouts, one frame at a time, teacher-forced passes, and policies.
 
 One way of filling a frame (`decoding`), one cache of finished frames (`cache`), three ways to the next one
 (`steps`); the rest is who asks for which frame.

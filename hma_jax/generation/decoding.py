@@ -1,7 +1,7 @@
 """Filling one masked frame, step by step: the part of generation that differs between variants.
 
-A frame is a `Frame`: what is known of it and what is still masked. Each step looks at it once,
-proposes values for masked tokens and commits some of them; the rest wait for another look.
+A frame is a `Frame`: what is known of it and what is still masked. Each step predicts it once,
+proposes values for masked tokens and commits some of them; the rest wait for another step.
 """
 
 from __future__ import annotations
@@ -94,18 +94,18 @@ def _ranks(score_BS: jax.Array) -> jax.Array:
     return jnp.argsort(jnp.argsort(score_BS, axis=-1), axis=-1)
 
 
-Look = Callable[[Frame], jax.Array]
+Predict = Callable[[Frame], jax.Array]
 """What the model says of a frame: logits [B, S, Q, V] or conditions [B, S, D]."""
 
 
-def decode_frame(model: HMA, first: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
-    """Values of a frame that starts wholly masked; `first` is what `look` says of that one."""
+def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+    """Values of a frame that starts wholly masked; `first` is what `predict` says of that one."""
     if model.config.diffusion:
-        return _decode_latents(model, first, look, key_B, decode)
-    return _decode_tokens(model, first, look, key_B, decode)
+        return _decode_latents(model, first, predict, key_B, decode)
+    return _decode_tokens(model, first, predict, key_B, decode)
 
 
-def _decode_tokens(model: HMA, logits: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+def _decode_tokens(model: HMA, logits: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     batch, size = logits.shape[:2]
     frame = blank_frame(model.config, batch)
     for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
@@ -115,11 +115,11 @@ def _decode_tokens(model: HMA, logits: jax.Array, look: Look, key_B: jax.Array, 
             score = jax.vmap(lambda k: jax.random.uniform(k, (size,)))(keys[:, 1])
         frame = unmask(frame, sampled, score, still_masked)
         if still_masked:
-            logits = look(frame)
+            logits = predict(frame)
     return frame.values
 
 
-def _decode_latents(model: HMA, z: jax.Array, look: Look, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     """Patches in a random order fixed at the start, each predicted once.
 
     DIFFERS: the release never marks what it has predicted and samples it again in every step,
@@ -138,7 +138,7 @@ def _decode_latents(model: HMA, z: jax.Array, look: Look, key_B: jax.Array, deco
         frame = commit(frame, chosen, new)
         before = still_masked
         if still_masked:
-            z = look(frame)
+            z = predict(frame)
     return frame.values
 
 

@@ -15,7 +15,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import denoiser_flops, pass_flops
 
 Way = Literal["fill", "slide", "stream", "recompute"]
-"""How a frame is made: as in `hma_jax.generation.steps`, or by passes over a whole window for every look."""
+"""How a frame is made: as in `hma_jax.generation.steps`, or by passes over a whole window for every unmasking step."""
 
 
 def frame_flops(
@@ -26,27 +26,27 @@ def frame_flops(
     `earlier`: finished frames before it, by default all that fit a window, T - 1. `recompute` takes a window of
     `earlier` + 1 frames; `slide` and `stream` come where T - 1 are there.
     """
-    whole, looks = config.frames, decode.unmask_steps
+    whole, steps = config.frames, decode.unmask_steps
     earlier = whole - 1 if earlier is None else earlier
 
     def one(seen: int) -> float:
         return pass_flops(config, table, 1, seen)
 
-    if way == "fill":  # the frame before enters the cache beside the first look
-        trunk = one(earlier) + looks * one(earlier + 1)
+    if way == "fill":  # the frame before enters the cache beside the first step
+        trunk = one(earlier) + steps * one(earlier + 1)
     elif way == "stream":
-        trunk = (1 + looks) * one(whole)
+        trunk = (1 + steps) * one(whole)
     elif way == "slide":
-        trunk = pass_flops(config, table, whole, whole / 2) + (looks - 1) * one(whole)
+        trunk = pass_flops(config, table, whole, whole / 2) + (steps - 1) * one(whole)
     else:
-        trunk = looks * pass_flops(config, table, earlier + 1, (earlier + 1) / 2)
+        trunk = steps * pass_flops(config, table, earlier + 1, (earlier + 1) / 2)
     return trunk + sampler_flops(config, decode)
 
 
 def sampler_flops(config: ModelConfig, decode: DecodeConfig) -> float:
     """The denoiser's part of one frame; 0 for ids.
 
-    Every token is drawn once or, with `resample`, again at each look after the one that unmasked it. Every kind of
+    Every token is drawn once or, with `resample`, again at each step after the one that unmasked it. Every kind of
     sampler evaluates the denoiser once per step.
     """
     if config.diffusion is None:

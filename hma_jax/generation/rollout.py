@@ -134,7 +134,7 @@ def rollout_naive(
     frames: int | None = None,
     hidden_BT: jax.Array | None = None,
 ) -> jax.Array:
-    """What `rollout` must equal: the whole window again for every look at a frame.
+    """What `rollout` must equal: the whole window again for every pass over a frame.
 
     Without actions (None) there are neither action tokens nor conditioning, and `frames` says
     how many to fill up to.
@@ -155,14 +155,14 @@ def rollout_naive(
             shown = None if hidden_BT is None else cut(hidden_BT, first, size)
             hidden = model.align_hidden(shown, (batch, size))
 
-        def look(frame: Frame) -> jax.Array:
+        def predict(frame: Frame) -> jax.Array:
             values = cut(known, first, size)
             unknown = jnp.broadcast_to(jnp.arange(size)[None, :, None] >= t - first, values.shape[:3])
             values = values.at[:, t - first].set(frame.values)
             unknown = unknown.at[:, t - first].set(frame.masked)
             return model(values, unknown, aligned, embodiment_B, hidden_BT=hidden).said[:, t - first]
 
-        frame = decode_frame(model, look(blank), look, fold_in(key_B, t), decode)
+        frame = decode_frame(model, predict(blank), predict, fold_in(key_B, t), decode)
         return known.at[:, t].set(frame), None
 
     known, _ = jax.lax.scan(next_frame, jnp.concatenate([prompt, *future], axis=1), jnp.arange(count, frames))

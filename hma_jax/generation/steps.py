@@ -52,7 +52,7 @@ def _decode(
     key_B: jax.Array,
     decode: DecodeConfig,
 ) -> jax.Array:
-    def look(frame: Frame) -> jax.Array:
+    def predict(frame: Frame) -> jax.Array:
         return window.query(cache, frame, at)
 
-    return decode_frame(window.model, said, look, key_B, decode)
+    return decode_frame(window.model, said, predict, key_B, decode)

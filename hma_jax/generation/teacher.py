@@ -48,7 +48,7 @@ def next_frames(
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
 
-    def look(frame: Frame) -> jax.Array:
+    def predict(frame: Frame) -> jax.Array:
         """Of all masked frames at once, as if they were examples: [B (T - 1), S, ...]."""
         out_of_past = model(
             _by_window(frame.values, count),
@@ -63,7 +63,7 @@ def next_frames(
         return _by_frame(out_of_past.said)
 
     keys = jnp.stack([fold_in(key_B, t) for t in range(1, count + 1)], axis=1)
-    filled = decode_frame(model, _by_frame(out.said), look, _by_frame(keys), decode)
+    filled = decode_frame(model, _by_frame(out.said), predict, _by_frame(keys), decode)
     return out.said, _by_window(filled, count)
 
 

@@ -23,7 +23,7 @@ def is_address(path: Path) -> bool:
 
 
 @contextmanager
-def claimed(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
+def locked_run(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
     """Makes `run_dir` and holds it: to train in it or, with EVALUATION, to write the evaluation of its model.
     Raises RunBusy naming the process that holds it already, and ConfigError if it cannot be written."""
     require(

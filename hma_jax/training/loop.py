@@ -32,7 +32,7 @@ from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer, meet
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
-from hma_jax.training.claim import claimed
+from hma_jax.training.claim import locked_run
 from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Listener, Progress, RunLog, open_log
 from hma_jax.training.state import FINITE
@@ -120,7 +120,7 @@ def fit(
     run_dir, clock = Path(run_dir), options.clock
     # One writer per run: the others of a program with several processes leave lock and log alone.
     with (
-        claimed(run_dir) if is_writer() else nullcontext() as lock,
+        locked_run(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
             run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise
         ) as checkpoints,

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 from experiments.running.attempts import RUN, attempt
-from experiments.running.children import settle
+from experiments.running.children import enter_child
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job, run_missing
@@ -64,7 +64,7 @@ if __name__ == "__main__":
         root = Path(sys.argv[2])
         run_missing(THREE, root / "trials", Ledger(root / "ledger.jsonl"), launcher(root))
     else:
-        settle()
+        enter_child()
         try:
             with terminated_like_interrupted(), attempt(Path(sys.argv[1])):
                 sys.exit(count_to_the_end(Path(sys.argv[1])))

@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.commands.study import AXES, SCALING
 from experiments.presets import SMOKE
 from experiments.rows import Row, collect
 from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
 from experiments.running.provenance import Provenance, Start, TrialRecord
 from experiments.running.sealed import write_result
+from experiments.running.trial import Trial, write_samples
+from experiments.running.workspace import Record, Workspace
 from experiments.study import Study, TransferConfig
-from experiments.sweep import Sweep, titles, unique_trials
-from experiments.trial import Trial, write_samples
-from experiments.workspace import Record, Workspace
+from experiments.sweeps.registry import SCALING, plan_sweeps
+from experiments.sweeps.sweep import Sweep, titles, unique_trials
 from hma_jax.config.json import to_dict
 
 PROVENANCE = Provenance(store="5708e", manifest="3a41f", tokenizer="70c3")
-RECORD = TrialRecord(PROVENANCE, {"c0de": {"experiments.trial": "1"}}, {}, (Start("c0de", {"commit": "abc"}),))
+RECORD = TrialRecord(PROVENANCE, {"c0de": {"experiments.running.trial": "1"}}, {}, (Start("c0de", {"commit": "abc"}),))
 STUDY = replace(
     SMOKE,
     datasets=("arm", "rover", "pusher"),
@@ -44,11 +44,11 @@ def finished_study(
     without: Sequence[str] = (),
 ) -> Workspace:
     """A workspace with a result for every trial, but a failure for titles that contain a key of
-    `broken` (its value is the state). Ready for `commands.draw`. Metrics in `without` are left
+    `broken` (its value is the state). Ready for `draw`. Metrics in `without` are left
     out, as by a model that has none."""
     workspace = Workspace(root)
     ledger = Ledger(workspace.ledger)
-    sweeps = [AXES[axis](study) for axis in axes]
+    sweeps = plan_sweeps(study, axes, root)
     names = titles(sweeps, PROVENANCE)
     for id, trial in unique_trials(sweeps, PROVENANCE).items():
         directory = workspace.trials / id
@@ -71,7 +71,7 @@ def record_of(study: Study = STUDY, axes: Sequence[str] = SCALING) -> Record:
 
 
 def rows_of(workspace: Workspace, sweeps: Sequence[Sweep]) -> list[Row]:
-    """The rows that `commands.draw` would draw, without drawing."""
+    """The rows that `draw` would draw, without drawing."""
     ids = list(unique_trials(sweeps, PROVENANCE))
     states = read_states(ids, workspace.trials, Ledger(workspace.ledger))
     return collect(sweeps, PROVENANCE, workspace.trials, states)

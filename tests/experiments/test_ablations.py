@@ -6,12 +6,14 @@ from typing import get_args
 
 import pytest
 
-from experiments import ablate_conditioning, ablate_settings, scale_width
-from experiments.commands.study import draw
 from experiments.presets import CPU, PRESETS, SMOKE
+from experiments.report.draw import draw
 from experiments.rows import curve, difference, read_csv
-from experiments.sweep import CONTROL, POINT, reference_trial, titles, unique_trials
-from experiments.trial import trial_id
+from experiments.running.trial import trial_id
+from experiments.sweeps import conditioning as conditioning_axis
+from experiments.sweeps import settings as settings_axis
+from experiments.sweeps import width as width_axis
+from experiments.sweeps.sweep import CONTROL, POINT, reference_trial, titles, unique_trials
 from hma_jax.config import Conditioning, ConfigError
 from hma_jax.config.json import diff
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
@@ -29,7 +31,7 @@ def changes(sweep, study) -> dict[str, set[str]]:
 
 
 def test_settings_change_the_setting_and_heads_only_where_actions_are_predicted():
-    sweep = ablate_settings.plan(CPU)
+    sweep = settings_axis.plan(CPU)
     assert changes(sweep, CPU) == {
         "passive": {"train.masking.setting"},
         "full dynamics": {"train.masking.setting", "model.action_heads"},
@@ -43,7 +45,7 @@ def test_settings_change_the_setting_and_heads_only_where_actions_are_predicted(
 @pytest.mark.parametrize(("base", "other"), [("released", "causal"), ("causal", "released")])
 def test_every_conditioning_and_the_other_alignment(base, other):
     study = replace(SMOKE, model=replace(SMOKE.model, action_alignment=base))
-    found = changes(ablate_conditioning.plan(study), study)
+    found = changes(conditioning_axis.plan(study), study)
     assert set(get_args(Conditioning)) < set(found) and len(found) == 6
     assert found.pop("concat+modulate") == set()
     assert found.pop(f"concat+modulate, {other} alignment") == {"model.action_alignment"}
@@ -52,24 +54,24 @@ def test_every_conditioning_and_the_other_alignment(base, other):
 
 def test_the_default_is_where_the_study_is():
     study = replace(SMOKE, model=replace(SMOKE.model, conditioning="add"))
-    sweep = ablate_conditioning.plan(study)
+    sweep = conditioning_axis.plan(study)
     assert sweep.label(sweep.reference_x) == "add"
     passive = replace(SMOKE.train.masking, setting="passive")
     study = replace(SMOKE, train=replace(SMOKE.train, masking=passive))
-    sweep = ablate_settings.plan(study)
+    sweep = settings_axis.plan(study)
     assert sweep.label(sweep.reference_x) == "passive"
     with pytest.raises(ConfigError, match="train.masking.setting is 'policy'"):
         masking = replace(passive, setting="policy")
-        ablate_settings.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
+        settings_axis.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
 
 
 @pytest.mark.parametrize("study", PRESETS.values(), ids=PRESETS)
 def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(study):
-    settings, conditioning = ablate_settings.plan(study), ablate_conditioning.plan(study)
+    settings, conditioning = settings_axis.plan(study), conditioning_axis.plan(study)
     assert {p.trial.train.seed for p in settings.points} == set(study.ablation_seeds)
     seeds = len(study.ablation_seeds)
     assert len(unique_trials([settings, conditioning], PROVENANCE)) == (3 + 6 - 1) * seeds + 1
-    width = unique_trials([scale_width.plan(study)], PROVENANCE)
+    width = unique_trials([width_axis.plan(study)], PROVENANCE)
     shared = [p for p in settings.points if p.x == settings.reference_x and p.trial.train.seed in study.seeds]
     assert {p.role for p in shared} == {POINT, CONTROL}
     assert all(trial_id(p.trial, PROVENANCE) in width for p in shared)
@@ -80,7 +82,7 @@ def test_published_presets_have_error_bars():
 
 
 def test_titles_tell_trials_apart():
-    sweeps = [ablate_settings.plan(STUDY), ablate_conditioning.plan(STUDY)]
+    sweeps = [settings_axis.plan(STUDY), conditioning_axis.plan(STUDY)]
     lines = titles(sweeps, PROVENANCE)
     assert len(set(lines.values())) == len(lines) == len(unique_trials(sweeps, PROVENANCE))
     assert any(line.endswith("seed 1 · passive") for line in lines.values())

@@ -13,15 +13,14 @@ import pytest
 import data_pipelines
 import experiments
 import hma_jax
-from experiments import pipeline
+from experiments import run_study as study_runs
 from experiments.cli.main import main
-from experiments.commands import study as commands
-from experiments.preparing import windows
+from experiments.preparing import pipeline, windows
 from experiments.running.attempts import read_states
 from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import Ledger
-from experiments.setting import Where, make_setting
-from experiments.workspace import Workspace, load_record, save_record
+from experiments.running.workspace import Workspace, load_record, save_record
+from experiments.setting import StudyArguments, make_setting
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
 COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer",
@@ -81,8 +80,8 @@ def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp
 
 def test_wrong_choice_exits_with_2(capsys):
     with pytest.raises(SystemExit) as end:
-        main(["sweep", "widths"])
-    assert end.value.code == 2
+        main(["sweep", "width", "--preset", "gpu"])
+    assert end.value.code == 2 and "cpu" in capsys.readouterr().err
 
 
 def test_debug_shows_the_traceback(tmp_path):
@@ -100,15 +99,15 @@ def test_paper_plan_prints_the_papers_sizes(capsys):
 @pytest.mark.parametrize(
     ("module", "shown"),
     [
-        ("scale_width", "control"),
-        pytest.param("ablate_settings", "full dynamics, seed 1", marks=pytest.mark.slow),
-        pytest.param("ablate_conditioning", "cross_attention, seed 0", marks=pytest.mark.slow),
-        pytest.param("transfer_lr", "learning rate 0.002, no muP", marks=pytest.mark.slow),
+        ("width", "control"),
+        pytest.param("settings", "full dynamics, seed 1", marks=pytest.mark.slow),
+        pytest.param("conditioning", "cross_attention, seed 0", marks=pytest.mark.slow),
+        pytest.param("lr", "learning rate 0.002, no muP", marks=pytest.mark.slow),
     ],
 )
 def test_sweep_modules_run_as_programs(module, shown):
     done = subprocess.run(
-        [sys.executable, "-m", f"experiments.{module}", "--preset", "smoke", "--dry-run"],
+        [sys.executable, "-m", f"experiments.sweeps.{module}", "--preset", "smoke", "--dry-run"],
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0 and shown in done.stdout, done.stderr
@@ -165,7 +164,7 @@ def instant_trials(monkeypatch):
 
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: PROVENANCE)
     monkeypatch.setattr(windows, "require_judged", lambda *_: None)
-    monkeypatch.setattr(commands, "run_missing", run_missing)
+    monkeypatch.setattr(study_runs, "run_missing", run_missing)
     monkeypatch.setattr(Launching, "launcher", lambda *_: nullcontext())
 
 
@@ -234,23 +233,23 @@ def test_failed_trials_are_tried_again_by_the_command_that_is_printed(instant_tr
     def run_study(setting, axes, **how):
         asked.update(how, setting=setting, axes=axes)
 
-    monkeypatch.setattr(commands, "run_study", run_study)
+    monkeypatch.setattr(study_runs, "run_study", run_study)
     assert main(shlex.split(printed)[1:]) == 0
     assert asked["retry_failed"] and asked["axes"] == ("width",)
     assert asked["launcher"] == Launching("slurm", 2, ("gpus=1", "partition=a b"))
-    assert asked["setting"] == make_setting(Where("smoke", tmp_path, set=("widths=8,32",)))
+    assert asked["setting"] == make_setting(StudyArguments("smoke", tmp_path, set=("widths=8,32",)))
 
 
 def test_sigterm_ends_like_an_interruption_with_a_last_word(tmp_path):
     """Before, the process was just gone, and its trials with it, without a word."""
     program = (
-        "import sys, time; from experiments.cli import main; from experiments.commands import study\n"
+        "import sys, time; from experiments.cli import main; from experiments import run_study\n"
         "def run(*_, **__):\n"
         "    try:\n"
         "        print('at work', flush=True)\n"
         "        time.sleep(60)\n"
         "    finally: print('saved', flush=True)\n"
-        "study.run_study = run\n"
+        "run_study.run_study = run\n"
         "sys.exit(main.main(['study', '--preset', 'smoke']))"
     )
     process = subprocess.Popen(

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from data_pipelines.sampling.splits import held_out
 from data_pipelines.registry import get_spec
+from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
-from experiments.commands import registry as registry_commands
 from experiments.preparing import tokenizer, windows
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
@@ -476,6 +476,6 @@ def test_a_bug_is_not_dressed_up_as_a_mistake_of_the_user(monkeypatch):
     def broken(*_):
         raise KeyError("oops")
 
-    monkeypatch.setattr(registry_commands, "list_datasets", broken)
+    monkeypatch.setattr(registry_commands, "use_entries", broken)
     with pytest.raises(KeyError, match="oops"):
         main(["data", "list"])

@@ -9,7 +9,7 @@ import pytest
 from experiments.cli.main import main
 from experiments.cost import estimate, evaluation_flops_per_window
 from experiments.presets import SMOKE, SMOKE_CONTINUOUS
-from experiments.sweep import reference_trial
+from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import EvalConfig, ExecutionConfig, MaskingConfig
 from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model

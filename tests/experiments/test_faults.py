@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import pytest
 
 from data_pipelines.tokens import part_maker
-from experiments import trial as trials
 from experiments.cli.main import main
+from experiments.running import trial as trials
 from experiments.running import trial_main
-from experiments.workspace import Workspace
+from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
-from hma_jax.training.claim import EVALUATION, claimed
+from hma_jax.training.claim import EVALUATION, locked_run
 from hma_jax.training.log import RunLog
 from hma_jax.training.reading import find_damage, list_steps
 from hma_jax.training.runs import load_model, load_run
@@ -110,7 +110,7 @@ def test_a_trial_that_is_asked_to_stop_while_it_evaluates_says_so(tmp_path, monk
 
     inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
     (tmp_path / "job.json").write_text(json.dumps({"provenance": inputs}))
-    monkeypatch.setattr("experiments.job.read_job", lambda record: (None, None))
+    monkeypatch.setattr("experiments.running.job.read_job", lambda record: (None, None))
     monkeypatch.setattr(trials, "run_trial", asked)
     before = signal.getsignal(signal.SIGTERM)
     try:
@@ -149,7 +149,7 @@ def test_a_loss_that_is_no_number_has_its_own_code_and_names_the_records(where, 
     "command", ["study", "sweep width", "data suite", "tokenizer train", "train", "tokenize --replace tokens"]
 )
 def test_a_directory_that_another_command_works_in_is_refused(command, tmp_path, capsys):
-    with Workspace(tmp_path).claimed():
+    with Workspace(tmp_path).locked():
         assert main([*command.split(), *SMOKE, "--out", str(tmp_path)]) == Exit.REFUSED
     said = capsys.readouterr().err
     assert said.startswith(f"error: another command is at work in {tmp_path} (process {os.getpid()} on ")
@@ -158,14 +158,14 @@ def test_a_directory_that_another_command_works_in_is_refused(command, tmp_path,
 def test_two_evaluations_of_one_run_are_refused(where, study, capsys):
     evaluate = ["evaluate", str(study / "model"), *where]
     before = (study / "model" / "evaluation.json").read_bytes()
-    with claimed(study / "model", EVALUATION):
+    with locked_run(study / "model", EVALUATION):
         assert main(evaluate) == Exit.REFUSED
     assert f"{study / 'model'} is being evaluated by process {os.getpid()} on " in capsys.readouterr().err
     assert (study / "model" / "evaluation.json").read_bytes() == before
 
 
 def test_a_model_that_is_being_trained_may_be_evaluated(where, study):
-    with claimed(study / "model"):
+    with locked_run(study / "model"):
         assert main(["evaluate", str(study / "model"), *where]) == 0
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments.former import modernise
-from experiments.job import read_job
 from experiments.presets import SMOKE
-from experiments.sweep import reference_trial
+from experiments.running.former import modernise
+from experiments.running.job import read_job
+from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from experiments.running.ledger import Ledger
-from experiments.workspace import Workspace
+from experiments.running.workspace import Workspace
 from hma_jax.config import ConfigError
 
 
@@ -53,8 +53,8 @@ def test_damage_before_the_end_is_reported_with_its_line(ledger):
 
 
 def test_second_writer_is_refused(tmp_path):
-    with Workspace(tmp_path).claimed(), pytest.raises(ConfigError, match="another command is at work"):
-        with Workspace(tmp_path).claimed():
+    with Workspace(tmp_path).locked(), pytest.raises(ConfigError, match="another command is at work"):
+        with Workspace(tmp_path).locked():
             pass
-    with Workspace(tmp_path).claimed():
+    with Workspace(tmp_path).locked():
         pass  # free again

@@ -13,7 +13,7 @@ from tests.experiments.test_cli_errors import idle_training  # noqa: F401
 pytest.importorskip("av")
 
 
-def test_lerobot_and_robomimic_go_from_inspection_to_tokens(tmp_path, capsys):
+def test_lerobot_and_robomimic_go_from_inspection_and_view_to_tokens(tmp_path, capsys):
     data = [
         str(write_lerobot(tmp_path / "toy-arm", "v3.0", lengths=(24,) * 5)),
         str(write_robomimic(tmp_path / "image.hdf5", lengths=(23, 24, 22, 24))),
@@ -26,6 +26,8 @@ def test_lerobot_and_robomimic_go_from_inspection_to_tokens(tmp_path, capsys):
     # These recordings are short, and frames of one colour look blank, as real ones would not.
     text = entries.read_text().replace("video_targets = false\n", "")
     entries.write_text(text.replace("hz = 20.0", "hz = 4.0"))
+    page = tmp_path / "page.html"
+    assert main(["data", "view", *data, "--registry", str(entries), "--out", str(page)]) == 0 and page.is_file()
     common = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--registry", str(entries), "--data", *data]
     assert main(["tokenize", *common, "--set", "model.frames=4"]) == 0
     for name, keys in (("toy_arm", "observation/top"), ("robomimic_lift", "observation/agentview")):

@@ -7,11 +7,11 @@ import numpy as np
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.windows.evalset import eval_batches
-from experiments.pipeline import prepare
+from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
+from experiments.running.trial import open_materials
+from experiments.running.workspace import Workspace
 from experiments.study import override
-from experiments.trial import open_materials
-from experiments.workspace import Workspace
 
 
 def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path):

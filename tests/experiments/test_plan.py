@@ -8,7 +8,7 @@ import pytest
 from experiments.bench.collectives import Collective, Sent, count_kinds, find_collectives
 from experiments.bench.models import MODELS
 from experiments.bench.plan import abstract_inputs, find_devices, make_plan
-from experiments.cli.bench import Model
+from experiments.cli.bench.arguments import Model
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.mesh import make_mesh

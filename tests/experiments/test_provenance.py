@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments.commands import study as commands
+import experiments
+from experiments import run_study as study_runs
+from experiments.report.draw import draw_again
 from experiments.report.page import _origin
 from experiments.rows import Row, read_csv, write_csv
 from experiments.running import provenance
@@ -22,10 +24,11 @@ from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.runner import Job, run_missing
 from experiments.running.sealed import write_result
-from experiments.setting import Where, make_setting
-from experiments.sweep import unique_trials
-from experiments.trial import trial_id
-from experiments.workspace import Workspace, find_record, save_record
+from experiments.running.trial import trial_id
+from experiments.running.workspace import Workspace, find_record, save_record
+from experiments.setting import StudyArguments, make_setting
+from experiments.sweeps.registry import SCALING, plan_sweeps
+from experiments.sweeps.sweep import unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit
 from tests.experiments import fake_trial
@@ -94,8 +97,8 @@ def test_the_closure_is_what_is_imported(tmp_path):
 
 def test_a_trial_runs_neither_simulators_nor_plots():
     names = trace(ROOTS)
-    assert {"experiments.trial", "hma_jax.training.step", "data_pipelines.loading.loader"} <= names.keys()
-    strangers = ("data_pipelines.sim", "data_pipelines.suite", "experiments.report", "experiments.cli")
+    assert {"experiments.running.trial", "hma_jax.training.step", "data_pipelines.loading.loader"} <= names.keys()
+    strangers = ("data_pipelines.simulators", "data_pipelines.suite", "experiments.report", "experiments.cli")
     assert not [name for name in names if name.startswith(strangers)]
 
 
@@ -144,7 +147,7 @@ def test_a_comment_in_mid_sweep_is_no_change(checkout):
 
 
 def test_all_that_a_trial_runs_is_imported_before_it_works(monkeypatch):
-    before = {"experiments.trial": "1", "experiments.words": "2"}
+    before = {"experiments.running.trial": "1", "experiments.words": "2"}
     found = iter([before, before | {"experiments.words": "3"}])
     monkeypatch.setattr(provenance, "trial_closure", lambda: next(found))
     with pytest.raises(CodeChanged, match=r"experiments\.words"):  # changed while it was imported
@@ -157,11 +160,11 @@ def test_all_that_a_trial_runs_is_imported_before_it_works(monkeypatch):
 
 def test_a_start_is_recorded_once(tmp_path):
     for _ in range(2):
-        record_start(tmp_path, PROVENANCE, {"experiments.trial": "1"})
-    record_start(tmp_path, PROVENANCE, {"experiments.trial": "2"})
+        record_start(tmp_path, PROVENANCE, {"experiments.running.trial": "1"})
+    record_start(tmp_path, PROVENANCE, {"experiments.running.trial": "2"})
     record_end(tmp_path)
     record = provenance.read_record(tmp_path)
-    assert [start.code for start in record.starts] == [closure_hash({"experiments.trial": str(i)}) for i in (1, 2)]
+    assert [start.code for start in record.starts] == [closure_hash({"experiments.running.trial": str(i)}) for i in (1, 2)]
     assert record.code == record.starts[-1].code and len(record.closures) == 2
     assert record.besides["experiments.words"] == source_hash((ROOT / "experiments" / "words.py").read_text())
     machine = record.starts[0].machine
@@ -172,7 +175,7 @@ def test_a_start_is_recorded_once(tmp_path):
 
 
 def ids_of(study=STUDY) -> list[str]:
-    return list(unique_trials([commands.AXES[axis](study) for axis in commands.SCALING], PROVENANCE))
+    return list(unique_trials(plan_sweeps(study, SCALING), PROVENANCE))
 
 
 def test_finished_trials_copied_from_another_machine_count_as_done(tmp_path):
@@ -184,7 +187,7 @@ def test_finished_trials_copied_from_another_machine_count_as_done(tmp_path):
     assert {s.event for s in read_states(ids, here.trials, ledger).values()} == {"finished"}
     again = LocalLauncher(tmp_path, 1, command=lambda _: pytest.fail("it ran again"))
     run_missing([Job(id, id, {}) for id in ids], here.trials, ledger, again)
-    sweeps = [commands.AXES[axis](STUDY) for axis in commands.SCALING]
+    sweeps = plan_sweeps(STUDY, SCALING)
     for workspace in (there, here):
         write_csv(workspace.results, Row, rows_of(workspace, sweeps))
     assert here.results.read_bytes() == there.results.read_bytes()
@@ -212,7 +215,7 @@ TAMPERING = {
 @pytest.mark.parametrize("name", TAMPERING)
 def test_a_finished_trial_that_was_changed_is_refused(name, tmp_path):
     workspace = finished_study(tmp_path)
-    id = trial_id(next(iter(unique_trials([commands.AXES["width"](STUDY)], PROVENANCE).values())), PROVENANCE)
+    id = trial_id(next(iter(unique_trials(plan_sweeps(STUDY, ["width"]), PROVENANCE).values())), PROVENANCE)
     change, words = TAMPERING[name]
     change(workspace.trials / id)
     with pytest.raises(ConfigError, match=words) as raised:
@@ -241,7 +244,7 @@ def run_by(directory: Path, *closures: dict[str, str]) -> None:
     write_result(directory, {name: value for name, value in values.items() if name != "hash"})
 
 
-OLD, NEW = {"experiments.trial": "1", "hma_jax.a": "1"}, {"experiments.trial": "1", "hma_jax.a": "2"}
+OLD, NEW = {"experiments.running.trial": "1", "hma_jax.a": "1"}, {"experiments.running.trial": "1", "hma_jax.a": "2"}
 
 
 def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
@@ -264,34 +267,34 @@ def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
 @pytest.mark.parametrize("accept", [False, True])
 def test_a_study_goes_on_under_changed_sources_only_if_that_is_accepted(accept, tmp_path, monkeypatch):
     workspace = finished_study(tmp_path)  # by sources that are not these
-    monkeypatch.setattr("experiments.pipeline.prepare", lambda *_, **__: PROVENANCE)
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: PROVENANCE)
     monkeypatch.setattr("experiments.preparing.windows.require_judged", lambda *_: None)
     monkeypatch.setattr("experiments.preparing.windows.require_same_windows", lambda *_: None)
     monkeypatch.setattr("experiments.preparing.suite.require_simulated", lambda *_: None)
     ran = []
-    monkeypatch.setattr(commands, "run_jobs", lambda jobs, *_, **__: ran.extend(jobs) or {})
-    monkeypatch.setattr(commands, "draw", lambda *_: None)
-    monkeypatch.setattr(commands, "complain", lambda *_: None)
+    monkeypatch.setattr(study_runs, "run_jobs", lambda jobs, *_, **__: ran.extend(jobs) or {})
+    monkeypatch.setattr(study_runs, "draw", lambda *_: None)
+    monkeypatch.setattr(study_runs, "require_results", lambda *_: None)
     save_record(workspace, record_of())
     shutil.rmtree(workspace.trials / ids_of()[-1])
-    setting = replace(make_setting(Where("smoke", tmp_path)), study=STUDY)
+    setting = replace(make_setting(StudyArguments("smoke", tmp_path)), study=STUDY)
 
     def run():
-        commands.run_study(setting, commands.SCALING, again="", launcher=Launching(), retry_failed=False,
+        study_runs.run_study(setting, SCALING, again="", launcher=Launching(), retry_failed=False,
                            accept_code=accept, replace=None)  # fmt: skip
 
     if accept:
         run()
         assert len(ran) == len(ids_of()) and ran[0].record["code"] == trace(ROOTS)
     else:
-        with pytest.raises(CodeChanged, match=r"differs in experiments\.trial"):
+        with pytest.raises(CodeChanged, match=r"differs in experiments\.running\.trial"):
             run()
         assert not ran and "hma study" in find_record(workspace).command
 
 
 # --- Records of earlier versions ------------------------------------------------------------------
 
-KEPT = Path(commands.__file__).parents[1] / "results"
+KEPT = Path(experiments.__file__).parent / "results"
 
 
 @pytest.mark.parametrize("name", ["cpu", "ablations"])
@@ -306,7 +309,7 @@ def test_results_that_are_kept_are_read(name):
 def test_results_that_are_kept_are_drawn_again_from_their_table(tmp_path):
     for file in ("study.json", "results.csv"):
         shutil.copy(KEPT / "ablations" / file, tmp_path)
-    commands.draw_again(tmp_path)
+    draw_again(tmp_path)
     assert (tmp_path / "results.csv").read_bytes() == (KEPT / "ablations" / "results.csv").read_bytes()
     assert {p.name for p in (tmp_path / "figures").iterdir()} >= {"settings.png", "conditioning.png"}
     assert not (tmp_path / "report.html").exists()

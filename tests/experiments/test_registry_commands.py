@@ -13,7 +13,7 @@ from data_pipelines.inspection.inspect import Shown
 from data_pipelines.registry import table as registry_table
 from experiments.cli.main import main
 from experiments.contact_sheet import TILE, draw_sheet
-from experiments.setting import Where, find_directories, make_setting
+from experiments.setting import StudyArguments, find_directories, make_setting
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
 
@@ -133,7 +133,7 @@ def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path):
 
 
 def test_mixture_names_the_datasets_of_a_study(tmp_path, capsys):
-    assert make_setting(Where("paper", tmp_path, mixture="dataset10")).study.dataset_counts == (5, 10)
+    assert make_setting(StudyArguments("paper", tmp_path, mixture="dataset10")).study.dataset_counts == (5, 10)
     assert main(["study", "--preset", "smoke", "--mixture", "dataset5", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "bridge_data_v2, fractal20220817_data, language_table and others: not simulated" in said

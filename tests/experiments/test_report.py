@@ -5,10 +5,10 @@ import re
 
 import pytest
 
-from experiments.commands.study import draw
+from experiments.report.draw import draw
 from experiments.rows import OVERALL, Row, curve, read_csv, tally, write_csv
-from experiments.scale_datasets import plan as plan_datasets
-from experiments.scale_width import plan as plan_width
+from experiments.sweeps.datasets import plan as plan_datasets
+from experiments.sweeps.width import plan as plan_width
 from hma_jax.config import ConfigError
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
 

@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 
 from data_pipelines.registry import get_mixture, get_spec
+from experiments import run_study
 from experiments import setting as settings
+from experiments.cli import evaluate, tokenize, tokenizer, train
 from experiments.cli.main import main
-from experiments.commands import model as model_commands
-from experiments.commands import study as study_commands
-from experiments.commands import tokenize as tokenize_commands
-from experiments.setting import Setting, Where, make_setting
+from experiments.setting import Setting, StudyArguments, make_setting
 from tests.data_pipelines.fakes import make_spec, write_rlds
 from tests.experiments.test_cli_errors import idle_training  # noqa: F401
 
@@ -59,23 +58,23 @@ SAMPLES = {
 
 
 def test_every_field_has_a_sample():
-    assert set(SAMPLES) == {field.name for field in dataclasses.fields(Where)}
+    assert set(SAMPLES) == {field.name for field in dataclasses.fields(StudyArguments)}
 
 
-def combinations() -> list[Where]:
+def combinations() -> list[StudyArguments]:
     """Every value alone, every pair of values of two fields, and all fields at once."""
     found = {}
     for names in itertools.chain(((n,) for n in SAMPLES), itertools.combinations(SAMPLES, 2), [tuple(SAMPLES)]):
         for values in itertools.product(*(SAMPLES[n] for n in names)):
-            found[repr((names, values))] = Where(**{"preset": "smoke"} | dict(zip(names, values, strict=True)))
+            found[repr((names, values))] = StudyArguments(**{"preset": "smoke"} | dict(zip(names, values, strict=True)))
     return list(found.values())
 
 
 def asked_by(command: str, monkeypatch) -> Setting:
     """The Setting that a command works on, from its text, through a shell's words and the real parser."""
     seen = []
-    for module, name in ((study_commands, "run_study"), (tokenize_commands, "tokenize"), (model_commands, "train"),
-                         (model_commands, "evaluate"), (study_commands, "train_tokenizer")):  # fmt: skip
+    for module, name in ((run_study, "run_study"), (tokenize, "prepare_together"), (train, "train_model"),
+                         (evaluate, "evaluate_model"), (tokenizer, "train_tokenizer")):  # fmt: skip
         where = 0
         monkeypatch.setattr(module, name, lambda *args, where=where, **_: seen.append(args[where]))
     program, *words = shlex.split(command)
@@ -88,11 +87,11 @@ def asked_by(command: str, monkeypatch) -> Setting:
 def anything_goes(monkeypatch):
     """Some combinations make no study (a mixture of data that is not there); what is tested is what is asked."""
 
-    def study_of(where: Where) -> Setting:
+    def study_of(where: StudyArguments) -> Setting:
         asked = where.anywhere()
         return Setting(asked, settings.get_preset(asked.preset), (), settings.Workspace(asked.out))
 
-    for module in ("study", "data", "tokenizer", "bench"):
+    for module in ("study", "tokenize", "train", "evaluate", "tokenizer"):
         monkeypatch.setattr(f"experiments.cli.{module}.make_setting", study_of)
     return study_of
 
@@ -109,10 +108,10 @@ def test_a_printed_command_asks_for_the_same_again(world, monkeypatch, anything_
 @pytest.mark.parametrize(
     "where",
     [
-        Where("smoke"),
-        Where("smoke", Path("out"), (f"bridge/{ARM.name}",), set=("train.steps=7", "widths=[8, 16]"), mesh=(-1, 1, 1)),
-        Where("smoke-continuous", None, ("it's data/my_robot",), Path("my entries.toml"), tokenizer=Path("-tok")),
-        Where("paper", Path("/tmp/x y"), ("openx",), mixture="dataset5", set=("seeds=0,1",)),
+        StudyArguments("smoke"),
+        StudyArguments("smoke", Path("out"), (f"bridge/{ARM.name}",), set=("train.steps=7", "widths=[8, 16]"), mesh=(-1, 1, 1)),
+        StudyArguments("smoke-continuous", None, ("it's data/my_robot",), Path("my entries.toml"), tokenizer=Path("-tok")),
+        StudyArguments("paper", Path("/tmp/x y"), ("openx",), mixture="dataset5", set=("seeds=0,1",)),
     ],
 )
 def test_the_study_is_the_same_too(where, world, monkeypatch):
@@ -126,7 +125,7 @@ def test_the_study_is_the_same_too(where, world, monkeypatch):
 
 def test_a_command_means_the_same_in_another_directory(world, monkeypatch, tmp_path):
     monkeypatch.chdir(world)
-    setting = make_setting(Where("smoke", Path("out"), (f"bridge/{ARM.name}",), tokenizer=None))
+    setting = make_setting(StudyArguments("smoke", Path("out"), (f"bridge/{ARM.name}",), tokenizer=None))
     monkeypatch.chdir(tmp_path)
     assert asked_by(setting.command("train"), monkeypatch) == setting
     assert str(world) in setting.command("train")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from experiments.cli.main import main
-from tests.data_pipelines.sim.fakes import fake_workers
+from tests.data_pipelines.simulators.fakes import fake_workers
 
 
 @pytest.mark.parametrize("command", ["sim", "sim-table"])

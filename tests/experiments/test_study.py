@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import pytest
 
-from experiments import scale_datasets, scale_trajectories, scale_width
 from experiments.cost import ONE_ROBOT, declared_table, estimate
 from experiments.presets import CPU, PAPER, PRESETS, SMOKE, get_preset
 from experiments.running.provenance import Provenance
+from experiments.running.trial import trial_id
 from experiments.setting import Preset
 from experiments.study import on_user_data, override
-from experiments.sweep import reference_trial, unique_trials
-from experiments.trial import trial_id
+from experiments.sweeps import datasets, trajectories, width
+from experiments.sweeps.sweep import reference_trial, unique_trials
 from hma_jax.config import ConfigError, MeshConfig
 from hma_jax.config.json import from_dict, to_dict
 
-PLANS = (scale_datasets.plan, scale_trajectories.plan, scale_width.plan)
+PLANS = (datasets.plan, trajectories.plan, width.plan)
 PROVENANCE = Provenance("store", "manifest", "tokenizer")
 
 
@@ -34,7 +34,7 @@ def test_axes_share_one_reference_and_one_control(study):
 
 
 def test_points_of_an_axis_are_nested_and_judged_alike():
-    sweep = scale_datasets.plan(CPU)
+    sweep = datasets.plan(CPU)
     trials = [p.trial for p in sweep.points if p.role == "point"]
     for small, large in zip(trials, trials[1:], strict=False):
         assert large.datasets[: len(small.datasets)] == small.datasets
@@ -43,11 +43,11 @@ def test_points_of_an_axis_are_nested_and_judged_alike():
 
 
 def test_only_the_axis_changes_along_it():
-    for plan, field in ((scale_trajectories.plan, "max_trajectories"), (scale_width.plan, "model")):
+    for plan, field in ((trajectories.plan, "max_trajectories"), (width.plan, "model")):
         points = [p.trial for p in plan(SMOKE).points if p.role == "point"]
         same = {f.name for f in dataclasses.fields(points[0])} - {field, "measure_untrained"}
         assert all(len({getattr(t, name) for t in points}) == 1 for name in same)
-    widths = [p.trial.model for p in scale_width.plan(SMOKE).points]
+    widths = [p.trial.model for p in width.plan(SMOKE).points]
     assert len({replace(m, width=16) for m in widths}) == 1
 
 
@@ -143,7 +143,7 @@ def test_unknown_setting_like_no_other_lists_those_around_it_only(path, around):
 def test_the_widths_of_a_sweep_do_not_bound_a_single_model():
     study = override(CPU, ["model.width=128"])
     assert reference_trial(study, 0).model.width == 128
-    points = {p.x: p.trial for p in scale_width.plan(study).points}
+    points = {p.x: p.trial for p in width.plan(study).points}
     assert list(points) == [16, 32, 48, 128]
     assert points[128].model == study.model
 
@@ -152,7 +152,7 @@ def test_the_number_of_datasets_is_checked_by_the_axis_that_counts_them():
     study = override(SMOKE, ["datasets=a,b"])
     assert reference_trial(study, 0).datasets == ("a", "b")
     with pytest.raises(ConfigError, match=r"the last of dataset_counts \(2, 3\) must be the number of datasets, 2"):
-        scale_datasets.plan(study)
+        datasets.plan(study)
 
 
 @pytest.mark.parametrize(

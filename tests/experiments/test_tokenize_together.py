@@ -17,8 +17,8 @@ from data_pipelines.tokens import part_maker
 from experiments.cli.main import main
 from experiments.preparing import sources
 from experiments.progress import Pace
-from experiments.setting import Where, make_setting
-from experiments.workspace import Workspace
+from experiments.running.workspace import Workspace
+from experiments.setting import StudyArguments, make_setting
 from tests.data_pipelines.fakes import write_rlds
 from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
@@ -72,7 +72,7 @@ def test_who_joins_waits_for_the_parts_of_others_and_freezes_if_nobody_else_does
     (work,) = (tmp_path / "tokens").glob(f".{ARM.name}.????????????")
     part, holder = ExitStack(), ExitStack()
     part.enter_context(claim(work.with_name(f"{work.name}.claims") / "00000"))
-    holder.enter_context(Workspace(tmp_path).claimed())
+    holder.enter_context(Workspace(tmp_path).locked())
     with ThreadPoolExecutor(1) as pool:
         joined = pool.submit(main, arguments)
         until = time.monotonic() + 60
@@ -97,14 +97,14 @@ def test_who_joins_leaves_the_windows_to_a_living_holder_that_has_frozen_them(da
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data, *tokenizer]
     assert main(arguments) == 0
     before = (tmp_path / "eval_manifest.json").stat().st_mtime_ns
-    with Workspace(tmp_path).claimed():
+    with Workspace(tmp_path).locked():
         assert main(arguments) == 0
     assert (tmp_path / "eval_manifest.json").stat().st_mtime_ns == before
 
 
 def test_who_joins_needs_a_tokenizer_and_replaces_nothing(data, tokenizer, tmp_path, capsys):
     arguments = ["tokenize", *SMOKE, "--out", str(tmp_path), *data]
-    with Workspace(tmp_path).claimed():
+    with Workspace(tmp_path).locked():
         assert main(arguments) == 2
         message = capsys.readouterr().err
         assert "no tokenizer yet, and another command is at work" in message
@@ -130,7 +130,7 @@ def test_remote_data_is_neither_mangled_nor_copied(data, tmp_path, capsys):
             copy = root / "1.0.0" / path.name
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(path.read_bytes())
-        setting = make_setting(Where("smoke", tmp_path, (str(root),)))
+        setting = make_setting(StudyArguments("smoke", tmp_path, (str(root),)))
         assert setting.data == (f"memory://bucket/{ARM.name}",)
         ((spec, directory),) = sources.find_sources(setting.study, setting.data)
         assert spec == ARM and directory == root

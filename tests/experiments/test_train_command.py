@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import trial as trials
 from experiments.cli.main import main
-from hma_jax.training.claim import claimed
+from experiments.running import trial as trials
+from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.fakes import write_rlds
@@ -82,7 +82,7 @@ def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, s
 
 
 def test_a_run_that_another_process_trains_is_refused(where, tmp_path, capsys):
-    with claimed(tmp_path / "run"):
+    with locked_run(tmp_path / "run"):
         assert main(["train", *where, "--run", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"error: {tmp_path / 'run'} is being trained in by process ") and "Traceback" not in said

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from experiments import transfer_lr
-from experiments.commands.study import draw
 from experiments.optima import find_optima
 from experiments.presets import CPU, PRESETS, SMOKE
+from experiments.report.draw import draw
 from experiments.rows import LOSS, TRAINING, curve, read_csv
 from experiments.study import TransferConfig, override
-from experiments.sweep import POINT, STANDARD, unique_trials
+from experiments.sweeps import lr
+from experiments.sweeps.sweep import POINT, STANDARD, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
 from hma_jax.model.attention import attention_scale
@@ -22,18 +22,18 @@ RATE = STUDY.train.optimizer.learning_rate
 
 
 def rows_with(root, broken=None, study=STUDY):
-    return rows_of(finished_study(root, study, broken, axes=("lr",)), [transfer_lr.plan(study)])
+    return rows_of(finished_study(root, study, broken, axes=("lr",)), [lr.plan(study)])
 
 
 def optima_of(rows, metric="cross_entropy"):
     """{(role, series): optimum}"""
-    found = find_optima(rows, [transfer_lr.plan(STUDY)])
+    found = find_optima(rows, [lr.plan(STUDY)])
     return {(o.role, o.series): o for o in found if o.metric == metric}
 
 
 @pytest.mark.parametrize("study", PRESETS.values(), ids=PRESETS)
 def test_both_parametrisations_are_one_function_at_the_base_width(study):
-    sweep = transfer_lr.plan(study)
+    sweep = lr.plan(study)
     mup, standard = (
         {(p.series, p.x, p.trial.train.seed): p.trial for p in sweep.points if p.role == role}
         for role in (POINT, STANDARD)
@@ -53,13 +53,13 @@ def test_both_parametrisations_are_one_function_at_the_base_width(study):
 
 
 def test_rates_surround_that_of_the_study():
-    rates = sorted({p.x for p in transfer_lr.plan(CPU).points})
+    rates = sorted({p.x for p in lr.plan(CPU).points})
     assert rates == pytest.approx([1e-3, 2e-3, 4e-3, 8e-3, 16e-3])
     assert rates[2] == CPU.train.optimizer.learning_rate
 
 
 def test_the_smaller_trial_is_as_declared():
-    trial = transfer_lr.plan(CPU).points[0].trial
+    trial = lr.plan(CPU).points[0].trial
     assert trial.train.steps == CPU.transfer.steps < CPU.train.steps
     assert trial.datasets == trial.evaluated == CPU.dataset_names()[: CPU.transfer.datasets]
 
@@ -77,7 +77,7 @@ def test_the_smaller_trial_is_as_declared():
 )
 def test_a_grid_that_cannot_work_is_refused(setting, message):
     with pytest.raises(ConfigError, match=message):
-        transfer_lr.plan(override(SMOKE, [setting]))
+        lr.plan(override(SMOKE, [setting]))
 
 
 def test_optima_line_up_with_mup_and_cost_nothing(tmp_path):

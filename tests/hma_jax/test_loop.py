@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.training.claim import RunBusy, claimed
+from hma_jax.training.claim import RunBusy, locked_run
 from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import LoopOptions, Watch
 from hma_jax.training.reading import list_steps
@@ -204,7 +204,7 @@ def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path)
 
 
 def hold(run_dir: Path, ready, done) -> None:
-    with claimed(run_dir):
+    with locked_run(run_dir):
         ready.set()
         done.wait(60)
 

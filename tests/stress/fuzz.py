@@ -48,14 +48,11 @@ class Checker:
         self.target, self.failures = target, failures
         self.count = self.accepted = 0
         self.found: dict[str, str] = {}
-        self._resident = _resident()
         signal.signal(signal.SIGVTALRM, _hang)
 
     def __call__(self, data: bytes) -> None:
         self.count += 1
-        if self.count % 100 == 0:
-            self._resident = _resident()
-        before = _peak()  # what made the input may have taken more than what reads it
+        before, resident = _peak(), _resident()  # what made the input may have taken more than what reads it
         signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS)
         try:
             self.target.parse(data)
@@ -70,8 +67,8 @@ class Checker:
         finally:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0)
         peak = _peak()
-        if peak > before and peak - self._resident > EXTRA_MEMORY + 10 * len(data):
-            self._note(f"{(peak - self._resident) / 2**20:.0f} MB for {len(data)} bytes", None, data)
+        if peak > before and peak - resident > EXTRA_MEMORY + 10 * len(data):
+            self._note(f"{(peak - resident) / 2**20:.0f} MB for {len(data)} bytes", None, data)
 
     def _note(self, what: str, error: BaseException | None, data: bytes) -> None:
         frames = traceback.extract_tb(error.__traceback__) if error else []

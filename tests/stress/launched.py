@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.running.attempts import OUTPUT, read_progress
-from experiments.workspace import Workspace
+from experiments.running.workspace import Workspace
 
 SWEEP = ("sweep", "trajectories", "--preset", "smoke", "--set", "trajectory_counts=2,4")
 TRIALS = 3

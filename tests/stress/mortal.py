@@ -15,10 +15,10 @@ import tensorflow_datasets  # noqa: F401  once, in the server that processes are
 
 import data_pipelines.loading.frames
 import data_pipelines.loading.loader
-import experiments.pipeline
+import experiments.preparing.pipeline
 import experiments.preparing.suite
 import experiments.preparing.tokenizer
-import experiments.trial  # noqa: F401
+import experiments.running.trial  # noqa: F401
 import hma_jax.evaluation.evaluate
 import hma_jax.tokenizers.train
 import hma_jax.training.train  # noqa: F401
@@ -34,7 +34,7 @@ def run(
     """`hma ARGUMENTS`, which writes what it says to `output`, once `begun` is set. `ends_in`: sends itself the signal `how` before
     this step of its saves, from 1 on; 0: before none. `log` says how many there were."""
     os.environ[children._PARENT] = str(os.getppid())
-    children.settle()  # it ends with the server, and that with the program that kills
+    children.enter_child()  # it ends with the server, and that with the program that kills
     said = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(said, 1)
     os.dup2(said, 2)

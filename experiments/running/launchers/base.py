@@ -32,7 +32,7 @@ class Launcher(ABC):
 
     Settings: ClassVar[type]
     pause: ClassVar[float] = 0.1
-    """Seconds between two looks at what has ended."""
+    """Seconds between two checks of what has ended."""
 
     at_once: int = sys.maxsize
     """How many trials it takes at a time; the engines queue what does not fit."""

@@ -18,7 +18,7 @@ from experiments.running.children import child_environment
 from experiments.running.launchers.base import GRACE_SECONDS, Command
 
 LOOK_EVERY = 0.1
-"""Seconds between two looks whether the child has ended."""
+"""Seconds between two checks whether the child has ended."""
 
 
 class Attempt:

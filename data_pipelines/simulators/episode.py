@@ -1,0 +1,143 @@
+"""Episodes of one simulator: recorded under a behaviour, or run again from a recorded start.
+
+Owns the loop and what is remembered of it. `Simulator` is what a backend provides.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Protocol
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from data_pipelines.simulators.behaviour import Behaviour, Expert
+from data_pipelines.simulators.spec import SimSpec
+
+
+class Simulator(Protocol):
+    """A running environment of one embodiment. Frame t is the state before action t.
+
+    Everything but `start` and `close` waits for the first `start`.
+    """
+
+    low: np.ndarray  # float64 [A], of actions
+    high: np.ndarray  # float64 [A]
+
+    def start(self, env: str, seed: int) -> None:
+        """A new episode; a function of both arguments, whatever ran before."""
+
+    def rest(self) -> np.ndarray:
+        """float64 [A]: the action that wandering is centred on."""
+
+    def expert(self, rng: np.random.Generator) -> Expert | None:
+        """The expert for the episode just started; None where there is none."""
+
+    def step(self, action: np.ndarray) -> tuple[float, bool]:
+        """(reward, whether the goal is reached) after an action, float64 [A]."""
+
+    def physics(self) -> np.ndarray:
+        """float64 [P]: the state of the physics, from which it goes on."""
+
+    def set_physics(self, values: np.ndarray) -> None:
+        """Inverse of `physics`."""
+
+    def vector(self) -> np.ndarray:
+        """float32 [S]: what the robot may know of its state."""
+
+    def frame(self) -> np.ndarray:
+        """uint8 [size, size, 3], RGB."""
+
+    def close(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class StartState:
+    """Where an episode began: what resets the environment, then the physics it is set to."""
+
+    env: str
+    seed: int
+    physics: tuple[float, ...]
+
+    def to_json(self) -> str:
+        """Text from which the same numbers are read again, to the last bit."""
+        return json.dumps(asdict(self), separators=(",", ":"))
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> StartState:
+        """Raises DataError for text that is no start state."""
+        try:
+            values = json.loads(text)
+            return cls(values["env"], int(values["seed"]), tuple(map(float, values["physics"])))
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"{text[:80]!r} is no start state ({error}). "
+                "Take it from episode_metadata/start of a dataset that `hma data sim` wrote."
+            ) from error
+
+
+@dataclass(frozen=True)
+class Episode:
+    """N native frames and the actions after them."""
+
+    start: StartState
+    frames: np.ndarray  # uint8 [N, size, size, 3]
+    states: np.ndarray  # float32 [N, S]
+    actions: np.ndarray  # float32 [N, A], raw units
+    rewards: np.ndarray  # float32 [N], after each action
+    success: bool  # reached at any time
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What other actions lead to. One frame more than actions: the last shows where it ended."""
+
+    frames: np.ndarray  # uint8 [N + 1, size, size, 3]
+    rewards: np.ndarray  # float32 [N]
+    success: bool
+
+
+def record_episode(simulator: Simulator, spec: SimSpec, env: str, seed: int) -> Episode:
+    """One episode of `env` under the dataset's behaviour: a function of the arguments."""
+    rng = np.random.default_rng([seed, 1])
+    steps = int(rng.integers(spec.steps[0], spec.steps[1] + 1))
+    simulator.start(env, seed)
+    start = StartState(env, seed, tuple(simulator.physics().tolist()))
+    expert = simulator.expert(np.random.default_rng([seed, 2]))
+    behaviour = Behaviour(spec, simulator.low, simulator.high, simulator.rest(), expert, rng)
+    frames, states, actions, rewards, reached = [], [], [], [], False
+    for _ in range(steps):
+        frames.append(simulator.frame())
+        states.append(simulator.vector())
+        actions.append(behaviour.act(reached))
+        reward, done = simulator.step(actions[-1].astype(np.float64))
+        rewards.append(reward)
+        reached = reached or done
+    return Episode(
+        start, np.stack(frames), np.stack(states), np.stack(actions), np.asarray(rewards, np.float32), reached
+    )
+
+
+def replay_episode(simulator: Simulator, start: StartState, actions: Sequence[np.ndarray]) -> Replay:
+    """Runs `actions` [N, A] (raw units) from `start`. Raises DataError for those of another robot."""
+    actions = np.asarray(actions, np.float64)
+    simulator.start(start.env, start.seed)
+    size = len(simulator.low)
+    if actions.ndim != 2 or actions.shape[1] != size:
+        raise DataError(f"actions of shape {actions.shape} cannot be run: this robot takes [N, {size}].")
+    expected = len(simulator.physics())
+    if len(start.physics) != expected:
+        raise DataError(
+            f"{start.env}: the start state has {len(start.physics)} numbers, the simulator {expected}. "
+            "It was recorded with another robot or another version of the simulator."
+        )
+    simulator.set_physics(np.asarray(start.physics))
+    frames, rewards, reached = [simulator.frame()], [], False
+    for action in np.clip(actions, simulator.low, simulator.high):
+        reward, done = simulator.step(action)
+        rewards.append(reward)
+        reached = reached or done
+        frames.append(simulator.frame())
+    return Replay(np.stack(frames), np.asarray(rewards, np.float32), reached)

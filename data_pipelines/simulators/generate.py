@@ -1,0 +1,208 @@
+"""Making the simulator suite: which episodes are missing, in which processes, all or nothing each.
+
+Bytes depend on the table, the packages' versions, frame size, episode count and seed; never on
+the number of workers or on how often a run was cut short. Episodes are kept as they are made, a
+dataset appears when all of its episodes are there. One process at a time makes a dataset (see
+`publishing`). Imports no simulator.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack
+from pathlib import Path
+from typing import BinaryIO
+
+from data_pipelines.errors import DataError
+from data_pipelines.publishing.claims import Claim, claim
+from data_pipelines.publishing.marks import FINGERPRINT, is_complete
+from data_pipelines.simulators.embodiments import select
+from data_pipelines.simulators.packages import gl_backend, package_versions, require_packages
+from data_pipelines.simulators.spec import SimSpec
+from data_pipelines.simulators.worker import Job, record_path
+from data_pipelines.simulators.write import write_dataset
+from data_pipelines.sources.rlds.writer import VERSION
+from hma_jax.config import ConfigError, require
+from hma_jax.runtime.locks import Held
+
+GENERATOR = 1
+"""Raise it when simulation, behaviour, drawing or encoding change: older datasets are then remade."""
+
+JOB_EPISODES = 10
+"""At most so many episodes in one process: starting one costs a few seconds."""
+
+Progress = Callable[[str, int, int], None]
+"""Called with (dataset, episodes that are there, of how many) over all datasets."""
+
+
+def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
+    """Hash of everything the bytes of this dataset depend on."""
+    text = repr((GENERATOR, spec, episodes, size, seed, package_versions(spec), gl_backend()))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def generate_sim(
+    root: str | Path,
+    *,
+    names: Sequence[str] | None = None,
+    episodes: int = 20,
+    size: int = 128,
+    seed: int = 0,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
+
+    `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
+    is left as it is. Raises ConfigError for bad arguments, missing packages and a dataset that another
+    process is making, DataError when a simulator fails; the other datasets are then made all the same.
+    """
+    require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
+    require(16 <= size <= 1024, f"the frame size must lie in 16..1024, got {size}")
+    require(workers >= 1, f"workers must be at least 1, got {workers}")
+    specs, root = select(names), Path(root)
+    require_packages(specs)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot make the directory {root}: {error.strerror}") from error
+    require(os.access(root, os.W_OK), f"cannot write to {root}: no permission; choose another directory")
+
+    marks = {spec.name: fingerprint(spec, episodes, size, seed) for spec in specs}
+    with ExitStack() as claims:
+        run = _Run(root, marks, episodes, size, seed, len(specs) * episodes, progress, claims)
+        jobs = [job for spec in specs for job in run.plan(spec)]
+        failures = run.work(jobs, workers)
+    if failures:
+        raise DataError(
+            f"{len(failures)} of {len(specs)} datasets were not made; the others are complete. "
+            + " ".join(failures)
+            + " The same command tries them again."
+        )
+    return [root / spec.name / VERSION for spec in specs]
+
+
+class _Run:
+    """One call of `generate_sim`: what is there, and the processes under way."""
+
+    def __init__(
+        self, root: Path, marks: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack
+    ):
+        self.root, self.marks, self.episodes, self.size, self.seed = root, marks, episodes, size, seed
+        self.done, self.total, self.progress = 0, total, progress
+        self.lock, self.finishing = threading.Lock(), threading.Lock()
+        self.children: set[subprocess.Popen] = set()
+        self.stopped = False
+        self.stack, self.claims = stack, dict[str, Claim]()
+
+    def staging(self, name: str) -> Path:
+        """Where the episodes of a dataset wait for each other."""
+        return self.root / name / f".{VERSION}.episodes.{self.marks[name]}"
+
+    def plan(self, spec: SimSpec) -> list[Job]:
+        """The jobs that a dataset lacks; it is put together if nothing but that is left to do."""
+        name = spec.name
+        if not is_complete(self.root / name / VERSION, self.marks[name]):
+            self.claims[name] = self.claim(name)  # looked at again: another process may have made it by then
+        if is_complete(self.root / name / VERSION, self.marks[name]):
+            self.count(name, self.episodes)
+            return []
+        staging = self.staging(name)
+        staging.mkdir(parents=True, exist_ok=True)
+        missing = self.missing(name)
+        self.count(name, self.episodes - len(missing))
+        if not missing:
+            self.finish(spec)
+        chunks = [missing[i : i + JOB_EPISODES] for i in range(0, len(missing), JOB_EPISODES)]
+        return [Job(name, tuple(chunk), self.seed, self.size, str(staging)) for chunk in chunks]
+
+    def claim(self, name: str) -> Claim:
+        """Held until the whole run ends. Raises Held."""
+        home = self.root / name
+        try:
+            return self.stack.enter_context(claim(home / f".{VERSION}"))
+        except Held as held:
+            raise Held(
+                f"{home}: {held.who} is making this dataset; wait for it, stop it, or name other datasets",
+                held.holder,
+            ) from None
+
+    def missing(self, name: str) -> list[int]:
+        return [i for i in range(self.episodes) if not record_path(self.staging(name), i).is_file()]
+
+    def work(self, jobs: Sequence[Job], workers: int) -> list[str]:
+        """Runs `jobs` and returns what failed. When it is interrupted its processes are ended."""
+        with ThreadPoolExecutor(workers) as pool:
+            running = [pool.submit(self.run, job) for job in jobs]
+            try:
+                failures = [job.result() for job in as_completed(running)]
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                self.stop()
+                raise
+        return sorted({failure for failure in failures if failure})
+
+    def run(self, job: Job) -> str:
+        """One process. Returns what is to be said if it failed, nothing if not."""
+        log = Path(job.directory) / "log.txt"
+        with open(log, "ab") as messages:
+            child = self.launch(job, messages)
+            for line in child.stdout:
+                if line.strip().isdigit():  # packages print as well
+                    self.count(job.name, 1)
+            code = child.wait()
+        with self.lock:
+            self.children.discard(child)
+        if code:
+            last = log.read_text(errors="replace").strip().splitlines()[-1:] or ["nothing was said"]
+            return f"{job.name}: its simulator ended with code {code}: {last[0]} ({log} has the rest)."
+        with self.finishing:
+            (spec,) = select([job.name])
+            if self.staging(job.name).is_dir() and not self.missing(job.name):
+                self.finish(spec)
+        return ""
+
+    def launch(self, job: Job, messages: BinaryIO) -> subprocess.Popen:
+        command = [sys.executable, "-m", "data_pipelines.simulators", job.to_json()]
+        here = str(Path(__file__).parents[2])
+        path = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+        # One thread each: several processes share the cores.
+        environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "JAX_PLATFORMS": "cpu"}
+        with self.lock:
+            if self.stopped:
+                raise KeyboardInterrupt
+            child = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=messages, env=environment, text=True
+            )
+            self.children.add(child)
+        return child
+
+    def stop(self) -> None:
+        with self.lock:
+            self.stopped = True
+            for child in self.children:
+                child.kill()
+
+    def finish(self, spec: SimSpec) -> None:
+        """Puts a dataset together from its episodes."""
+        write_dataset(
+            spec,
+            self.root / spec.name,
+            self.claims[spec.name],
+            self.staging(spec.name),
+            episodes=self.episodes,
+            size=self.size,
+            metadata={FINGERPRINT: self.marks[spec.name], "generator": GENERATOR, "seed": self.seed},
+        )
+
+    def count(self, name: str, episodes: int) -> None:
+        with self.lock:
+            self.done += episodes
+            if self.progress:
+                self.progress(name, self.done, self.total)

@@ -1,0 +1,119 @@
+"""What the simulators need from the machine: packages, and a way to draw without a screen.
+
+Owns the messages for what is missing. Looks for packages without importing them.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from collections.abc import Iterable
+
+from data_pipelines.simulators.spec import SimSpec
+from hma_jax.config import ConfigError
+
+MODULES = {
+    "metaworld": "metaworld",
+    "robosuite": "robosuite",
+    "robosuite-models": "robosuite_models",
+    "gymnasium-robotics": "gymnasium_robotics",
+    "gymnasium": "gymnasium",
+    "dm-control": "dm_control",
+    "gym-aloha": "gym_aloha",
+    "gym-pusht": "gym_pusht",
+    "ogbench": "ogbench",
+    "lerobot-env-so101": "lerobot_env_so101",
+}
+"""Package -> the module it installs."""
+
+TOGETHER = {
+    "gymnasium": ("gymnasium", "gymnasium-robotics", "ogbench"),
+    "robosuite": ("robosuite", "robosuite-models"),
+}
+"""Backend -> packages that its module imports, whichever of them a robot is from."""
+
+EVERYWHERE = ("mujoco", "numpy", "simplejpeg")
+"""Packages that decide what is in every dataset: physics and drawing, random draws, the encoding of frames."""
+
+BENEATH = {
+    "metaworld": ("gymnasium", "scipy"),
+    "robosuite": ("mink", "numba", "scipy"),
+    "gymnasium": ("dm-control",),
+    "aloha": ("dm-control", "gymnasium"),
+    "pusht": ("gymnasium", "opencv-python", "opencv-python-headless", "pygame", "pymunk", "shapely"),
+    "so101": ("gymnasium", "scipy"),
+}
+"""Backend -> what its packages simulate, steer and draw with, where it is installed."""
+
+EXTRA = "pip install -e '.[sim]'"
+
+APT = (
+    "apt-get install --no-install-recommends libosmesa6 libegl1 libgl1-mesa-dri libgl1 libglx-mesa0 "
+    "libegl-mesa0 libgles2 libglu1-mesa"
+)
+
+GL = {"egl": "EGL", "osmesa": "OSMesa"}
+"""Values of MUJOCO_GL that need no screen -> the library behind each."""
+
+
+def missing_packages(specs: Iterable[SimSpec]) -> tuple[str, ...]:
+    """Packages that these embodiments need and that are not installed."""
+    needed = {"mujoco"}
+    for spec in specs:
+        needed.update({spec.package, *TOGETHER.get(spec.backend, ())})
+    return tuple(p for p in sorted(needed) if importlib.util.find_spec(MODULES.get(p, p)) is None)
+
+
+def package_versions(spec: SimSpec) -> dict[str, str]:
+    """Versions of the packages that decide what is in a dataset; "" for one that is not installed."""
+    used = {spec.package, *EVERYWHERE, *TOGETHER.get(spec.backend, ()), *BENEATH.get(spec.backend, ())}
+    return {package: _version(package) for package in sorted(used)}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return ""
+
+
+def require_packages(specs: Iterable[SimSpec]) -> None:
+    """Raises ConfigError, with what to install, unless these embodiments can be simulated here."""
+    missing = missing_packages(specs)
+    if missing:
+        raise ConfigError(
+            f"simulators not installed ({', '.join(missing)}): {EXTRA} "
+            f"and, to draw without a screen, {APT}"
+        )
+    backend = gl_backend()
+    if ctypes.util.find_library(GL[backend]) is None:
+        raise ConfigError(
+            f"the simulators cannot draw: no {GL[backend]} library on this machine; "
+            f"{APT} (or set MUJOCO_GL to the other of {' and '.join(GL)})"
+        )
+
+
+def gl_backend() -> str:
+    """The library that draws: MUJOCO_GL, egl without it. Raises ConfigError for one with a screen."""
+    backend = os.environ.get("MUJOCO_GL") or "egl"
+    if backend not in GL:
+        raise ConfigError(f"MUJOCO_GL is {backend!r}; frames are drawn without a screen by {' or '.join(GL)}")
+    return backend
+
+
+def prepare_process() -> None:
+    """Settles, before any simulator is imported, how this process draws.
+
+    Raises ConfigError where TensorFlow is loaded: with Mesa's software renderer in the same
+    process, the first picture ends it with a segmentation fault.
+    """
+    if "tensorflow" in sys.modules:
+        raise ConfigError(
+            "TensorFlow is loaded in this process, which ends with a segmentation fault when a simulator "
+            "draws; simulate in a process of its own, without `import tensorflow`"
+        )
+    backend = gl_backend()
+    os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend

@@ -1,0 +1,44 @@
+"""The table of a generated simulator suite: sizes, speed, success. Reads stats.json files only."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from data_pipelines.simulators.embodiments import EMBODIMENTS
+from data_pipelines.simulators.write import STATS
+
+HEADER = "| dataset | package | dims | Hz | expert | episodes | frames | seconds | frames/s | success |"
+
+
+def stats_table(root: Path) -> str:
+    """Markdown, one row per dataset of the suite under `root`, in the order of the table.
+
+    Episode lengths are shortest to longest, in seconds of the robot's time; frames/s is what one
+    process simulated and drew, the start of the first episode included. Raises DataError when
+    nothing is there.
+    """
+    rows, machines, sizes, dates = [], set(), set(), set()
+    for spec in EMBODIMENTS:
+        path = root / spec.name / STATS
+        if not path.is_file():
+            continue
+        stats = json.loads(path.read_text())
+        frames, success = stats["frames"], stats["success"]
+        lengths = f"{min(frames) / spec.hz:.1f} to {max(frames) / spec.hz:.1f}"
+        rate = "" if success is None else f"{sum(success)}/{len(success)}"
+        speed = f"{np.sum(frames) / np.sum(stats['seconds']):.0f}"
+        what = [f"`{spec.name}`", spec.package, f"{spec.action_dim}", f"{spec.hz:.3g}"]
+        how = [spec.expert or "wanders", f"{len(frames)}", f"{np.sum(frames)}", lengths, speed, rate]
+        rows.append(f"| {' | '.join(what + how)} |")
+        machines.add(stats["machine"])
+        sizes.add(f"{stats['size']} px")
+        dates.add(stats["date"])
+    if not rows:
+        raise DataError(f"{root}: no simulator datasets; make them with `hma data sim --out {root}`.")
+    made = f"{len(rows)} datasets, {', '.join(sorted(sizes))}, made on {', '.join(sorted(machines))}, "
+    rule = "|---|---|" + "--:|" * 2 + "---|" + "--:|" * 5
+    return "\n".join([made + " and ".join(sorted(dates)) + ".", "", HEADER, rule, *rows])

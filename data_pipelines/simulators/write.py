@@ -1,0 +1,86 @@
+"""One simulator dataset on disk, put together from the records of its episodes.
+
+Owns shards and what lies beside them; the dataset appears whole. Beside it, not in it, lies
+stats.json: how fast it was made and what became of the episodes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import time
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.publishing.claims import Claim
+from data_pipelines.publishing.files import publish, write_file
+from data_pipelines.simulators.record import build_features
+from data_pipelines.simulators.spec import SimSpec
+from data_pipelines.simulators.worker import facts_path, record_path
+from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.writer import VERSION, shard_name, write_info
+from data_pipelines.suite.write import SHARD_FRAMES
+
+STATS = "stats.json"
+
+
+def write_dataset(
+    spec: SimSpec, home: Path, claim: Claim, staging: Path, *, episodes: int, size: int, metadata: dict
+) -> Path:
+    """`<home>/<version>/` from the episodes in `staging`, which are then removed.
+
+    `claim` is that of the dataset in `home`: staging directories of other settings are nobody's then.
+    """
+    scratch, final = claim.scratch, home / VERSION
+    facts = [json.loads(facts_path(staging, i).read_text()) for i in range(episodes)]
+    frames = sum(f["frames"] for f in facts)
+    shards = max(1, min(episodes, round(frames / SHARD_FRAMES)))
+    bounds = np.linspace(0, episodes, shards + 1).astype(int)
+    lengths, payload = [], 0
+    for k in range(shards):
+        path = scratch / shard_name(spec.name, k, shards)
+        records = (record_path(staging, i).read_bytes() for i in range(bounds[k], bounds[k + 1]))
+        lengths.append(write_shard(path, records))
+        payload += path.stat().st_size - 16 * lengths[-1]  # tfds counts payload bytes, not framing
+    layout = ", ".join(f"{what} {dim}" for what, dim in spec.layout)
+    write_info(
+        scratch,
+        spec.name,
+        build_features(spec, size, facts[0]["states"]),
+        lengths,
+        payload,
+        f"Simulated by {spec.package}: {', '.join(spec.envs)}; actions at {spec.hz:g} Hz: {layout}.",
+        metadata,
+        module="data_pipelines.simulators",
+    )
+    _write_stats(home / STATS, spec, size, facts)
+    publish(scratch, final)
+    for left in home.glob(f".{VERSION}.episodes.*"):
+        shutil.rmtree(left)
+    return final
+
+
+def _write_stats(path: Path, spec: SimSpec, size: int, facts: list[dict]) -> None:
+    stats = {
+        "name": spec.name,
+        "size": size,
+        "frames": [f["frames"] for f in facts],
+        "seconds": [f["seconds"] for f in facts],
+        "success": [f["success"] for f in facts] if spec.success else None,
+        "machine": _machine(),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+    write_file(path, json.dumps(stats))
+
+
+def _machine() -> str:
+    """Processor and cores, for people."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # not Linux
+        lines = []
+    model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "")
+    return f"{model or platform.machine()}, {os.cpu_count()} cores"

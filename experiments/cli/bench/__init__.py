@@ -1,0 +1,1 @@
+"""`hma bench`: how fast it is, here; the measuring is in `experiments.bench`."""

@@ -1,0 +1,24 @@
+"""`hma bench`: its commands by name."""
+
+from __future__ import annotations
+
+from tyro.extras import SubcommandApp
+
+from experiments.cli.bench import models, others
+
+HELP = (
+    "How fast it is, here. Every command times the fast path and the naive one by turns in one process, "
+    "prints both, and writes a JSON record with commit, hardware and versions."
+)
+
+bench_app = SubcommandApp()
+bench_app.command(name="generate")(models.generate)
+bench_app.command(name="rollout")(models.rollout)
+bench_app.command(name="train")(models.train)
+bench_app.command(name="products")(models.products)
+bench_app.command(name="eval")(models.evaluate)
+bench_app.command(name="quality")(others.quality)
+bench_app.command(name="tokenize")(others.tokenize)
+bench_app.command(name="load")(others.load)
+bench_app.command(name="release")(others.release)
+bench_app.command(name="report")(others.report)

@@ -1,0 +1,50 @@
+"""What several commands of `hma bench` ask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from hma_jax.config.evaluation import SamplerKind
+from hma_jax.config.execution import Dtype
+
+Model = Literal["base", "xl", "base-continuous", "xl-continuous", "cpu", "cpu-continuous"]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """What is timed and how often."""
+
+    model: Model = "base"
+    """base: the released size, width 256, 32 layers, 12 frames of 256 + 64 tokens; xl: width 1024; cpu:
+    the model of the cpu preset."""
+    batch: tuple[int, ...] = (1,)
+    """Examples at a time; several numbers give several measurements."""
+    repeats: int = 30
+    """Timed calls of every stage, after two untimed ones."""
+    dtype: Dtype = "float32"
+    """What is computed in."""
+    robots: int = 1
+    """Embodiments of the model; a batch mixes them."""
+    layers: Annotated[int | None, arg(metavar="N")] = None
+    """Another number of layers, for a quick try."""
+    width: Annotated[int | None, arg(metavar="D")] = None
+    """Another width."""
+    seed: int = 0
+    out: Path = Path("runs/bench")
+    """Directory for the record."""
+
+
+@dataclass(frozen=True)
+class Decode:
+    """How frames are filled."""
+
+    unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2
+    """Passes over each frame, M."""
+    sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100
+    """Continuous models: steps of the diffusion sampler."""
+    sampler: SamplerKind = "ddpm"
+    """Continuous models: the diffusion sampler. dpm++ needs 10 to 12 steps."""

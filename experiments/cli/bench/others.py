@@ -1,0 +1,208 @@
+"""`hma bench quality|tokenize|load|release|report`: trained models, tokenizers, data, the release, and the tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from experiments.cli.bench.record import write
+from experiments.progress import console, step, tidy_table
+from experiments.setting import StudyArguments, make_setting
+from hma_jax.config import ConfigError, require
+from hma_jax.config.execution import Dtype
+
+
+def quality(
+    run: Positional[Path],
+    asked: OmitArgPrefixes[StudyArguments],
+    frames: int | None = None,
+    windows: int = 12,
+    repeats: int = 30,
+) -> None:
+    """Judge a trained model's rollouts under cheaper and dearer decoding: quality beside time per frame.
+
+    Latents: DDPM and DDIM with fewer steps, DPM++ with few. Ids: more and fewer passes over each frame. With --frames
+    beyond the model's window: an exact slide against streaming.
+
+    Args:
+        run: Directory of a trained model.
+        asked: The study whose held-out windows are used.
+        frames: Length of a rollout, prompt included; the model's window if not given.
+        windows: Held-out windows per dataset.
+        repeats: Timed rollouts of every decoding.
+    """
+    from dataclasses import replace
+
+    from data_pipelines.windows.evalset import eval_batches, freeze_manifest
+    from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
+    from experiments.cli.evaluate import check_fits, require_prepared
+    from experiments.rows import write_csv
+    from experiments.running.trial import open_materials
+    from hma_jax.training.runs import load_model
+
+    setting = make_setting(asked)
+    trained = load_model(run).run
+    require_prepared(setting)
+    materials = open_materials(setting.workspace)
+    check_fits(trained, materials)
+    subject, config = subject_of(trained), setting.study.eval
+    config = replace(config, batch=min(config.batch, windows))  # no rows of padding
+    frames = frames or trained.model.frames
+    if frames < trained.model.frames:
+        raise ConfigError(f"--frames must be at least the model's window of {trained.model.frames}, got {frames}")
+    names = [d.dataset for d in materials.manifest.datasets if d.dataset in trained.table.names]
+    # Whole windows: what is timed are frames, all of them.
+    frozen = freeze_manifest(
+        materials.store, names, frames, windows, materials.manifest.seed, rate=materials.manifest.rate
+    )
+    settings = decodings(trained.model, config, frames)
+
+    def batches():
+        return eval_batches(materials.store, trained.table, frozen, config.batch, frozen.names)
+
+    with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
+        rows, stages = judge(
+            subject, materials.tokenizer, batches, settings, frames, repeats,
+            lambda name, done: update(done, len(settings), name),
+        )  # fmt: skip
+    table = tidy_table(
+        f"{run}, {frames} frames from a prompt of {config.prompt_frames}, {rows[0].windows} windows",
+        "decoding", "PSNR", "SSIM", "delta PSNR", "ms/frame", "cost",
+    )  # fmt: skip
+    for r in rows:
+        means = (f"{r.psnr:.2f} ± {r.psnr_sem:.2f}", f"{r.ssim:.3f}", f"{r.delta_psnr:.3f} ± {r.delta_psnr_sem:.3f}")
+        table.add_row(r.decoding, *means, f"{r.milliseconds_per_frame:.2f}", f"{r.cost:.3f}")
+    console.print(table)
+    out = run / "quality"
+    out.mkdir(exist_ok=True)
+    stem = out / f"quality-{frames}"
+    write_csv(stem.with_suffix(".csv"), Judged, rows)
+    plot_quality(rows, stem.with_suffix(".png"))
+    gaps = {f"PSNR of {r.decoding} over {rows[0].decoding}, dB": r.psnr_gap for r in rows[1:]}
+    facts = {"model": trained.model, "eval": replace(config, batch=1), "frames": frames, "windows": rows[0].windows}
+    write("quality", f"{frames}-frames", subject.execution.dtype, 0, facts, stages, gaps, (), out)
+    console.print(f"wrote {stem}.csv and {stem}.png", soft_wrap=True)
+
+
+def tokenize(
+    tokenizer: str = "magvit2",
+    piece: int | None = None,
+    repeats: int = 30,
+    dtype: Dtype = "float32",
+    seed: int = 0,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time a tokenizer both ways.
+
+    Args:
+        tokenizer: magvit2 or svd-vae, with drawn weights at 256 pixels, or a tokenizer's directory.
+        piece: Images per device at a time; its own default if not given.
+        repeats: Timed calls of every stage.
+        dtype: What magvit2 and svd-vae compute in.
+        seed: Of weights and images.
+        out: Directory for the record.
+    """
+    from experiments.bench.tokenize import make_tokenizer, time_tokenizer
+
+    with step(f"make {tokenizer}"):
+        made = make_tokenizer(tokenizer, dtype, piece, seed)
+    with step(f"time {tokenizer} on {made.at_once} image(s) at a time"):
+        stages = time_tokenizer(made, repeats, seed)
+    settings = {"tokenizer": made.config, "piece": made.at_once}
+    write("tokenize", Path(tokenizer).name, dtype, seed, settings, stages, {}, (), out)
+
+
+def load(
+    store: Path | None = None,
+    data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = (),
+    windows: int = 20_000,
+    batch: int = 32,
+    frames: int = 12,
+    size: int = 64,
+    threads: tuple[int, ...] = (1, 2),
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time training windows from a token store, and frames from RLDS directories; watch the memory.
+
+    Args:
+        store: A token store; one of forty datasets with random tokens is made if not given.
+        data: RLDS directories, whose frames are decoded and resized.
+        windows: Windows to draw.
+        batch: Windows per batch; four times as many frames of RLDS directories.
+        frames: Frames per window.
+        size: Pixels that frames of RLDS directories are resized to.
+        threads: Threads that read ahead; several numbers are timed one after the other.
+        out: Directory for the record.
+    """
+    import tempfile
+
+    from data_pipelines.tokens.store import TokenStore
+    from experiments.bench.load import MemoryPoint, make_store, plot_memory, time_shards, time_windows
+    from experiments.rows import write_csv
+
+    with tempfile.TemporaryDirectory() as scratch:
+        with step("open the token store"):
+            opened = make_store(Path(scratch), 0) if store is None else TokenStore(store)
+        with step(f"draw windows of {len(opened.names)} datasets"):
+            drained = [time_windows(opened, windows, batch, frames, n) for n in threads]
+    if data:
+        from data_pipelines.registry import get_spec
+        from experiments.preparing.sources import name_datasets
+
+        sources = [(get_spec(n), Path(d)) for n, d in zip(name_datasets(data), data, strict=True)]
+        with step(f"draw frames of {len(sources)} RLDS directories"):
+            drained += [time_shards(sources, windows * frames // 10, 4 * batch, size, n) for n in threads]
+    settings = {"frames": frames, "threads": threads, "datasets": len(opened.names), "size": size}
+    stages, notes = [d.stage for d in drained], tuple(d.describe() for d in drained)
+    name = "store" if store is None else store.name
+    write("load", name, "none", 0, settings, stages, {}, notes, out)
+    write_csv(out / f"load-{name}-memory.csv", MemoryPoint, [p for d in drained for p in d.memory])
+    plot_memory(drained, out / f"load-{name}-memory.png")
+    console.print(f"wrote {out / f'load-{name}-memory'}.csv and .png", soft_wrap=True)
+
+
+def release(
+    checkout: Positional[Path],
+    python: Path,
+    stages: Annotated[tuple[str, ...], arg(metavar="[STAGE ...]")] = (),
+    turns: int = 5,
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time the base models beside the official PyTorch release: two processes that take turns.
+
+    Args:
+        checkout: A clone of github.com/liruiw/HMA.
+        python: An interpreter with what the release imports: torch, einops, mup, transformers,
+            huggingface_hub, scipy.
+        stages: Some of: forward, fill, slide, step, "continuous fill", "continuous slide",
+            "continuous few" (10 evaluations by dpm++ against the release's 100). All if not given.
+        turns: Timed turns of every stage, after one untimed.
+        out: Directory for the record.
+    """
+    from experiments.bench.beside import RELEASED, time_beside
+
+    names = stages or tuple(RELEASED)
+    with step(f"time {len(names)} stages beside the release") as update:
+        found, ratios = time_beside(checkout, python, names, turns, lambda what, turn: update(turn, turns, what))
+    write("release", "base", "float32", 0, {"stages": list(names)}, found, ratios, (), out)
+
+
+def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
+    """Print records as Markdown tables, and draw them.
+
+    Args:
+        records: Record files, or directories of them.
+        figure: PNG file for bars of every stage.
+    """
+    from experiments.bench.record import read_record
+    from experiments.bench.report import markdown, plot_records
+
+    files = [f for path in records for f in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
+    require(len(files) > 0, "no records there; make one with `hma bench generate`")
+    found = [read_record(file) for file in files]
+    print(markdown(found))
+    if figure is not None:
+        plot_records(found, figure)
+        console.print(f"wrote {figure}", soft_wrap=True)

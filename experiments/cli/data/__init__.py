@@ -1,0 +1,1 @@
+"""`hma data`: the registry, what a directory holds, other formats, the simulated suites."""

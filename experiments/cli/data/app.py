@@ -1,0 +1,47 @@
+"""`hma data`: its commands by name, and the one that writes the study's own suite."""
+
+from __future__ import annotations
+
+from tyro.conf import OmitArgPrefixes
+from tyro.extras import SubcommandApp
+
+from experiments.cli.arguments import Remake
+from experiments.cli.data import convert, registry, sim
+from experiments.cli.data.view import view
+from experiments.setting import StudyArguments, make_setting
+from experiments.wrote import wrote
+
+HELP = "The registry, what a directory holds, other formats, the simulated suites."
+
+CONVERT_HELP = (
+    "Other formats into an RLDS directory, as an export: LeRobot and robomimic are read directly too. Needs the extra 'convert' "
+    "(pip install 'hma-jax[convert]'). The same command again goes on where it was interrupted."
+)
+
+
+def suite(asked: OmitArgPrefixes[StudyArguments], remake: OmitArgPrefixes[Remake]) -> None:
+    """Write the study's simulated datasets as RLDS directories."""
+    from experiments.preparing.suite import make_suite
+
+    setting = make_setting(asked)
+    with setting.workspace.locked():
+        make_suite(setting.study, setting.workspace, remake.replace)
+    wrote(setting.workspace.suite, then=setting.command("tokenizer train"))
+
+
+convert_app = SubcommandApp()
+convert_app.command(name="robomimic")(convert.robomimic)
+convert_app.command(name="lerobot")(convert.lerobot)
+convert_app.command(name="epic-kitchens")(convert.epic_kitchens)
+convert_app.command(name="ego4d")(convert.ego4d)
+convert_app.command(name="egoexo4d")(convert.egoexo4d)
+
+data_app = SubcommandApp()
+data_app.command(name="list")(registry.data_list)
+data_app.command(name="inspect")(registry.data_inspect)
+data_app.command(name="view")(view)
+data_app.command(name="suite")(suite)
+data_app.command(name="import-tokens")(convert.import_tokens)
+data_app.command(name="sim")(sim.data_sim)
+data_app.command(name="sim-table")(sim.data_sim_table)
+data_app.command(convert_app, name="convert", help=CONVERT_HELP)

@@ -1,0 +1,222 @@
+"""`hma data convert` and `hma data import-tokens`: other formats. Each command says what it wrote, and what is next."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from data_pipelines.sources.settings import (
+    Ego4dSettings,
+    EgoExo4dSettings,
+    EpicKitchensSettings,
+    LeRobotSettings,
+    RobomimicSettings,
+)
+from experiments.progress import console, step
+from experiments.setting import command
+from experiments.wrote import wrote
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.registry import DatasetSpec
+    from data_pipelines.sources.units import Source
+
+
+@dataclass(frozen=True)
+class Destination:
+    """Where the dataset goes."""
+
+    out: Path
+    """Directory in which NAME/1.0.0 is written."""
+    name: str | None = None
+    """Name of the dataset: lower-case letters, digits and _. Made of the source's name if not given."""
+    skip_damaged: Annotated[bool, arg(name="skip-damaged")] = False
+    """Leave damaged demonstrations, episodes or videos out and count them, instead of stopping."""
+
+
+def robomimic(
+    source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[RobomimicSettings]
+) -> None:
+    """Robomimic demonstrations: an HDF5 file with camera images.
+
+    Args:
+        source: The HDF5 file.
+        destination: Where the dataset goes.
+        settings: What is taken of the file.
+    """
+    from data_pipelines.sources.robomimic import RobomimicSource
+
+    opened = RobomimicSource(source, settings)
+    _convert(opened, destination, f"robomimic_{opened.task}")
+
+
+def lerobot(
+    source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[LeRobotSettings]
+) -> None:
+    """A LeRobot dataset, version 2.0, 2.1 or 3.0, with videos or images.
+
+    Args:
+        source: Its root, with meta, data and videos.
+        destination: Where the dataset goes.
+        settings: What is taken of the dataset.
+    """
+    from data_pipelines.sources.lerobot import LeRobotSource
+
+    _convert(LeRobotSource(source, settings), destination, source.absolute().name)
+
+
+def epic_kitchens(
+    source: Positional[Path],
+    detections: Path,
+    destination: OmitArgPrefixes[Destination],
+    settings: OmitArgPrefixes[EpicKitchensSettings],
+) -> None:
+    """EPIC-KITCHENS-100 frames with the published hand detections: 2-D hand motion as actions, 10 Hz.
+
+    Args:
+        source: Root of the frames: <participant>/rgb_frames/<video>/frame_*.jpg.
+        detections: Folder of the detections: <participant>/<video>.pkl. No code in them is run.
+        destination: Where the dataset goes.
+        settings: Which frames make episodes.
+    """
+    from data_pipelines.sources.human.epic_kitchens import NAME, EpicKitchensSource
+
+    _convert(EpicKitchensSource(source, detections, settings), destination, NAME)
+
+
+def ego4d(
+    source: Positional[Path],
+    videos: Path,
+    destination: OmitArgPrefixes[Destination],
+    settings: OmitArgPrefixes[Ego4dSettings],
+) -> None:
+    """Ego4D videos with the annotated hand boxes (FHO): 2-D hand positions as actions, 2 Hz.
+
+    Args:
+        source: The annotations, fho_main.json.
+        videos: Folder of <video_uid>.mp4.
+        destination: Where the dataset goes.
+        settings: Which frames make episodes.
+    """
+    from data_pipelines.sources.human.ego4d import NAME, Ego4dSource
+
+    _convert(Ego4dSource(source, videos, settings), destination, NAME)
+
+
+def egoexo4d(
+    source: Positional[Path], destination: OmitArgPrefixes[Destination], settings: OmitArgPrefixes[EgoExo4dSettings]
+) -> None:
+    """Ego-Exo4D takes with automatic hand poses: 2-D wrist positions as actions, 30 Hz.
+
+    Args:
+        source: Root of the dataset, with takes.json, takes and annotations.
+        destination: Where the dataset goes.
+        settings: Which takes and frames make episodes.
+    """
+    from data_pipelines.sources.human.egoexo4d import NAME, EgoExo4dSource
+
+    _convert(EgoExo4dSource(source, settings), destination, NAME)
+
+
+def _convert(source: Source, destination: Destination, default_name: str) -> None:
+    from data_pipelines.convert.write import convert
+
+    name = destination.name or re.sub(r"[^a-z0-9_]+", "_", default_name.lower()).strip("_")
+    with step(f"convert {len(source.units)} to {name}") as update:
+        done = convert(
+            source,
+            destination.out,
+            name,
+            skip_damaged=destination.skip_damaged,
+            progress=lambda units, total, unit: update(units, total, unit),
+        )
+    _say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
+    for reason, count in done.left_out.items():
+        _say(f"left out {count:,} x: {reason}")
+    inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
+    _say(
+        "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "
+        "that file to all others with --registry; or add this to data_pipelines/registry/own.py:"
+    )
+    _say(f"    {entry(done.spec)}")
+    wrote(done.directory, then=inspect)
+
+
+def entry(spec: DatasetSpec) -> str:
+    """The registry entry as it is written there."""
+    keys, dims = (
+        f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims)
+    )
+    return (
+        f'DatasetSpec("{spec.name}", image_key="{spec.image_key}", action_keys={keys}, '
+        f"action_dims={dims}, hz={spec.hz:g}),"
+    )
+
+
+def import_tokens(
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER [FOLDER ...]")],
+    store: Path,
+    name: str | None = None,
+    hz: float | None = None,
+    patch: int = 2,
+    frame_step: Annotated[int | None, arg(name="frame-step")] = None,
+    tokenizer: Path | None = None,
+) -> None:
+    """Read token folders of the official release (video.bin, actions, segment_ids.bin) into a token store.
+
+    A dataset is a pair of folders that end in _train and _val; either of them stands for both. The
+    tokens are taken as they are.
+
+    Args:
+        folders: Folders to read.
+        store: Token store to add them to.
+        name: Name of the dataset, if there is one only; the folders' own if not given.
+        hz: Native frames per second, if the registry does not know the dataset.
+        patch: Latent cells along one side of a token; of no effect on ids.
+        frame_step: Every how many native frames one is stored; the stride, for frames at 2 Hz, if not given.
+        tokenizer: Directory of the tokenizer that made the tokens. It decodes the validation frames that
+            evaluation in pixels compares with.
+    """
+    from data_pipelines.tokens.import_tokens import import_tokens as import_pair
+    from data_pipelines.tokens.import_tokens import pair_folders
+
+    pairs = pair_folders(folders)
+    require(name is None or len(pairs) == 1, f"--name can be given for one dataset, not for {len(pairs)}")
+    decoder = None
+    if tokenizer is not None:
+        from hma_jax.tokenizers.io import load_tokenizer
+
+        decoder = load_tokenizer(tokenizer)
+    for stem, train, val in pairs:
+        with step(f"import {stem}") as update:
+            manifest = import_pair(
+                train,
+                val,
+                store,
+                name=name,
+                hz=hz,
+                patch=patch,
+                frame_step=frame_step,
+                tokenizer=decoder,
+                progress=update,
+            )
+        facts, spec = manifest.tokenizer, manifest.spec
+        what = f"latents of {facts.channels} values" if facts.channels else f"ids of {facts.vocab_size:,}"
+        _say(
+            f"{spec.name}: {len(manifest.train.episodes):,} + {len(manifest.val.episodes):,} episodes, "
+            f"{facts.tokens} tokens per frame, {what}, by {facts.identity}; "
+            f"{spec.hz:g} Hz, stride {spec.stride}"
+        )
+        wrote(store / spec.name)
+    if tokenizer is None:
+        _say(
+            "note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets"
+        )
+
+
+def _say(line: str) -> None:
+    console.print(line, markup=False, soft_wrap=True)

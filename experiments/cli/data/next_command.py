@@ -1,0 +1,48 @@
+"""What to run after looking at data: the command that reads it as it was counted, or why there is none yet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.presets import get_preset
+from experiments.setting import StudyArguments, command
+
+if TYPE_CHECKING:
+    from data_pipelines.inspection.inspect import Facts
+
+
+def tokenize_command(
+    directories: Sequence[str], frames: int, registry: Path | None, longest: int, rate: float | None = None
+) -> str:
+    """The command that tokenises datasets for windows of `frames`, by the preset that is the default.
+
+    `longest`: frames of the longest episode at that rate; the prompt leaves one of them to judge. `rate`: of
+    frames in Hz, if it is not the preset's.
+    """
+    preset = get_preset(StudyArguments.preset)
+    changes: dict[str, object] = {}
+    if frames != preset.model.frames:
+        changes["model.frames"] = frames
+    prompt = preset.eval.prompt_frames if frames > preset.eval.prompt_frames else frames // 2
+    prompt = max(min(prompt, longest - 1), 1)
+    if prompt != preset.eval.prompt_frames:
+        changes["eval.prompt_frames"] = prompt
+    if rate is not None:
+        changes["rate"] = f"{rate:g}"
+    settings = tuple(f"{name}={value}" for name, value in changes.items())
+    asked = StudyArguments(data=tuple(directories), registry=registry, set=settings).anywhere()
+    return command("tokenize", *asked.words())
+
+
+def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
+    """What to run instead for a dataset of which no episode has two frames at `stride`, and why."""
+    longest, known = facts.lengths.longest, (("--registry", registry) if registry else ())
+    if longest < 2:
+        return "leave it out: its longest episode has one step, so there is no motion to learn"
+    words = command("data view", facts.directory, "--stride", "1", *known)
+    return (
+        f"{words}  (no episode that was read has the {2 * stride} steps that the shortest window takes at stride "
+        f"{stride}; the longest has {longest}: every frame is needed, or the rate is another one, --hz)"
+    )

@@ -1,0 +1,249 @@
+"""`hma data list` and `hma data inspect`: the registry, and what lies in a directory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json as jsonlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from rich.markup import escape
+from rich.text import Text
+from tyro.conf import Positional, arg
+
+from data_pipelines.publishing.files import write_file
+from experiments.cli.data.next_command import no_window, tokenize_command
+from experiments.progress import console, step, tidy_table
+from experiments.setting import use_entries
+from experiments.wrote import wrote
+from hma_jax.config import ConfigError
+
+if TYPE_CHECKING:
+    from data_pipelines.inspection.inspect import Facts
+    from data_pipelines.inspection.suggest import Suggestion, WindowFacts
+    from data_pipelines.registry import DatasetSpec
+
+SHEET = "contact_sheet.png"
+
+
+def data_list(
+    words: Annotated[Positional[tuple[str, ...]], arg(metavar="[WORD ...]")] = (),
+    mixture: str | None = None,
+    registry: Path | None = None,
+) -> None:
+    """List the datasets that the registry knows: camera, action size, rate.
+
+    Args:
+        words: Only entries with all these words in name, note, camera or group ("open-x", "franka").
+        mixture: Only the datasets of this mixture: dataset5, 10, 20, 30, 40 or dataset30_vae.
+        registry: TOML file with entries of your own.
+    """
+    from data_pipelines.registry import MIXTURES, get_mixture, known_groups
+
+    use_entries(registry)
+    chosen = get_mixture(mixture) if mixture else None
+    shown = 0
+    for title, specs in known_groups().items():
+        found = [s for s in specs if _fits(s, title, words) and (chosen is None or s.name in chosen)]
+        shown += len(found)
+        if found:
+            console.print(_table_of(title, found))
+    if not shown:
+        raise ConfigError(f"no entry has {' and '.join(map(repr, words))} in it; `hma data list` shows all")
+    console.print(
+        f"{shown} entries. steps: of the middle episode, ~ of the mean one, ? nobody says. "
+        "* not confirmed by a public source: the entry says what. Mixtures: "
+        f"{', '.join(MIXTURES)} (--mixture). A dataset of your own is one more entry; "
+        "`hma data inspect DIR` suggests it."
+    )
+
+
+def _fits(spec: DatasetSpec, title: str, words: Sequence[str]) -> bool:
+    text = f"{spec.name} {spec.note} {spec.camera} {title}".lower()
+    return all(word.lower() in text for word in words)
+
+
+def _table_of(title: str, specs: Sequence[DatasetSpec]):
+    table = tidy_table(title, "name", "dims", "Hz", "stride", "episodes", "steps")
+    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
+    table.add_column("image", overflow="fold")
+    table.add_column("what it is", min_width=30)
+    for spec in specs:
+        unsure = f" [dim]* {escape(spec.unverified)}[/]" if spec.unverified else ""
+        table.add_row(
+            spec.name,
+            f"{spec.action_dim}",
+            f"{spec.hz:g}",
+            f"{spec.stride}",
+            f"{spec.episodes:,}" if spec.episodes else "?",
+            f"{spec.median_steps:g}" if spec.median_steps else f"~{spec.mean_steps:g}" if spec.mean_steps else "?",
+            spec.image_key.removeprefix("observation/"),
+            escape(spec.note) + unsure,
+        )
+    return table
+
+
+def data_inspect(
+    directory: Positional[str],
+    hz: float | None = None,
+    split: str = "train",
+    out: Path | None = None,
+    episodes: int = 32,
+    frames: int = 12,
+    json: Path | None = None,
+    entry: Path | None = None,
+    registry: Path | None = None,
+) -> None:
+    """Show what a dataset holds, draw a contact sheet, and suggest its registry entry.
+
+    Args:
+        directory: The dataset: an RLDS directory (<name> or <name>/<version>, a path or URL), the root of a
+            LeRobot dataset, or a robomimic .hdf5 file.
+        hz: Native rate of its frames, where no file says it (LeRobot and robomimic do).
+        split: The split to look at.
+        out: Directory for contact_sheet.png; runs/inspect/NAME if not given.
+        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        frames: Frames of the model's window, to count windows.
+        json: Write everything there as JSON.
+        entry: Add the suggested entry to this TOML file, for --registry.
+        registry: TOML file with entries of your own.
+    """
+    from data_pipelines.inspection.inspect import inspect_dataset
+    from data_pipelines.inspection.suggest import suggest_entry, window_facts
+    from data_pipelines.registry.spec import stride_of
+    from data_pipelines.registry.table import find_spec
+    from experiments.contact_sheet import draw_sheet
+
+    if hz is not None and hz <= 0:
+        raise ConfigError(f"--hz must be positive, got {hz:g}")
+    use_entries(registry)
+    with step(f"read {directory}"):
+        sample = inspect_dataset(directory, split, episodes=episodes)
+    facts = sample.facts
+    known = find_spec(facts.name)
+    hz = hz or facts.hz
+    suggestion = suggest_entry(facts, hz or (known.hz if known else None))
+    if entry is not None and (suggestion is None or not suggestion.hz):
+        raise ConfigError("--entry needs the native rate, which is not in the files: add --hz")
+    print_facts(facts)
+    rate, windows = hz or (known.hz if known else None), None
+    if rate:
+        stride = stride_of(rate)
+        windows = window_facts(facts, stride, frames)
+        console.print(
+            f"[bold]rate[/] {rate:g} Hz{'' if hz else ' (registry)'}: stride {stride}, "
+            f"{rate / stride:.2f} Hz; a whole window of {frames} frames takes {windows.native} steps, the shortest "
+            f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
+            f"{windows.total:,.0f} windows in the split"
+        )
+    _print_entry(facts, known, suggestion)
+    folder = out or Path("runs") / "inspect" / facts.name
+    folder.mkdir(parents=True, exist_ok=True)
+    blank = [c.key for c in facts.cameras if c.is_blank]
+    title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
+    sheet, aside = folder / SHEET, folder / f".{SHEET}"
+    draw_sheet(title, sample.shown, blank).save(aside, format="png")
+    aside.replace(sheet)
+    wrote(sheet)
+    if json is not None:
+        values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
+        strict = jsonlib.loads(jsonlib.dumps(values), parse_constant=lambda _: None)  # JSON has no NaN
+        write_file(json, jsonlib.dumps(strict, indent=1))
+        wrote(json)
+    if entry is not None:
+        _write_entry(entry, suggestion)
+    if known is not None or entry is not None:
+        _say_next(facts, windows, entry or registry)
+
+
+def print_facts(facts: Facts) -> None:
+    """Schema, splits, lengths, cameras and actions as tables."""
+    sampled = "all" if facts.sampled == facts.episodes else f"{facts.sampled} of {facts.episodes:,}"
+    console.print(
+        f"[bold]{escape(facts.name)}[/] {facts.version}  {escape(facts.directory)}\n"
+        f"read {sampled} episodes of split {facts.split!r} ({facts.bytes_read / 1e6:,.1f} MB)",
+        soft_wrap=True,
+    )
+    for reason, count in facts.damaged.items():
+        console.print(f"[yellow]damaged[/] {count} episode(s): {escape(reason)}", soft_wrap=True)
+    splits = tidy_table("Splits", "split", "episodes", "shards", "MB")
+    for s in facts.splits:
+        splits.add_row(s.name, f"{s.episodes:,}", f"{s.shards:,}", f"{s.bytes / 1e6:,.1f}")
+    console.print(splits)
+    n = facts.lengths
+    console.print(
+        f"[bold]steps per episode[/] {n.shortest} to {n.longest}, median {n.median:g}, "
+        f"80 % between {n.lower:g} and {n.upper:g}, mean {n.mean:.1f}"
+    )
+    schema = tidy_table("Fields", "field", "kind", "shape", "type")
+    for f in facts.fields:
+        shape = "x".join("?" if d is None else str(d) for d in f.shape)
+        schema.add_row(escape(f.key), f.kind, shape or "one", f.dtype)
+    console.print(schema)
+    cameras = tidy_table("Cameras", "camera", "height x width", "frames seen", "blank")
+    cameras.add_column("remark")
+    for c in facts.cameras:
+        sizes = ", ".join(f"{h}x{w}" for h, w in c.sizes)
+        remark = "blank: shows one colour" if c.is_blank else "stands still" if c.still else ""
+        cameras.add_row(escape(c.key), sizes, f"{c.frames}", f"{c.blank}", remark)
+    console.print(cameras)
+    for action in facts.actions:
+        table = tidy_table(escape(action.key), "value", "min", "max", "mean", "std", "distinct", "roughness")
+        table.add_column("looks like")
+        for i, d in enumerate(action.dimensions):
+            bad = f"[red]{d.not_finite} not finite[/] " if d.not_finite else ""
+            distinct = f"{d.distinct}" if d.distinct < 100 else "100+"
+            numbers = (f"{v:.4g}" for v in (d.minimum, d.maximum, d.mean, d.std))
+            table.add_row(f"{i}", *numbers, distinct, f"{d.smoothness:.2f}", bad + d.hint)
+        console.print(table)
+
+
+def _print_entry(facts: Facts, known: DatasetSpec | None, suggestion: Suggestion | None) -> None:
+    if suggestion is None:
+        console.print("[yellow]no entry[/]: the dataset has no camera of three colours")
+        return
+    if known is None:
+        console.print("[bold]not in the registry.[/] The entry that its contents suggest:")
+    else:
+        same = (known.image_key, known.action_keys, known.action_dims)
+        fits = same == (suggestion.image_key, suggestion.action_keys, suggestion.action_dims)
+        fits &= set(suggestion.angles) <= set(known.angles)
+        agrees = ", as its contents suggest" if fits else ". Its contents alone would suggest:"
+        console.print(f"[bold]in the registry[/]: {escape(_in_words(known))}{agrees}", soft_wrap=True)
+        if fits:
+            return
+    for reason in suggestion.reasons:
+        console.print(f"  {escape(reason)}", soft_wrap=True)
+    console.print(suggestion.python(), markup=False, soft_wrap=True)
+    console.print(
+        "Paste it into data_pipelines/registry/own.py, or write it with --entry FILE.toml and give that file "
+        "to other commands with --registry.",
+        soft_wrap=True,
+    )
+
+
+def _in_words(spec: DatasetSpec) -> str:
+    action = " + ".join(spec.action_keys) or "no action"
+    return f"{spec.image_key}, {action} ({spec.action_dim}), {spec.hz:g} Hz"
+
+
+def _write_entry(path: Path, suggestion: Suggestion) -> None:
+    """Adds the entry to a TOML file, in place of one of the same name."""
+    from data_pipelines.registry.toml_file import load_entries, to_toml
+
+    others = [e for e in load_entries(path) if e.name != suggestion.name] if path.exists() else []
+    write_file(path, "\n".join(to_toml(e) for e in (*others, suggestion.spec())))
+    wrote(path)
+
+
+def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -> None:
+    """The command that reads the dataset as it was counted here, or what to try where nothing can be read."""
+    if windows is None:
+        return
+    if windows.total:
+        spans = facts.lengths.longest // windows.stride
+        words = tokenize_command((facts.directory,), windows.frames, entries, spans)
+    else:
+        words = no_window(facts, windows.stride, entries)
+    console.print(Text(f"next: {words}"), soft_wrap=True)

@@ -1,0 +1,111 @@
+"""`hma data sim` and `hma data sim-table`: robots simulated with published models, as RLDS directories."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from experiments.progress import console, step
+from experiments.setting import command, command_words
+from experiments.wrote import wrote
+
+SimPreset = Literal["smoke", "full"]
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much is simulated. No names: all of the table."""
+
+    names: tuple[str, ...] | None
+    episodes: int
+    size: int
+    study: str  # the preset of a study for which that is enough
+
+
+PRESETS = {
+    "smoke": Amount(
+        (
+            "pusht", "dmc_reacher", "pointmaze_ball", "metaworld_sawyer", "fetch", "ogbench_ur5e",
+            "dmc_walker", "robosuite_panda_lift", "mujoco_ant", "franka_kitchen", "aloha", "adroit_door",
+        ),
+        episodes=4,
+        size=64,
+        study="smoke",
+    ),
+    "full": Amount(None, episodes=20, size=128, study="cpu"),
+}  # fmt: skip
+
+SHEET = "overview.png"
+SHEET_EPISODES = 4
+
+REPORT = 10
+"""Episodes from one line of a log to the next."""
+
+
+def data_sim(
+    out: Path,
+    preset: SimPreset = "smoke",
+    names: Annotated[tuple[str, ...], arg(metavar="[NAME ...]")] = (),
+    episodes: int | None = None,
+    size: int | None = None,
+    workers: int = 2,
+    seed: int = 0,
+) -> None:
+    """Simulate real robots' models (MuJoCo and others) and write them as RLDS directories.
+
+    Needs the extra `sim`. Run the same command again after an interruption: only what is missing
+    is made, and the bytes are the same.
+
+    Args:
+        out: Directory to write: one dataset per embodiment, and contact sheets.
+        preset: smoke (12 embodiments, 4 episodes, 64 pixels: minutes) or full (all of them, 20
+            episodes, 128 pixels: hours).
+        names: Only these embodiments of the table.
+        episodes: Episodes per dataset, instead of the preset's.
+        size: Pixels of a frame's side, instead of the preset's.
+        workers: Simulators at a time, each a process with one core; no effect on the data.
+        seed: Another seed gives other episodes.
+    """
+    from data_pipelines.simulators import generate_sim, select
+    from data_pipelines.simulators.sheet import draw_sheet
+
+    chosen = PRESETS[preset]
+    specs = select(tuple(names) or chosen.names)
+    with step(f"simulate {len(specs)} robots") as update:
+
+        def report(name: str, done: int, total: int) -> None:
+            update(done, total, name)
+            if done and not console.is_terminal and (done == total or done % REPORT == 0):
+                console.print(f"{done} of {total} episodes, the last of {name}")
+
+        paths = generate_sim(
+            out,
+            names=[spec.name for spec in specs],
+            episodes=chosen.episodes if episodes is None else episodes,
+            size=chosen.size if size is None else size,
+            seed=seed,
+            workers=workers,
+            progress=report,
+        )
+    with step("draw contact sheets"):
+        for path in paths:
+            draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
+        draw_sheet(paths, out / SHEET)
+    everything = sorted(paths) == sorted(out.glob(f"*/{paths[0].name}"))  # then a pattern says it shorter
+    data = f"{command_words(out)}/*/{paths[0].name}" if everything else command_words(*paths)
+    study = command("study", "--preset", chosen.study, "--out", "runs/sim")
+    wrote(*paths, out / SHEET, then=f"{study} --data {data}")
+
+
+def data_sim_table(directory: Positional[Path]) -> None:
+    """Print frames per second, episode lengths and success rates of `hma data sim`, as Markdown.
+
+    Args:
+        directory: What was given as --out.
+    """
+    from data_pipelines.simulators.stats import stats_table
+
+    print(stats_table(directory))

@@ -1,0 +1,161 @@
+"""`hma data view`: datasets read in part, one page written, the command that comes next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from rich.markup import escape
+from rich.text import Text
+from tyro.conf import Positional, arg
+
+from data_pipelines.publishing.files import write_file
+from experiments.cli.data.next_command import no_window, tokenize_command
+from experiments.progress import console, step
+from experiments.setting import command, use_entries
+from experiments.wrote import wrote
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.inspection.duplicates import Fingerprint
+    from data_pipelines.inspection.inspect import Facts
+    from experiments.report.data_page import Viewed
+
+ENTRIES = "my_robots.toml"
+
+OTHER_SPLITS = 2
+"""Splits beside the one shown that are searched for the same episodes."""
+
+
+def view(
+    datasets: Annotated[Positional[tuple[str, ...]], arg(metavar="DATASET [DATASET ...]")],
+    out: Path = Path("runs/view.html"),
+    split: str | None = None,
+    hz: float | None = None,
+    stride: int | None = None,
+    frames: int = 12,
+    episodes: int = 64,
+    shown: int = 6,
+    registry: Path | None = None,
+) -> None:
+    """Write one HTML page about datasets: clips with their actions, statistics, windows, what stands out.
+
+    Args:
+        datasets: RLDS directories, paths or URLs.
+        out: The page, a single file that needs nothing else.
+        split: The split to look at; the registry's, or train, if not given.
+        hz: Native rate of the frames, if the registry does not know the dataset or is wrong.
+        stride: Native frames per frame of the model; what comes nearest to 2 Hz if not given.
+        frames: Frames of the model's window, to count windows.
+        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        shown: Episodes to show.
+        registry: TOML file with entries of your own.
+    """
+    from experiments.report.data_page import draw_page
+
+    require(hz is None or hz > 0, f"--hz must be positive, got {hz}")
+    require(stride is None or stride >= 1, f"--stride must be at least 1, got {stride}")
+    require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
+    require(1 <= shown <= episodes, f"--shown must lie between 1 and --episodes {episodes}, got {shown}")
+    use_entries(registry)
+    viewed = []
+    for directory in datasets:
+        with step(f"read {directory}"):
+            viewed.append(_view_one(directory, split, hz, stride, frames, episodes, shown))
+        _say_remarks(viewed[-1])
+    given = {
+        "split": split, "hz": hz and f"{hz:g}", "stride": stride, "frames": frames, "episodes": episodes,
+        "shown": shown, "registry": registry,
+    }  # fmt: skip
+    options = [word for name, value in given.items() if value is not None for word in (f"--{name}", f"{value}")]
+    again = command("data view", *datasets, "--out", out, *options)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_file(out, draw_page(viewed, frames, again))
+    wrote(out)
+    _say_next(viewed, frames, registry)
+
+
+def _view_one(
+    directory: str, split: str | None, hz: float | None, stride: int | None, frames: int, episodes: int, shown: int
+) -> Viewed:
+    from data_pipelines.inspection.duplicates import find_duplicates
+    from data_pipelines.inspection.inspect import inspect_dataset
+    from data_pipelines.inspection.remarks import make_remarks
+    from data_pipelines.inspection.suggest import suggest_entry, window_facts
+    from data_pipelines.registry.spec import stride_of
+    from data_pipelines.registry.table import find_spec
+    from data_pipelines.sources.open import source_name
+    from experiments.report.data_page import CLIP_FRAMES, Viewed
+
+    known = find_spec(source_name(directory))
+    split = split or (known.split if known else "train")
+    sample = inspect_dataset(directory, split, episodes=episodes, shown=shown, frames=CLIP_FRAMES)
+    facts = sample.facts
+    rate = hz or (known.hz if known else None)
+    entry = replace(known, hz=rate) if known else None
+    if known is None and rate is not None:
+        suggestion = suggest_entry(facts, rate)
+        entry = suggestion.spec() if suggestion else None
+    usual = entry.stride if entry else stride_of(rate) if rate else None
+    stride = (stride or usual) if rate else None
+    others = [s.name for s in facts.splits if s.name != split and s.episodes][:OTHER_SPLITS]
+    prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes))]
+    windows = window_facts(facts, stride, frames) if stride else None
+    remarks = make_remarks(facts, entry, windows, find_duplicates(prints))
+    return Viewed(sample, entry, known is not None, rate, stride, tuple(remarks))
+
+
+def _fingerprints(directory: str, split: str, episodes: int) -> Sequence[Fingerprint]:
+    """Of another split, which need not be readable: the page is about the one that was asked for."""
+    from data_pipelines.errors import DataError
+    from data_pipelines.inspection.inspect import inspect_dataset
+
+    try:
+        return inspect_dataset(directory, split, episodes=episodes, shown=0, frames=2).fingerprints
+    except DataError as error:
+        console.print(f"[yellow]note[/]: split {split!r} was not searched for the same episodes: {escape(str(error))}")
+        return ()
+
+
+def _say_remarks(viewed: Viewed) -> None:
+    colours = {"bad": "red", "doubt": "yellow"}
+    name = escape(viewed.facts.name)
+    if not viewed.remarks:
+        console.print(f"[bold]{name}[/]: nothing stands out")
+    for remark in viewed.remarks:
+        title = f"[{colours[remark.kind]}]{remark.title}[/]"
+        console.print(f"[bold]{name}[/]: {title}: {escape(remark.text)}", soft_wrap=True)
+
+
+def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> None:
+    """The commands that read what can be read, one per rate of frames, or those that lead there."""
+    from data_pipelines.inspection.remarks import MISFIT
+    from data_pipelines.inspection.suggest import window_facts
+
+    usable: dict[float | None, list[Facts]] = {}
+    longest: dict[float | None, int] = {}
+    for v in viewed:
+        f = v.facts
+        if not v.registered:
+            words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", ENTRIES)
+            after = f"{words}  (it is not in the registry; this writes its entry)"
+        elif any(r.title == MISFIT for r in v.remarks):
+            after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
+        elif not window_facts(f, v.stride, frames).total:
+            after = no_window(f, v.stride, registry)
+        elif v.stride != v.entry.stride and v.entry.rate is not None:
+            after = (
+                f"nothing yet: its entry has a rate of its own, {v.entry.rate:g} Hz: a study takes it at stride "
+                f"{v.entry.stride}, whatever the study's rate"
+            )
+        else:
+            rate = None if v.stride == v.entry.stride else v.entry.hz / v.stride
+            usable.setdefault(rate, []).append(f)
+            longest[rate] = min(longest.get(rate, frames), f.lengths.longest // v.stride)
+            continue
+        console.print(Text(f"next for {f.name}: {after}"), soft_wrap=True)
+    for rate, facts in usable.items():
+        words = tokenize_command([f.directory for f in facts], frames, registry, longest[rate], rate)
+        console.print(Text(f"next: {words}"), soft_wrap=True)

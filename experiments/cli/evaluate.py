@@ -1,0 +1,166 @@
+"""`hma evaluate`: a trained model on the frozen windows of a study, if it was made for them."""
+
+from __future__ import annotations
+
+import json
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from data_pipelines.publishing.files import write_file
+from experiments.cli.hosts import Hosts
+from experiments.progress import console, step, tidy_table
+from experiments.setting import Setting, StudyArguments, make_setting, short
+from experiments.wrote import wrote
+from hma_jax.config import ConfigError, Weights, require
+from hma_jax.config.json import from_dict
+
+if TYPE_CHECKING:
+    from experiments.running.trial import Materials
+    from hma_jax.tokenizers.base import Tokenizer
+    from hma_jax.training.runs import Run
+
+SHOWN = (
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain"
+)  # fmt: skip
+"""Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all, and
+windows.csv.gz those of every window."""
+
+
+def evaluate(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    asked: OmitArgPrefixes[StudyArguments],
+    hosts: OmitArgPrefixes[Hosts],
+    weights: Weights = "auto",
+) -> None:
+    """Evaluate a trained model on the frozen windows of a study.
+
+    Args:
+        run: Directory of the training run.
+        asked: The study whose windows, tokenizer and protocol are used.
+        hosts: Several processes that evaluate together, on one host or on many.
+        weights: The last weights, their moving average (train.ema_decay), or the average where there is one.
+    """
+    hosts.join()
+    evaluate_model(make_setting(asked), run, weights)
+
+
+def evaluate_model(setting: Setting, run: Path, weights: Weights) -> None:
+    from hma_jax.runtime.processes import is_writer
+    from hma_jax.training.claim import EVALUATION, locked_run
+    from hma_jax.training.runs import load_model
+
+    trained = load_model(run, setting.study.execution, weights).run
+    # Before the work: that its results can be written, and by nobody else.
+    with locked_run(run, EVALUATION) if is_writer() else nullcontext():
+        _evaluate(setting, run, trained)
+
+
+def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
+    from experiments.running.trial import evaluate_on, open_materials, write_evaluation
+    from hma_jax.evaluation.windows import FILE
+    from hma_jax.runtime.processes import is_writer
+
+    require_prepared(setting)
+    materials = open_materials(setting.workspace)
+    check_fits(trained, materials)
+    frozen, untrained = set(materials.manifest.names), _not_trained_on(trained, materials)
+    left_out = [name for name in trained.table.names if name not in frozen]
+    if left_out:
+        console.print(f"note: not evaluated, for want of windows here: {', '.join(left_out)}", soft_wrap=True)
+    if untrained:
+        console.print(f"note: not evaluated, for it was not trained on: {', '.join(untrained)}", soft_wrap=True)
+    with step(f"evaluate {short(run)}") as update:
+        evaluation = evaluate_on(
+            tuple(name for name in trained.table.names if name in frozen - set(untrained)),
+            trained.params,
+            trained.model,
+            trained.table,
+            materials,
+            setting.study.eval,
+            trained.train.masking.setting,
+            execution=setting.study.execution,
+            progress=lambda phase, done, total: update(done, total, phase),
+        )
+    if not is_writer():
+        return
+    summary = evaluation.summary
+    metrics = [m for m in SHOWN if m in summary.overall]
+    which = ", averaged weights" if trained.weights == "ema" else ""
+    table = tidy_table(f"{short(run)}, step {trained.step:,}{which}", "dataset", *metrics)
+    for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
+        table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
+    console.print(table)
+    write_evaluation(run, evaluation)
+    write_file(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
+    wrote(run / "evaluation.json", run / FILE, run / "samples.npz")
+
+
+def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
+    """Datasets that a model was meant to be trained on and that gave it no window."""
+    from data_pipelines.loading.selection import LoaderConfig, select_windows
+
+    loader = trained.provenance.get("loader")
+    if loader is None:  # it was converted
+        return []
+    config = from_dict(LoaderConfig, loader)
+    if not set(config.datasets) <= set(materials.store.names):
+        return []
+    return list(select_windows(materials.store, config).mixture.dropped)
+
+
+def require_prepared(setting: Setting) -> None:
+    """Raises ConfigError, with the command that makes it, unless everything is there that evaluation reads."""
+    there = setting.workspace
+    missing = [str(p) for p in (there.store, there.tokenizer, there.manifest) if not p.exists()]
+    require(not missing, f"{', '.join(missing)}: not made yet; run `{setting.command('tokenize')}`")
+
+
+def check_fits(trained: Run, materials: Materials) -> None:
+    """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
+    advice = "; evaluate it with the --out it was trained in"
+    check_tokenizer(trained, materials, advice)
+    frames, manifest = trained.model.frames, materials.manifest
+    if frames != manifest.frames:
+        raise ConfigError(
+            f"the model sees windows of {frames} frames, those frozen for evaluation here have "
+            f"{manifest.frames}{advice}"
+        )
+    if not set(trained.table.names) & {d.dataset for d in manifest.datasets}:
+        raise ConfigError(
+            f"the model was trained on {', '.join(trained.table.names)}, of which the study here has no "
+            f"windows{advice}"
+        )
+
+
+def check_tokenizer(trained: Run, materials: Materials, advice: str) -> None:
+    """A model that was converted does not know its tokenizer: then the form of its tokens decides."""
+    if "official" in trained.provenance and "tokenizer" not in trained.provenance:
+        _check_form(trained, materials.tokenizer, advice)
+        return
+    tokenizer, here = trained.provenance.get("tokenizer"), materials.tokenizer.identity
+    if tokenizer != here:
+        raise ConfigError(
+            f"the model was trained on tokens of tokenizer {tokenizer}, the study here uses {here}{advice}"
+        )
+
+
+def _check_form(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
+    model = trained.model
+    if model.diffusion:
+        takes = (model.tokens, 0, 0, model.diffusion.token_channels)
+    else:
+        takes = (model.tokens, model.factors, model.factor_vocab, 0)
+    makes = (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels)
+    if takes != makes:
+        words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
+        raise ConfigError(
+            f"the model takes {words.format(*takes)}, the tokenizer here makes {words.format(*makes)}{advice}"
+        )
+    console.print(
+        f"note: the model comes from the official release and does not say on which tokens it was trained; "
+        f"taken for those of the tokenizer here, {tokenizer.identity}",
+        soft_wrap=True,
+    )

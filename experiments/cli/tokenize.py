@@ -1,0 +1,147 @@
+"""`hma tokenize`: everything up to training, by one process or by many."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from typing import Annotated
+
+from rich.markup import escape
+from tyro.conf import OmitArgPrefixes, arg
+
+from experiments.cli.arguments import Remake
+from experiments.preparing.made_from import Step
+from experiments.progress import console, tidy_table
+from experiments.running.workspace import Busy, Workspace
+from experiments.setting import Setting, StudyArguments, make_setting, short
+from experiments.wrote import wrote
+
+
+def tokenize(
+    asked: OmitArgPrefixes[StudyArguments],
+    remake: OmitArgPrefixes[Remake],
+    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
+    threads: Annotated[
+        int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")
+    ] = None,
+) -> None:
+    """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
+
+    Killed at any point, the same command goes on and ends with the same bytes. Started several times, on one
+    machine or on many that share the directory, it shares the work: each process takes parts that no other one
+    has, any of them may be killed, more may join. Those that join need a tokenizer that is there: --tokenizer,
+    or `hma tokenizer train` before.
+
+    Args:
+        asked: Study, data, output directory and settings. Several processes share the directory.
+        remake: What was made with other settings or data is never replaced without being asked for.
+        batch: Frames encoded at a time. Changes no token.
+        threads: Threads that decode frames.
+    """
+    prepare_together(make_setting(asked), batch, threads, remake.replace)
+
+
+def prepare_together(
+    setting: Setting, batch: int | None = None, threads: int | None = None, replace: Step | None = None
+) -> None:
+    """Everything up to training. If another command prepares the same directory, takes part in its tokenising."""
+    from experiments.preparing.pipeline import prepare
+
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(setting.workspace.locked())
+        except Busy as busy:
+            _take_part(setting, busy, batch, threads, replace)
+        else:
+            prepare(
+                setting.study, setting.workspace, setting.data, setting.tokenizer,
+                replace=replace, batch=batch, threads=threads,
+            )  # fmt: skip
+    _finish(setting)
+
+
+def _take_part(
+    setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None
+) -> None:
+    """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
+    from experiments.preparing.sources import find_sources, find_suite
+    from experiments.preparing.store import make_store
+    from experiments.preparing.windows import require_same_windows
+
+    study, workspace = setting.study, setting.workspace
+    if replace is not None:
+        raise Busy(f"{busy}; --replace needs the directory for itself", busy.holder)
+    tokenizer = setting.tokenizer or workspace.tokenizer
+    if not tokenizer.is_dir():
+        advice = f"Start this again when it is there, or make it before: {setting.command('tokenizer train')}"
+        raise Busy(f"{tokenizer}: no tokenizer yet, and {busy}. {advice}", busy.holder)
+    require_same_windows(study, workspace, None)
+    if setting.data:
+        sources = find_sources(study, setting.data)
+    else:
+        advice = f"Start this again when they are, or make them before: {setting.command('data suite')}"
+        sources = find_suite(study, workspace, advice)
+    console.print(f"taking part: {busy.who} prepares {short(workspace.root)}", soft_wrap=True)
+    make_store(study, workspace, sources, tokenizer=tokenizer, batch=batch, threads=threads)
+    _freeze(setting)
+
+
+def _freeze(setting: Setting) -> None:
+    """Sees to it that the windows of a complete store are frozen, by whoever holds the directory or by this process."""
+    from data_pipelines.publishing.claims import waiting_times
+    from experiments.preparing.tokenizer import adopt_tokenizer
+    from experiments.preparing.windows import freeze_windows, windows_are_frozen
+
+    study, workspace, said = setting.study, setting.workspace, False
+    for pause in waiting_times():
+        try:
+            with workspace.locked():
+                if setting.tokenizer is not None:
+                    adopt_tokenizer(setting.tokenizer, study, workspace)
+                freeze_windows(study, workspace)
+            return
+        except Busy as busy:
+            if windows_are_frozen(study, workspace):
+                return
+            if not said:
+                waiting = f"all tokens are there; waiting for the windows, or the end, of {busy.who}"
+                console.print(waiting, soft_wrap=True)
+                said = True
+        time.sleep(pause)
+
+
+def _finish(setting: Setting) -> None:
+    workspace = setting.workspace
+    show_store(workspace)
+    wrote(workspace.store, workspace.manifest, then=setting.command("train"))
+
+
+def show_store(workspace: Workspace) -> None:
+    """What the token store holds, per dataset."""
+    import numpy as np
+
+    from data_pipelines.tokens.store import TokenStore
+
+    store = TokenStore(workspace.store)
+    lengths = ("shortest", "median", "longest")
+    title = "The token store: episodes, native frames, lengths of training episodes"
+    table = tidy_table(title, "dataset", "train", "held out", "lost", "frames", *lengths, "Hz", "stride")
+    for name in store.names:
+        manifest = store.manifest(name)
+        steps = manifest.train.steps
+        table.add_row(
+            name,
+            f"{len(steps)}",
+            f"{len(manifest.val.steps)}",
+            f"{manifest.lost}",
+            f"{manifest.train.native_frames + manifest.val.native_frames}",
+            f"{min(steps)}",
+            f"{np.median(steps):g}",
+            f"{max(steps)}",
+            f"{manifest.spec.hz:g}",
+            f"{manifest.spec.stride}",
+        )
+    console.print(table)
+    for name in store.names:
+        for loss in store.manifest(name).skipped:
+            console.print(f"[yellow]lost[/] {name}: {escape(loss.reason)}", soft_wrap=True)

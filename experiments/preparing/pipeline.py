@@ -1,0 +1,47 @@
+"""From datasets to everything a trial needs: suite, tokenizer, token store, frozen windows.
+
+Each step is skipped when its output is there and was made from the same inputs, and goes on where it was cut
+short. What was made from other inputs is refused unless it may be replaced (`preparing.made_from`). What was
+prepared is named by the hashes of `Provenance`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.preparing.made_from import Step
+from experiments.preparing.sources import find_sources
+from experiments.preparing.store import make_store
+from experiments.preparing.suite import make_suite
+from experiments.preparing.tokenizer import adopt_tokenizer, make_tokenizer
+from experiments.preparing.windows import freeze_windows, require_same_windows
+from experiments.running.provenance import Provenance
+from experiments.running.workspace import Workspace
+from experiments.study import Study
+
+
+def prepare(
+    study: Study,
+    workspace: Workspace,
+    data: Sequence[str] = (),
+    tokenizer: Path | None = None,
+    *,
+    replace: Step | None = None,
+    batch: int | None = None,
+    threads: int | None = None,
+) -> Provenance:
+    """Makes what is missing and returns what trials depend on.
+
+    `data` are RLDS directories of the user, in the study's order; () simulates the suite. Instead
+    of training one, a trained `tokenizer` is taken from its directory. What follows from `replace` on may be made
+    again in its place. `batch` and `threads` as in `make_store`. Raises ConfigError or DataError.
+    """
+    require_same_windows(study, workspace, replace)
+    sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
+    if tokenizer is None:
+        make_tokenizer(study, workspace, sources, replace)
+    else:
+        adopt_tokenizer(tokenizer, study, workspace, replace)
+    make_store(study, workspace, sources, replace=replace, batch=batch, threads=threads)
+    return freeze_windows(study, workspace, replace)

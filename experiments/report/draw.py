@@ -1,0 +1,84 @@
+"""CSV, figures and page of a study, from whatever trials are finished."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from data_pipelines.publishing.claims import waiting_times
+from experiments.progress import console
+from experiments.running.attempts import read_states
+from experiments.running.ledger import Ledger
+from experiments.running.workspace import Busy, Record, Workspace, load_record
+from experiments.setting import short
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import Sweep, unique_trials
+from experiments.wrote import wrote
+from hma_jax.config import ConfigError
+
+if TYPE_CHECKING:
+    from experiments.rows import Row
+
+
+def draw(workspace: Workspace, record: Record) -> None:
+    """CSV, figures and page from whatever trials are finished, by one process at a time: others wait."""
+    for pause in waiting_times():
+        try:
+            with workspace.locked(".report.lock"):
+                _draw(workspace, record)
+            return
+        except Busy:
+            time.sleep(pause)
+
+
+def _draw(workspace: Workspace, record: Record) -> None:
+    from experiments.optima import Optimum, find_optima
+    from experiments.report.page import write_report
+    from experiments.rows import Row, collect, read_csv, write_csv
+
+    provenance = record.provenance
+    if provenance is None:
+        raise ConfigError(f"the study in {workspace.root} has not run yet; run `{record.command}`")
+    sweeps = plan_sweeps(record.study, record.axes, workspace.root)
+    states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
+    write_csv(workspace.results, Row, collect(sweeps, provenance, workspace.trials, states))
+    rows = read_csv(workspace.results)  # figures show what the file says
+    draw_figures(workspace, sweeps, rows)
+    tables = [workspace.results]
+    optima = find_optima(rows, sweeps)
+    if optima:
+        write_csv(workspace.optima, Optimum, optima)
+        tables.append(workspace.optima)
+    write_report(workspace, record, sweeps, rows, optima, states, provenance)
+    wrote(*tables, workspace.figures, workspace.report)
+
+
+def draw_figures(workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row]) -> None:
+    """A figure for each sweep, and one of the scaling ones together."""
+    from experiments.report.plots import plot_overview, plot_sweep
+
+    workspace.figures.mkdir(exist_ok=True)
+    for sweep in sweeps:
+        plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
+    plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")
+
+
+def draw_again(out: Path) -> None:
+    """Report of a study that ran before, without touching its data or trials.
+
+    Where its trials are not, as with results that are kept for the record, its figures are drawn from its table,
+    and table and page stay as they are.
+    """
+    from experiments.rows import read_csv
+
+    workspace = Workspace(out.absolute())
+    record = load_record(workspace)
+    if workspace.trials.exists() or not workspace.results.exists():
+        draw(workspace, record)
+        return
+    sweeps = plan_sweeps(record.study, record.axes, workspace.root)
+    draw_figures(workspace, sweeps, read_csv(workspace.results))
+    console.print(f"no trials in {short(workspace.root)}: drawn from its table, as it is; the page stays as it is")
+    wrote(workspace.figures)

@@ -1,0 +1,134 @@
+"""A study from its data to its page: what is missing is prepared and run, then everything is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from experiments.preparing.made_from import Step, require_same
+from experiments.program import command_line
+from experiments.progress import SweepMonitor, console
+from experiments.report.draw import draw
+from experiments.running.attempts import State, read_states
+from experiments.running.closure import Closure
+from experiments.running.launchers.registry import Launching
+from experiments.running.ledger import FINISHED, Ledger
+from experiments.running.runner import Job, run_missing
+from experiments.running.workspace import Record, Workspace, find_record, save_record
+from experiments.setting import Setting
+from experiments.study import Study
+from experiments.sweeps.registry import keep_axis, plan_sweeps
+from experiments.sweeps.sweep import Sweep, titles, unique_trials
+from hma_jax.config import ConfigError
+from hma_jax.config.json import diff, to_dict
+
+
+class TrialsFailed(Exception):
+    """The sweep went on to its end, but some trials have no result."""
+
+
+def run_study(
+    setting: Setting,
+    axes: Sequence[str],
+    *,
+    again: str,
+    launcher: Launching,
+    retry_failed: bool,
+    accept_code: bool,
+    replace: Step | None,
+) -> None:
+    """Prepares, runs what is missing, and draws the results. Raises TrialsFailed at the end.
+
+    `again` is the command that tries failed trials once more. Raises ConfigError, before anything is done, if the
+    directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
+    changed, or if trials ran other sources than there are now and nobody accepts that.
+    """
+    from experiments.preparing.pipeline import prepare
+    from experiments.preparing.suite import require_simulated
+    from experiments.preparing.windows import require_judged, require_same_windows
+    from experiments.running.provenance import trial_closure
+
+    study, workspace = setting.study, setting.workspace
+    if not setting.data:
+        require_simulated(study.dataset_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
+    sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
+    with workspace.locked():
+        require_same_windows(study, workspace, replace)
+        earlier = find_earlier(workspace, study, replace)
+        provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
+        require_judged(study, workspace, {name for sweep in sweeps for name in sweep.scope})
+        if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
+            what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
+            console.print(what, markup=False, soft_wrap=True)
+        kept = [keep_axis(axis, workspace.root) for axis in axes]
+        all_axes = tuple(dict.fromkeys([*(earlier.axes if earlier else ()), *kept]))
+        record = Record(study, setting.data, all_axes, command_line(), provenance)
+        trials = unique_trials(sweeps, provenance)
+        require_agreement(workspace, record, trials, sources, accept_code)
+        save_record(workspace, record)
+        common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
+        # The widest take longest: first, so that no worker is left with one at the end.
+        ordered = sorted(trials.items(), key=lambda item: -item[1].model.width)
+        names = titles(sweeps, provenance)
+        jobs = [Job(id, names[id], {"trial": to_dict(trial), **common}) for id, trial in ordered]
+        states = run_jobs(jobs, workspace, launcher, retry_failed)
+        draw(workspace, record)
+    require_results(jobs, states, again)
+
+
+def require_agreement(
+    workspace: Workspace, record: Record, asked: Collection[str], sources: Closure, accept_code: bool
+) -> None:
+    """Raises ConfigError if a finished trial of the study is not what it was, or if its trials, with those to be run
+    of the ids that are `asked` for, ran different sources and nobody accepts that."""
+    from experiments.running.agreement import check_finished, require_one_closure
+    from experiments.running.sealed import RESULT
+
+    shown = unique_trials(plan_sweeps(record.study, record.axes, workspace.root), record.provenance)
+    check_finished(workspace.trials, shown)
+    complete = all((workspace.trials / id / RESULT).exists() for id in asked)
+    require_one_closure(workspace.trials, shown, None if complete else sources, accept_code)
+
+
+def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Record | None:
+    """What was run here before, if `study` goes on with it: its axes then have the same trials under both.
+
+    Raises ConfigError for a study of other settings, unless `replace` allows it: its report would be drawn over.
+    """
+
+    def plans(study: Study) -> list[Sweep]:
+        return plan_sweeps(study, earlier.axes, workspace.root)
+
+    try:
+        earlier = find_record(workspace)
+        lines = []
+        if earlier and plans(earlier.study) != plans(study):
+            lines = diff(earlier.study, study)
+    except ConfigError as error:  # it cannot be read
+        earlier, lines = None, [str(error)]
+    require_same("study", workspace.record, lines, replace)
+    return None if lines else earlier
+
+
+def run_jobs(
+    jobs: Sequence[Job], workspace: Workspace, launching: Launching, retry_failed: bool
+) -> dict[str, State]:
+    """Runs what is missing, visibly."""
+    ledger = Ledger(workspace.ledger)
+    before = read_states([job.id for job in jobs], workspace.trials, ledger)
+    kept = sum(state.event == FINISHED for state in before.values())
+    if kept:
+        console.print(f"{kept} of {len(jobs)} trials are finished already")
+    if kept == len(jobs):
+        return before
+    with launching.launcher(workspace.root) as launcher, SweepMonitor(len(jobs), kept) as monitor:
+        return run_missing(
+            jobs, workspace.trials, ledger, launcher, retry_failed=retry_failed, monitor=monitor
+        )
+
+
+def require_results(jobs: Sequence[Job], states: dict[str, State], again: str) -> None:
+    """Raises TrialsFailed, naming every trial without a result, and the command that tries them again."""
+    bad = [(job, states[job.id]) for job in jobs if states[job.id].event != FINISHED]
+    if bad:
+        lines = "\n".join(f"  {s.event}: {job.title}: {s.message}" for job, s in bad)
+        raise TrialsFailed(f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\nTo try them again: {again}")

@@ -1,0 +1,23 @@
+"""What the process of one trial is told: job.json, as it is written today and as earlier versions wrote it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from experiments.running.former import modernise
+from experiments.running.trial import Trial
+from hma_jax.config import ConfigError, ExecutionConfig
+from hma_jax.config.json import from_dict
+
+
+def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig]:
+    """(the trial, how it is computed). Fields that came after the job was written take their defaults.
+
+    Earlier versions counted how a trial is computed to the trial itself. Raises ConfigError for what is no job.
+    """
+    try:
+        trial, said = modernise(record["trial"])
+        execution = record.get("execution") or {"mesh": record["mesh"]}
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"job.json: not a job of this project ({error!r}); run its study again") from error
+    return from_dict(Trial, trial), from_dict(ExecutionConfig, execution | said)

@@ -1,0 +1,304 @@
+"""One trial: what determines it, its identity, and running it to a result.
+
+A trial's directory holds
+    job.json        the trial and its provenance (written by the runner)
+    run/            the training run (`hma_jax.training`): log, checkpoints
+    samples.npz     true and predicted frames of a few windows per dataset
+    windows.csv.gz  every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
+    provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
+    result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from experiments.running.machine import describe_machine
+from experiments.running.provenance import Provenance, record_end
+from experiments.running.run_options import UNWATCHED, RunOptions
+from experiments.running.workspace import Workspace
+from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, TrainConfig
+from hma_jax.config.json import stable_hash, to_dict
+
+if TYPE_CHECKING:
+    from data_pipelines.loading.selection import LoaderConfig
+    from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
+    from hma_jax.evaluation.evaluate import Evaluation
+    from hma_jax.model.embodiments import EmbodimentTable
+    from hma_jax.model.params import Params
+    from hma_jax.tokenizers.base import Tokenizer
+    from hma_jax.training.loop import FitResult
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(phase, done, total)."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Everything about a trial that is chosen; `train.seed` also seeds its data order."""
+
+    datasets: tuple[str, ...]  # in the order of the embodiment axis
+    max_trajectories: int | None  # per dataset; None: all
+    evaluated: tuple[str, ...]  # datasets whose validation windows are used
+    model: ModelConfig
+    train: TrainConfig
+    eval: EvalConfig
+    tau: float = 3.0
+    rate: float | None = 2.0  # of frames, in Hz; None: native
+    weighed: Literal["used", "all"] = "used"  # whose windows weigh in the mixture
+    shuffle_actions: bool = False  # the control: actions from another episode
+    measure_untrained: bool = False  # also evaluate the model before its first step
+
+    @property
+    def title(self) -> str:
+        """One line that tells this trial from the others of its study."""
+        cap = "all" if self.max_trajectories is None else f"{self.max_trajectories}"
+        control = " · shuffled actions" if self.shuffle_actions else ""
+        return (
+            f"{len(self.datasets)} datasets · {cap} trajectories · width {self.model.width} · "
+            f"seed {self.train.seed}{control}"
+        )
+
+
+def trial_id(trial: Trial, provenance: Provenance) -> str:
+    """The name of a trial: equal exactly when everything that determines it is equal."""
+    return stable_hash({"trial": to_dict(trial), "provenance": to_dict(provenance)})
+
+
+@dataclass(frozen=True)
+class Materials:
+    """What the pipeline prepared, opened."""
+
+    store: TokenStore
+    tokenizer: Tokenizer
+    manifest: EvalManifest
+
+
+def open_materials(workspace: Workspace) -> Materials:
+    """Raises ConfigError or DataError for what is missing or damaged."""
+    from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    return Materials(
+        TokenStore(workspace.store),
+        load_tokenizer(workspace.tokenizer),
+        EvalManifest.load(workspace.manifest),
+    )
+
+
+def loader_of(trial: Trial) -> LoaderConfig:
+    """Which windows a trial draws, and in what order."""
+    from data_pipelines.loading.selection import LoaderConfig
+
+    return LoaderConfig(
+        frames=trial.model.frames,
+        batch=trial.train.batch,
+        tau=trial.tau,
+        seed=trial.train.seed,
+        max_trajectories=trial.max_trajectories,
+        datasets=trial.datasets,
+        shuffle_actions=trial.shuffle_actions,
+        rate=trial.rate,
+        weighed=trial.weighed,
+    )
+
+
+def train_trial(
+    trial: Trial,
+    materials: Materials,
+    run_dir: Path,
+    *,
+    execution: ExecutionConfig = ExecutionConfig(),
+    options: RunOptions = UNWATCHED,
+    progress: Progress = lambda *_: None,
+    table: EmbodimentTable | None = None,
+    initial: Params | None = None,
+    origin: dict[str, Any] | None = None,
+) -> FitResult:
+    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
+
+    A model that is not new has a `table` of its own (of which the trial's datasets are part), its
+    `initial` parameters and an `origin`, which its checkpoints remember.
+    """
+    from data_pipelines.loading.loader import describe_batch, make_loader
+    from data_pipelines.loading.selection import LoaderConfig, training_table
+    from hma_jax.config.json import from_dict
+    from hma_jax.runtime.rows import own_rows
+    from hma_jax.training.loop import LoopOptions
+    from hma_jax.training.train import train_model
+    from hma_jax.training.validation import Validation
+
+    store, loader = materials.store, loader_of(trial)
+    table = table or training_table(store, loader, trial.train.action_scale)
+    checkpoint_every, validate_every = options.steps_between(trial.train.steps)
+    lost = {"lost": {name: store.manifest(name).lost for name in trial.datasets}}  # damaged episodes, left out
+
+    def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
+        before = {"order": 1} | provenance["loader"]  # of versions that did not say in which order they drew
+        return lost | provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
+
+    def report(step: int, steps: int, values: dict[str, float]) -> None:
+        held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
+        progress(f"training{held_out}", step, steps)
+
+    return train_model(
+        trial.model,
+        table,
+        trial.train,
+        lambda start: make_loader(
+            store, table, loader, start_step=start, rows=own_rows(execution.mesh, trial.train.batch)
+        ),
+        execution=execution,
+        run_dir=run_dir,
+        provenance={
+            "store": store.hash(trial.datasets),
+            "tokenizer": materials.tokenizer.identity,
+            "loader": to_dict(loader),
+            **lost,
+            **({"origin": origin} if origin else {}),
+        },
+        modernise_provenance=modernise,
+        initial=initial,
+        records=lambda index: describe_batch(store, table, loader, index),
+        options=LoopOptions(
+            checkpoint_every=checkpoint_every,
+            checkpoint_minutes=options.checkpoint_minutes,
+            keep_checkpoints=options.keep_checkpoints,
+            skip_damaged=options.skip_damaged,
+        ),
+        validation=Validation(validate_every, lambda: validation_batches(trial, materials, table, execution))
+        if validate_every
+        else None,
+        progress=report,
+    )
+
+
+def validation_batches(
+    trial: Trial, materials: Materials, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+) -> Iterator[dict[str, Any]]:
+    """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
+    from data_pipelines.windows.evalset import eval_batches
+    from hma_jax.runtime.rows import own_rows
+
+    own = own_rows(execution.mesh, trial.train.batch)
+    for name in trial.evaluated:
+        for whole in eval_batches(materials.store, table, materials.manifest, trial.train.batch, (name,)):
+            yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
+            break  # the next dataset; one without windows has no batch
+
+
+def evaluate_on(
+    names: tuple[str, ...],
+    params: Any,
+    model: ModelConfig,
+    table: EmbodimentTable,
+    materials: Materials,
+    config: EvalConfig,
+    setting: Setting = "forward",
+    *,
+    execution: ExecutionConfig = ExecutionConfig(),
+    first: int | None = None,
+    progress: Progress = lambda *_: None,
+) -> Evaluation:
+    """The protocol over the frozen windows of `names`, or over the `first` ones of each."""
+    from data_pipelines.windows.evalset import eval_batches
+    from hma_jax.evaluation.evaluate import evaluate
+
+    manifest = materials.manifest
+    batches = eval_batches(materials.store, table, manifest, config.batch, names, first=first)
+    windows = sum(len(d.windows[:first]) for d in manifest.datasets if d.dataset in names)
+    progress("evaluating", 0, windows)
+    return evaluate(
+        params,
+        model,
+        table,
+        materials.tokenizer,
+        batches,
+        config,
+        setting=setting,
+        execution=execution,
+        progress=lambda done: progress("evaluating", done, windows),
+    )
+
+
+def run_trial(
+    trial: Trial,
+    workspace: Workspace,
+    directory: Path,
+    *,
+    execution: ExecutionConfig = ExecutionConfig(),
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
+
+    Returns what it writes to result.json. Raises ConfigError, DataError, DivergedError or
+    Interrupted.
+    """
+    import jax
+
+    from data_pipelines.loading.selection import training_table
+    from experiments.running.sealed import write_result
+    from hma_jax.model.flops import train_flops_per_window
+    from hma_jax.model.hma import declare_model
+    from hma_jax.runtime.processes import is_writer
+
+    started = time.perf_counter()
+    materials = open_materials(workspace)
+    table = training_table(materials.store, loader_of(trial), trial.train.action_scale)
+    declared = declare_model(trial.model, table)
+    trained = train_trial(trial, materials, directory / "run", execution=execution, progress=progress, table=table)
+
+    subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
+    evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)
+    untrained = None
+    if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
+        fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))
+        untrained = evaluate_on(
+            trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
+        ).summary.to_dict()
+
+    result = {
+        "evaluation": evaluation.summary.to_dict(),
+        "untrained": untrained,
+        "losses": trained.losses,
+        "parameters": declared.count(),
+        "train_flops": train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
+        "run": {
+            "seconds": time.perf_counter() - started,
+            "train_seconds": trained.seconds,
+            "compile_seconds": trained.compile_seconds,
+            "machine": describe_machine(jax.devices()),
+            "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
+        },
+    }
+    if is_writer():
+        write_evaluation(directory, evaluation)
+        record_end(directory)
+        write_result(directory, result)
+    return result
+
+
+def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
+    """Writes windows.csv.gz and samples.npz into `directory`."""
+    from hma_jax.evaluation.windows import FILE
+
+    evaluation.windows.save(directory / FILE)
+    write_samples(directory / "samples.npz", evaluation.samples)
+
+
+def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:
+    """Stores {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}} as '<dataset>/<kind>'."""
+    import numpy as np
+
+    aside = path.with_suffix(".tmp.npz")
+    np.savez_compressed(
+        aside, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
+    )
+    os.replace(aside, path)

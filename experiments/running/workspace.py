@@ -1,0 +1,156 @@
+"""The output directory of a study: where everything lies, and which study lives there."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from data_pipelines.publishing.files import write_file
+from experiments.program import PROGRAM
+from experiments.running.former import modernise
+from experiments.running.provenance import Provenance, inputs_of
+from experiments.study import Study
+from hma_jax.config import ConfigError
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.runtime.locks import Held, exclusive
+
+
+class Busy(Held):
+    """Another command is at work in the directory."""
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Paths under `root`. Deleting any of them is safe: the next run makes it again."""
+
+    root: Path
+
+    @property
+    def suite(self) -> Path:
+        """Simulated RLDS datasets."""
+        return self.root / "suite"
+
+    @property
+    def tokenizer(self) -> Path:
+        return self.root / "tokenizer"
+
+    @property
+    def store(self) -> Path:
+        """Token store."""
+        return self.root / "tokens"
+
+    @property
+    def manifest(self) -> Path:
+        """Frozen evaluation windows."""
+        return self.root / "eval_manifest.json"
+
+    @property
+    def data_summary(self) -> Path:
+        """Episodes and windows per dataset, as JSON."""
+        return self.root / "data.json"
+
+    @property
+    def trials(self) -> Path:
+        return self.root / "trials"
+
+    @property
+    def ledger(self) -> Path:
+        return self.root / "ledger.jsonl"
+
+    @property
+    def results(self) -> Path:
+        return self.root / "results.csv"
+
+    @property
+    def optima(self) -> Path:
+        """Best learning rates per width, where they were swept."""
+        return self.root / "optima.csv"
+
+    @property
+    def figures(self) -> Path:
+        return self.root / "figures"
+
+    @property
+    def report(self) -> Path:
+        return self.root / "report.html"
+
+    @property
+    def record(self) -> Path:
+        """Which study lives here."""
+        return self.root / "study.json"
+
+    @contextmanager
+    def locked(self, lock: str = ".lock") -> Iterator[None]:
+        """Makes the directory and holds the right to write in it, or what another `lock` is for; it dies with its
+        process.
+
+        Raises ConfigError if the directory cannot be written, Busy if another process holds it.
+        """
+        with ExitStack() as stack:
+            try:
+                self.root.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(exclusive(self.root / lock))
+            except Held as held:
+                raise Busy(
+                    f"another command is at work in {self.root} ({held.who}); wait for it or choose another --out",
+                    held.holder,
+                ) from None
+            except OSError as error:
+                there = next(p for p in (self.root, *self.root.parents) if p.exists())
+                what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
+                raise ConfigError(
+                    f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, in a directory "
+                    "where you may write"
+                ) from error
+            yield
+
+
+@dataclass(frozen=True)
+class Record:
+    """What study.json remembers, so that `hma report` and `hma sweep` need only --out."""
+
+    study: Study
+    data: tuple[str, ...] = ()  # RLDS directories of the user; () for the suite
+    axes: tuple[str, ...] = ()  # sweeps run so far
+    command: str = ""
+    provenance: Provenance | None = None  # of the trials that the report shows; None: not prepared yet
+
+
+def save_record(workspace: Workspace, record: Record) -> None:
+    write_file(workspace.record, json.dumps(to_dict(record), indent=1))
+
+
+def find_record(workspace: Workspace) -> Record | None:
+    """The study that lives there, as this or an earlier version recorded it; None without any.
+
+    Raises ConfigError if its file cannot be read.
+    """
+    path = workspace.record
+    try:
+        values = json.loads(path.read_text())
+        study, execution = modernise(values["study"])
+        values["study"] = study | {"execution": study.get("execution", {}) | execution}
+        if values.get("provenance"):
+            values["provenance"] = to_dict(inputs_of(values["provenance"]))
+        return from_dict(Record, values)
+    except FileNotFoundError:
+        return None
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path} is damaged or of another version ({error}); delete it and run the study's command again"
+        ) from error
+
+
+def load_record(workspace: Workspace) -> Record:
+    """Raises ConfigError if no study lives there."""
+    record = find_record(workspace)
+    if record is None:
+        raise ConfigError(
+            f"no study in {workspace.root} (it has no {workspace.record.name}); start one with "
+            f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
+        )
+    return record

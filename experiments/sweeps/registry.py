@@ -1,0 +1,88 @@
+"""Which axes there are: the names of this folder's files, and files of the user's own.
+
+An axis is a module with `plan(study) -> Sweep`. Those of the project are imported when they are asked for.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from data_pipelines.publishing.files import write_file
+from experiments.study import Study
+from experiments.sweeps.sweep import Sweep
+from hma_jax.config import ConfigError, require
+
+SCALING = ("datasets", "trajectories", "width")
+"""What `hma study` runs."""
+
+AXES = (*SCALING, "settings", "conditioning", "lr")
+"""Each is `experiments.sweeps.<name>`."""
+
+Plan = Callable[[Study], Sweep]
+
+
+def is_file(axis: str) -> bool:
+    """Whether an axis is a file of the user's own, not one of the project's."""
+    return axis.endswith(".py")
+
+
+def keep_axis(axis: str, root: Path) -> str:
+    """The axis as a study in `root` remembers it: a user's file is copied there, so that its report can be drawn
+    anywhere and its trials be planned again."""
+    if not is_file(axis):
+        return axis
+    kept = Path("axes") / Path(axis).name
+    text = Path(axis).read_bytes()
+    (root / kept).parent.mkdir(exist_ok=True)
+    write_file(root / kept, text)
+    return str(kept)
+
+
+def find_axis(axis: str, root: Path = Path()) -> Plan:
+    """The function that plans an axis, of its name or of a user's file, relative to `root`.
+
+    Raises ConfigError without any.
+    """
+    if is_file(axis):
+        return _load(root / axis)
+    if axis not in AXES:
+        near = difflib.get_close_matches(axis, AXES, n=1)
+        meant = f"did you mean {near[0]}?" if near else f"known: {', '.join(AXES)}; or a file of your own, AXIS.py"
+        raise ConfigError(f"no axis {axis!r}; {meant}")
+    return importlib.import_module(f"experiments.sweeps.{axis}").plan
+
+
+def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[Sweep]:
+    """The sweeps along `axes`, of which files are relative to `root`. Raises ConfigError for an axis that is none, or that does not fit the study."""
+    sweeps = [find_axis(axis, root)(study) for axis in axes]
+    for axis, sweep in zip(axes, sweeps, strict=True):
+        where = f"{axis}: plan(study)"
+        require(isinstance(sweep, Sweep), f"{where} must return a Sweep, got {type(sweep).__name__}")
+        require(bool(sweep.points), f"{where} returned a sweep without points")
+        if is_file(axis):
+            require(sweep.name not in AXES, f"{where}: the name {sweep.name!r} is taken; choose another")
+            require(
+                sweep.name.isidentifier(),
+                f"{where}: the name {sweep.name!r} becomes that of files; write it with letters, digits and _",
+            )
+    names = [sweep.name for sweep in sweeps]
+    require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
+    return sweeps
+
+
+def _load(path: Path) -> Plan:
+    """`plan` of a file, which is run. What it raises is its author's, and not caught."""
+    require(path.is_file(), f"{path}: no such file; an axis is a Python file with plan(study) (docs/own_axis.md)")
+    name = f"axis_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses of the file look themselves up there
+    spec.loader.exec_module(module)
+    plan = getattr(module, "plan", None)
+    require(callable(plan), f"{path}: has no function plan(study) (docs/own_axis.md)")
+    return plan

@@ -1,0 +1,209 @@
+"""What the suite does where nothing is simulated: messages, records, jobs, restarts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.publishing.claims import claim
+from data_pipelines.simulators import generate, packages, read_start, select
+from data_pipelines.simulators.episode import StartState
+from data_pipelines.simulators.record import encode_episode
+from data_pipelines.simulators.stats import stats_table
+from data_pipelines.simulators.worker import Job, episode_seed
+from data_pipelines.simulators.write import write_dataset
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from hma_jax.config import ConfigError
+from tests.data_pipelines.simulators.fakes import EPISODES, SIZE, SPEC, fake_workers, make_episode, write_episode
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    return fake_workers(monkeypatch)
+
+
+@pytest.fixture
+def home(tmp_path):
+    staging = tmp_path / "pusht" / ".1.0.0.episodes.mark"
+    staging.mkdir(parents=True)
+    for i in range(EPISODES):
+        write_episode(staging, i)
+    with claim(staging.with_name(".1.0.0")) as held:
+        write_dataset(
+            SPEC, staging.parent, held, staging, episodes=EPISODES, size=SIZE, metadata={"fingerprint": "mark"}
+        )
+    return tmp_path
+
+
+def test_what_was_simulated_is_read_back(home):
+    dataset = RldsDataset(home / "pusht")
+    assert (dataset.name, len(dataset)) == ("pusht", EPISODES)
+    for i in range(EPISODES):
+        episode, made = dataset.episode(i, "observation/image", ["action"]), make_episode(i)
+        np.testing.assert_array_equal(episode.actions, made.actions)
+        assert episode.success == made.success and len(episode.images) == 80
+        assert np.abs(episode.images[0].astype(int) - made.frames[0]).max() <= 2
+        assert read_start(dataset, i) == made.start, "the start state lost digits"
+    assert sorted(p.name for p in (home / "pusht").iterdir()) == ["1.0.0", "stats.json"]
+
+
+def test_tfds_decodes_the_records(home):
+    import tensorflow_datasets as tfds
+
+    from data_pipelines.sources.rlds.tfrecord import index_shard, read_record
+
+    features = tfds.builder_from_directory(str(home / "pusht" / "1.0.0")).info.features
+    shard = index_shard(next((home / "pusht" / "1.0.0").glob("*.tfrecord-*")))
+    example = features.deserialize_example_np(read_record(shard.path, shard.offsets[1], shard.lengths[1]))
+    steps = list(example["steps"])
+    made = make_episode(1)
+    np.testing.assert_array_equal([s["action"] for s in steps], made.actions)
+    np.testing.assert_array_equal([s["observation"]["state"] for s in steps], made.states)
+    assert bool(example["episode_metadata"]["success"])
+    assert [bool(s["is_terminal"]) for s in steps] == [False] * 80
+
+
+def test_robots_without_a_success_signal_claim_none():
+    from data_pipelines.sources.rlds.example import parse_example
+
+    (quiet,) = select(["dmc_reacher"])
+    assert "episode_metadata/success" not in parse_example(encode_episode(quiet, make_episode(1), 0))
+
+
+def test_the_table_of_figures_has_speed_lengths_and_success(home):
+    table = stats_table(home)
+    assert "| `pusht` | gym-pusht | 2 | 10 | push script | 3 | 240 | 8.0 to 8.0 | 40 | 1/3 |" in table
+    assert "16 px" in table
+    with pytest.raises(DataError, match="no simulator datasets"):
+        stats_table(home / "pusht")
+
+
+def test_missing_packages_are_named_with_the_extra_and_what_draws(monkeypatch):
+    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: None)
+    message = r"not installed \(gym-pusht, mujoco\): pip install -e '.\[sim\]'.*libegl1"
+    with pytest.raises(ConfigError, match=message):
+        packages.require_packages([SPEC])
+
+
+def test_a_machine_that_cannot_draw_is_told_what_to_install(monkeypatch):
+    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(packages.ctypes.util, "find_library", lambda name: None)
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    with pytest.raises(ConfigError, match="no OSMesa library.*apt-get install.*libosmesa6"):
+        packages.require_packages([SPEC])
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(ConfigError, match="MUJOCO_GL is 'glfw'"):
+        packages.require_packages([SPEC])
+
+
+def test_a_process_with_tensorflow_is_refused_before_it_can_crash(monkeypatch):
+    monkeypatch.setitem(packages.sys.modules, "tensorflow", object())
+    with pytest.raises(ConfigError, match="TensorFlow is loaded in this process"):
+        packages.prepare_process()
+
+
+def test_a_job_survives_its_command_line_and_seeds_are_its_episodes_own():
+    job = Job("pusht", (3, 4), 7, 64, "/some where")
+    assert Job.from_json(job.to_json()) == job
+    seeds = {episode_seed(n, s, i) for n in ("pusht", "fetch") for s in (0, 1) for i in range(50)}
+    assert len(seeds) == 200
+
+
+def test_text_that_is_no_start_state_is_refused():
+    with pytest.raises(DataError, match="is no start state"):
+        StartState.from_json(b'{"env": "Lift"}')
+
+
+def contents(root) -> dict[str, bytes]:
+    files = (p for p in sorted(root.rglob("*")) if p.is_file() and p.name != "stats.json")
+    return {str(p.relative_to(root)): p.read_bytes() for p in files}
+
+
+def run(root, **more):
+    return generate.generate_sim(root, names=["pusht"], **{"episodes": 12, "size": SIZE} | more)
+
+
+def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
+    run(tmp_path / "whole", workers=2)
+    assert sorted(fake.made) == list(range(12))
+
+    fake.made.clear()
+    fake.dies_at = 4
+    message = "pusht: its simulator ended with code -11: cannot draw.*tries them again"
+    with pytest.raises(DataError, match=message):
+        run(tmp_path / "cut")
+    assert sorted(fake.made) == [0, 1, 2, 3, 10, 11], "the other job of the dataset was not run"
+    assert not (tmp_path / "cut" / "pusht" / "1.0.0").exists()
+
+    fake.made.clear()
+    fake.dies_at = None
+    seen = []
+    run(tmp_path / "cut", progress=lambda name, done, total: seen.append((done, total)))
+    assert sorted(fake.made) == list(range(4, 10)), "episodes were made again"
+    assert seen == [(6, 12)] + [(n, 12) for n in range(7, 13)]
+    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
+
+    fake.made.clear()
+    run(tmp_path / "cut")
+    assert fake.made == []
+
+
+def test_other_settings_remake_a_dataset(tmp_path, fake, monkeypatch):
+    run(tmp_path)
+    for change in ({"seed": 1}, {"episodes": 13}):
+        fake.made.clear()
+        run(tmp_path, **change)
+        assert len(fake.made) == change.get("episodes", 12)
+    fake.made.clear()
+    monkeypatch.setattr(generate, "GENERATOR", generate.GENERATOR + 1)
+    run(tmp_path, episodes=13)
+    assert len(fake.made) == 13
+
+
+@pytest.mark.parametrize("package", ["numpy", "dm-control", "gymnasium", "mujoco", "simplejpeg"])
+def test_the_fingerprint_follows_packages_beneath_the_robots_own(monkeypatch, package):
+    (spec,) = select(["ogbench_ur5e"])
+    versions = dict.fromkeys(package_names(), "1.0")
+    monkeypatch.setattr(packages.importlib.metadata, "version", lambda name: versions[name])
+    before = generate.fingerprint(spec, 10, SIZE, 0)
+    assert before == generate.fingerprint(spec, 10, SIZE, 0)
+    versions[package] = "1.1"
+    assert generate.fingerprint(spec, 10, SIZE, 0) != before
+
+
+def package_names() -> set[str]:
+    names = {*packages.MODULES, *packages.EVERYWHERE}
+    return names.union(*packages.TOGETHER.values(), *packages.BENEATH.values())
+
+
+def test_the_fingerprint_follows_the_library_that_draws(monkeypatch, fake):
+    marks = set()
+    for library in packages.GL:
+        monkeypatch.setenv("MUJOCO_GL", library)
+        marks.add(generate.fingerprint(SPEC, 10, SIZE, 0))
+    assert len(marks) == 2
+
+
+def test_a_dataset_that_another_process_makes_is_named_and_left_alone(tmp_path, fake):
+    theirs = tmp_path / "pusht" / ".1.0.0.episodes.theirs"
+    theirs.mkdir(parents=True)
+    refused = pytest.raises(ConfigError, match="pusht: process .* is making this dataset")
+    with claim(tmp_path / "pusht" / ".1.0.0"), refused:
+        run(tmp_path)
+    assert theirs.is_dir() and fake.made == []
+    run(tmp_path)  # nobody's now
+    assert sorted(p.name for p in (tmp_path / "pusht").iterdir()) == ["1.0.0", "stats.json"]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"episodes": 0}, "episodes must be at least 1"),
+        ({"size": 8}, "frame size must lie in 16..1024"),
+        ({"workers": 0}, "workers must be at least 1"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path, fake, arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        run(tmp_path, **arguments)

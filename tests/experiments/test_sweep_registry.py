@@ -1,0 +1,89 @@
+"""Axes: all that there are can be asked for, and a stranger's file is one of them."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import experiments.sweeps
+from experiments.cli.main import main
+from experiments.presets import SMOKE
+from experiments.report.draw import draw
+from experiments.running.workspace import Workspace, load_record, save_record
+from experiments.sweeps.registry import AXES, find_axis, keep_axis, plan_sweeps
+from hma_jax.config import ConfigError
+from tests.experiments.fakes import STUDY, finished_study, record_of
+
+FOLDER = Path(experiments.sweeps.__file__).parent
+PAGE = Path(__file__).parents[2] / "docs/own_axis.md"
+
+
+def test_every_file_with_a_plan_is_registered():
+    """A line that is forgotten in the registry is found here, not by who asks for the axis."""
+    files = {path.stem for path in FOLDER.glob("*.py") if re.search(r"^def plan\(", path.read_text(), re.MULTILINE)}
+    assert files == set(AXES)
+
+
+def test_every_axis_says_what_the_page_needs():
+    for axis, sweep in zip(AXES, plan_sweeps(SMOKE, AXES), strict=True):
+        assert sweep.name == axis and sweep.question and sweep.gain
+        assert sweep.title or sweep.scaling, f"{axis} has a section of its own, without a title"
+
+
+def test_every_axis_is_a_program_of_its_own():
+    for axis in AXES:
+        assert (FOLDER / f"{axis}.py").read_text().endswith(f'if __name__ == "__main__":\n    run_sweep("{axis}")\n')
+
+
+@pytest.mark.parametrize(("axis", "words"), [("widht", "did you mean width"), ("colour", "known: datasets, ")])
+def test_an_unknown_axis_is_named(axis, words, capsys):
+    with pytest.raises(ConfigError, match=words):
+        find_axis(axis)
+    assert main(["sweep", axis, "--preset", "smoke", "--dry-run"]) == 2 and words in capsys.readouterr().err
+
+
+@pytest.fixture
+def documented(tmp_path) -> Path:
+    """The example of the documentation as a file."""
+    (text,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    path = tmp_path / "temperature.py"
+    path.write_text(text)
+    return path
+
+
+def test_the_documented_axis_is_planned(documented, capsys):
+    assert main(["sweep", str(documented), "--preset", "smoke", "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "4 trials" in said and "temperature" in said and "reference" in said
+
+
+def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
+    root = tmp_path / "study"
+    root.mkdir()
+    kept = keep_axis(str(documented), root)
+    documented.unlink()
+    axes = ("width", kept)
+    save_record(Workspace(root), record_of(axes=axes))
+    draw(finished_study(root, axes=axes), load_record(Workspace(root)))
+    page = (root / "report.html").read_text()
+    assert "how strongly the mixture favours" in page and "more width and another mixture" in page
+    assert (root / "figures/temperature.png").exists()
+    rows = (root / "results.csv").read_text()
+    assert all(f"temperature,{x}," in rows.replace(".0,", ",") for x in (1, 3, 10))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "has no function plan"),
+        ("def plan(study): return 3", "must return a Sweep, got int"),
+        ("from experiments.sweeps.width import plan", "'width' is taken"),
+    ],
+)
+def test_a_file_that_is_no_axis_is_refused(text, words, tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=words):
+        plan_sweeps(STUDY, [str(path)])
+    with pytest.raises(ConfigError, match="no such file"):
+        plan_sweeps(STUDY, [str(tmp_path / "other.py")])
