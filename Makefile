@@ -22,7 +22,7 @@ study: $(VENV)/installed
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
 play: $(VENV)/installed-play
-	$(BIN)/hma play --port $(PORT)
+	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play --port $(PORT)
 
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8

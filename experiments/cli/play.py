@@ -54,6 +54,11 @@ def play(
     from hma_jax.simulator.simulator import SAMPLER
     from hma_jax.simulator.warm_up import warm_up
 
+    require(
+        run != SHIPPED or run.is_dir(),
+        f"there is no model at {SHIPPED}: say which run to serve, or make one with `hma train --preset play --out runs/play` "
+        "and `hma play runs/play/model`",
+    )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
     decode = DecodeConfig(unmask_steps, temperature, sampler=SAMPLER, slide=window)

@@ -12,9 +12,10 @@ from aiohttp.test_utils import TestClient, TestServer
 
 from experiments.applications.play.server import make_app
 from experiments.applications.play.turn import Truth
+from hma_jax.simulator.warm_up import warm_up
 from tests.hma_jax.simulator.small import simulator, start
 
-SECONDS = 30.0
+SECONDS = 120.0
 """That any answer may take on a busy machine."""
 
 
@@ -25,9 +26,11 @@ def no_truth(_: Any) -> None:
 def serving(test: Callable[[TestClient], Awaitable[None]], *, visitors: int = 2, truth: Truth = no_truth) -> None:
     """Runs `test` with a client of a server for so many visitors."""
 
+    sim = simulator(episodes=visitors)
+    warm_up(sim)  # nobody waits for the compiler
+    sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
+
     async def main() -> None:
-        sim = simulator(episodes=visitors)
-        sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
         async with TestClient(TestServer(make_app(sim, truth))) as client:
             await asyncio.wait_for(test(client), 4 * SECONDS)
 

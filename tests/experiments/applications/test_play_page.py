@@ -163,7 +163,8 @@ def test_it_fits_a_phone():
         phone = {"viewport": {"width": 360, "height": 740}, "has_touch": True, "is_mobile": True}
         page = await opened(browser, address, bypass_csp=False, **phone)  # as a visitor has it
         assert await page.evaluate("document.documentElement.scrollWidth") <= 360
-        pad = await page.locator(".pad").bounding_box()
+        assert not await page.is_visible("#saved"), "nothing was recorded yet"
+        pad = await page.locator(".pads").bounding_box()
         assert pad["y"] + pad["height"] <= 740, "the picture and the pad are on one screen"
         await page.tap(".pad button[data-key=ArrowUp]")
         assert not page.faults

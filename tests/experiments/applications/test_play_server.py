@@ -53,7 +53,7 @@ def test_two_visitors_do_not_mix():
         assert one == wanted, "the other's actions reached it"
         assert other != one
 
-    serving(test, visitors=3)
+    serving(test)
 
 
 def test_a_lost_connection_finds_its_episode_again():
