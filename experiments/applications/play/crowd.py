@@ -55,6 +55,7 @@ class Visitor:
     wishes: deque[Wish] = field(default_factory=deque)
     replies: asyncio.Queue[str] | None = None  # None while not connected
     socket: web.WebSocketResponse | None = None
+    transport: asyncio.Transport | None = None  # of the socket
     active: float = field(default_factory=time.monotonic)
 
     def tell(self, message: Message) -> None:
@@ -65,15 +66,14 @@ class Visitor:
             self.replies.put_nowait(json.dumps(message))
         except asyncio.QueueFull:
             log.info("a visitor does not read; disconnected")
-            abort(self.socket)
-            self.replies = self.socket = None
+            self.abort()
+            self.replies = None
 
-
-def abort(socket: web.WebSocketResponse | None) -> None:
-    """Ends a connection at once: whoever does not read does not say goodbye either."""
-    transport = socket._req.transport if socket is not None and socket._req is not None else None
-    if transport is not None:
-        transport.abort()
+    def abort(self) -> None:
+        """Ends the connection at once: whoever does not read does not say goodbye either."""
+        if self.transport is not None:
+            self.transport.abort()
+        self.socket = self.transport = None
 
 
 class Crowd:
@@ -93,7 +93,7 @@ class Crowd:
         now = time.monotonic()
         if token in self.visitors:
             visitor = self.visitors[token]
-            abort(visitor.socket)  # the same page in a second window takes over
+            visitor.abort()  # the same page in a second window takes over
             visitor.active = now
             return visitor
         if not self._free:
@@ -114,7 +114,7 @@ class Crowd:
     def leave(self, visitor: Visitor, socket: web.WebSocketResponse) -> None:
         """The connection ended. The seat stays for a while."""
         if visitor.socket is socket:
-            visitor.socket = visitor.replies = None
+            visitor.socket = visitor.replies = visitor.transport = None
             visitor.wishes.clear()
             visitor.active = time.monotonic()
 
@@ -175,7 +175,8 @@ class Crowd:
                     await asyncio.wait_for(socket.send_str(text), SEND_SECONDS)
                 except TimeoutError:
                     log.info("a visitor does not read; disconnected")
-                    abort(socket)
+                    if visitor.socket is socket:
+                        visitor.abort()
                     return
 
     def close(self) -> None:

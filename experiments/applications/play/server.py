@@ -123,7 +123,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
         sockets.discard(socket)
         return socket
     replies: asyncio.Queue[str] = asyncio.Queue(REPLIES)
-    visitor.socket, visitor.replies = socket, replies
+    visitor.socket, visitor.transport, visitor.replies = socket, request.transport, replies
     sending = asyncio.create_task(crowd.send(visitor, socket, replies))
     robot = visitor.seat.robot
     visitor.tell({"type": "hello", "token": visitor.token, "robot": robot.name if robot else None, "start": visitor.seat.start})
