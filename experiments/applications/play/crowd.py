@@ -1,7 +1,7 @@
 """Who is there: visitors, their seats in the simulator, what they wait for and what waits for them.
 
 Everything here runs in the event loop's thread but `turn.answer`, of which one runs at a time in another. Queues are
-bounded on both ends: a visitor who asks faster than frames are made is told so, one who does not read is let go.
+bounded on both ends: of a visitor who asks faster than frames are made no more is read, one who does not read is let go.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ class Visitor:
     token: str
     seat: Seat
     wishes: deque[Wish] = field(default_factory=deque)
+    answered: asyncio.Event = field(default_factory=asyncio.Event)
     replies: asyncio.Queue[str] | None = None  # None while not connected
     socket: web.WebSocketResponse | None = None
     transport: asyncio.Transport | None = None  # of the socket
@@ -121,6 +122,8 @@ class Crowd:
     def dismiss(self, visitor: Visitor) -> None:
         if self.visitors.pop(visitor.token, None) is not None:
             self._free.append(visitor.seat.episode)
+            visitor.wishes.clear()
+            visitor.answered.set()
 
     def tidy(self) -> None:
         """Frees the seats of those who were away for too long."""
@@ -134,15 +137,18 @@ class Crowd:
     def wish(self, visitor: Visitor, message: Message) -> bool:
         """Takes a message as a wish. False if it makes no sense."""
         kind = message.get("type")
-        if kind != "act" and kind not in CHANGES:
+        if not isinstance(kind, str) or (kind != "act" and kind not in CHANGES):
             return False
         visitor.active = time.monotonic()
-        if len(visitor.wishes) >= WISHES:
-            visitor.tell({"type": "busy", "after": kind})
-            return True
         visitor.wishes.append(Wish(kind, message))
         self._wanted.set()
         return True
+
+    async def room_for(self, visitor: Visitor) -> None:
+        """Until few enough of a visitor's wishes wait. Meanwhile nothing of that visitor is read."""
+        while len(visitor.wishes) >= WISHES:
+            visitor.answered.clear()
+            await visitor.answered.wait()
 
     async def serve(self) -> None:
         """Answers wishes, a round of all visitors' oldest ones at a time, until cancelled."""
@@ -160,6 +166,7 @@ class Crowd:
                 log.exception("a round of wishes could not be answered")
                 replies = {i: [{"type": "error", "message": "the simulator failed; see the server's log"}] for i in wishes}
             for i, messages in replies.items():
+                asking[i].answered.set()
                 for message in messages:
                     asking[i].tell(message)
             if any(v.wishes for v in self.visitors.values()):

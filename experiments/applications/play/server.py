@@ -139,6 +139,7 @@ async def _drive(request: web.Request) -> web.StreamResponse:
 async def _listen(crowd: Crowd, visitor: Visitor, socket: web.WebSocketResponse) -> None:
     faults = 0
     async for message in socket:
+        await crowd.room_for(visitor)
         if message.type != WSMsgType.TEXT or not crowd.wish(visitor, _parsed(message.data)):
             faults += 1
             visitor.tell({"type": "error", "message": "that message makes no sense"})

@@ -1,6 +1,7 @@
 """The page's server: who visits it, well-behaved or not."""
 
 import asyncio
+import contextlib
 import io
 import json
 import zipfile
@@ -149,7 +150,8 @@ def test_a_huge_message_ends_its_connection_and_nothing_else():
         hostile, player = Player(client), Player(client)
         await hostile.enter()
         await player.enter()
-        await hostile.socket.send_str(json.dumps({"type": "act", "action": [0.0] * 10**6}))
+        with contextlib.suppress(ConnectionError):  # it may be over before all is sent
+            await hostile.socket.send_str(json.dumps({"type": "act", "action": [0.0] * 10**6}))
         assert (await hear(hostile.socket))["type"] == "closed"
         assert len(await player.drive(0.5, 2)) == 2
 
@@ -218,10 +220,14 @@ def test_wishes_that_wait_are_bounded():
     async def test(client):
         player = Player(client)
         await player.enter()
+        waiting = client.server.app[server.CROWD].visitors[player.token].wishes
         for _ in range(60):
             await player.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
-        kinds = [(await hear(player.socket))["type"] for _ in range(60)]
-        assert kinds.count("busy") and kinds.count("frame") and set(kinds) == {"busy", "frame"}
+        counts = []
+        for _ in range(60):
+            counts.append((await hear(player.socket))["count"])
+            assert len(waiting) <= crowd_module.WISHES
+        assert counts == list(range(3, 63)), "none is lost, and they stay in order"
 
     serving(test)
 
@@ -265,6 +271,6 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
 def _episodes(directory):
     source = RldsDataset(directory, "train")
     for i in range(len(source)):
-        images = np.stack(source.frames(i, "image", lambda steps: list(range(steps))))
-        with source.open_episode(i, "image", ["action"]) as episode:
+        images = np.stack(source.frames(i, "observation/image", lambda steps: list(range(steps))))
+        with source.open_episode(i, "observation/image", ["action"]) as episode:
             yield images, np.array(episode.actions)
