@@ -28,12 +28,14 @@ play: $(VENV)/installed-play
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8
 
 # Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py.
+EXACT = $(shell grep -rl --include='test_*.py' 'mark.exact' tests)
+
 test: $(VENV)/installed-test
-	XLA_FLAGS= $(PYTEST) -m "exact and not slow"
+	XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT)
 	$(PYTEST) -m "not exact and not slow"
 
 test-slow: $(VENV)/installed-test
-	XLA_FLAGS= $(PYTEST) -m exact
+	XLA_FLAGS= $(PYTEST) -m exact $(EXACT)
 	$(PYTEST) -m "not exact"
 
 # constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves.

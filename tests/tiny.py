@@ -40,6 +40,11 @@ def model_config(**changes) -> ModelConfig:
     return ModelConfig(**(settings | changes))
 
 
+def shallow_config(**changes) -> ModelConfig:
+    """One layer, where what a second one adds is compilation."""
+    return model_config(**{"layers": 1} | changes)
+
+
 SMALLER = dict(width=8, layers=1, heads=2, frames=3, tokens=4, action_tokens=1, factor_vocab=4)
 """model_config(**SMALLER): where what is computed does not matter. Tests that share it share its compiled step."""
 

@@ -149,7 +149,8 @@ def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> 
 
     def read() -> Any:
         try:
-            _check_pages(parquet.read_metadata(path), path)
+            with path.open("rb") as file:
+                check_pages(file)
             table = parquet.read_table(path, columns=columns, partitioning=None, **options)
             table.column_names  # noqa: B018  that they are text is found out here
             return table
@@ -159,15 +160,6 @@ def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> 
             raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
 
     return retried(path, read)
-
-
-def _check_pages(metadata: Any, path: Path) -> None:
-    """Raises ValueError for a page that no reader should take memory for."""
-    with path.open("rb") as file:
-        for group in map(metadata.row_group, range(metadata.num_row_groups)):
-            for column in map(group.column, range(group.num_columns)):
-                starts = [at for at in (column.dictionary_page_offset, column.data_page_offset) if at]
-                check_pages(file, min(starts, default=0), column.total_compressed_size)
 
 
 _PLACE = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")

@@ -1,13 +1,15 @@
 """What the pages of a Parquet file say they hold, looked at before a library takes memory for it.
 
 A page's header states its size unpacked, in up to 31 bits, and a reader takes that much memory at once: a damaged
-file of 800 bytes asked for 520 MB. Headers are structs of Thrift's compact protocol, one after another:
-https://github.com/apache/parquet-format (PageHeader: 1 type, 2 uncompressed size, 3 compressed size, ...).
+file of 800 bytes asked for 520 MB. Headers, and the file's footer that says where they lie, are structs of Thrift's
+compact protocol (https://github.com/apache/parquet-format). pyarrow shows the footer too, but ends the process
+over some that are damaged.
 """
 
 from __future__ import annotations
 
-from typing import BinaryIO
+from collections.abc import Iterator
+from typing import Any, BinaryIO
 
 MOST_UNPACKED = 32 * 2**20
 """Bytes of a page, unpacked. Writers aim at 1 MB; a page of one large image may have more."""
@@ -15,64 +17,105 @@ MOST_UNPACKED = 32 * 2**20
 MOST_HEADER = 64 * 1024
 """Bytes; a header may hold the smallest and the largest value of its page."""
 
-UNCOMPRESSED, COMPRESSED = 2, 3
+MAGIC, END = b"PAR1", 8
+"""A file ends with the footer's length, in four bytes, and the magic."""
+
+# Fields of FileMetaData, RowGroup, ColumnChunk, ColumnMetaData and PageHeader.
+ROW_GROUPS, COLUMNS, META, CHUNK_SIZE, DATA_AT, DICTIONARY_AT, UNPACKED, PACKED = 4, 1, 3, 7, 9, 11, 2, 3
+
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
+DEEPEST = 12
 
 
-def check_pages(file: BinaryIO, start: int, size: int) -> None:
-    """Looks at the headers of a column chunk's pages, `size` bytes from `start` on. Raises ValueError for one that
-    is damaged, lies outside, or says that it holds more than MOST_UNPACKED bytes."""
-    at, end = start, start + size
-    while at < end:
-        file.seek(at)
-        header = _Header(file.read(min(MOST_HEADER, end - at)))
-        sizes = header.read_struct()
-        unpacked, packed = sizes.get(UNCOMPRESSED, -1), sizes.get(COMPRESSED, -1)
-        if not 0 <= unpacked <= MOST_UNPACKED:
-            raise ValueError(f"the page at byte {at} says that it holds {unpacked} bytes, {MOST_UNPACKED} are the most")
-        at += header.at + packed
-        if packed < 0 or at > end:
-            raise ValueError(f"a page of {packed} bytes reaches out of its column, which ends at byte {end}")
+def check_pages(file: BinaryIO) -> None:
+    """Raises ValueError for a page that is damaged, lies outside of its column, or says that it holds more than
+    MOST_UNPACKED bytes."""
+    for start, size in _chunks(_read_footer(file)):
+        at, end = start, start + size
+        while at < end:
+            file.seek(at)
+            header = _Compact(file.read(min(MOST_HEADER, end - at)))
+            sizes = header.read_struct()
+            unpacked, packed = _number(sizes, UNPACKED), _number(sizes, PACKED)
+            if not 0 <= unpacked <= MOST_UNPACKED:
+                raise ValueError(
+                    f"the page at byte {at} says that it holds {unpacked} bytes, {MOST_UNPACKED} are the most"
+                )
+            at += header.at + packed
+            if packed < 0 or at > end:
+                raise ValueError(f"a page of {packed} bytes reaches out of its column, which ends at byte {end}")
 
 
-class _Header:
-    """Thrift's compact protocol, as much as a page header has of it."""
+def _read_footer(file: BinaryIO) -> dict[int, Any]:
+    size = file.seek(0, 2)
+    file.seek(max(size - END, 0))
+    end = file.read(END)
+    length = int.from_bytes(end[:4], "little")
+    if end[4:] != MAGIC or length > size - END - len(MAGIC):
+        raise ValueError("it does not end as a Parquet file does")
+    file.seek(size - END - length)
+    return _Compact(file.read(length)).read_struct()
+
+
+def _chunks(footer: dict[int, Any]) -> Iterator[tuple[int, int]]:
+    """(first byte, bytes) of every column of every group of rows."""
+    for group in _structs(footer, ROW_GROUPS):
+        for column in _structs(group, COLUMNS):
+            meta = column.get(META)
+            if not isinstance(meta, dict):
+                raise ValueError("the footer says of a column nothing")
+            starts = [at for at in (_number(meta, DATA_AT), _number(meta, DICTIONARY_AT)) if at > 0]
+            yield min(starts, default=0), _number(meta, CHUNK_SIZE)
+
+
+def _structs(values: dict[int, Any], field: int) -> list[dict[int, Any]]:
+    found = values.get(field, [])
+    if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
+        raise ValueError(f"the footer's field {field} is no list of structs")
+    return found
+
+
+def _number(values: dict[int, Any], field: int) -> int:
+    """A whole number, -1 where there is none."""
+    found = values.get(field)
+    return found if isinstance(found, int) else -1
+
+
+class _Compact:
+    """Thrift's compact protocol: values from bytes, and in `at` how many were read. Raises ValueError."""
 
     def __init__(self, data: bytes):
         self.data, self.at = data, 0
 
-    def read_struct(self, depth: int = 0) -> dict[int, int]:
-        """Field -> value, of its whole numbers; what else it has is passed over."""
-        fields: dict[int, int] = {}
+    def read_struct(self, depth: int = 0) -> dict[int, Any]:
+        """Field -> value; of texts and truth values None."""
+        fields: dict[int, Any] = {}
         field = 0
         while (byte := self._byte()) != 0:
             delta, kind = byte >> 4, byte & 15
             field = field + delta if delta else self._integer()
-            if kind in (I16, I32, I64):
-                fields[field] = self._integer()
-            elif kind not in (TRUE, FALSE):  # which stand in the field's own byte
-                self._skip(kind, depth)
+            # A field's own byte says whether it is true.
+            fields[field] = None if kind in (TRUE, FALSE) else self._read(kind, depth)
         return fields
 
-    def _skip(self, kind: int, depth: int) -> None:
-        if depth > 8:
-            raise ValueError("a page header is nested too deep")
-        if kind in (TRUE, FALSE, BYTE):  # as an element of a list
-            self._byte()
-        elif kind in (I16, I32, I64):
-            self._varint()
-        elif kind == DOUBLE:
-            self._pass(8)
-        elif kind == BINARY:
-            self._pass(self._varint())
-        elif kind in (LIST, SET):
+    def _read(self, kind: int, depth: int) -> Any:
+        if depth > DEEPEST:
+            raise ValueError("it is nested too deep")
+        if kind in (I16, I32, I64):
+            return self._integer()
+        if kind in (TRUE, FALSE, BYTE):
+            return self._pass(1)
+        if kind == DOUBLE:
+            return self._pass(8)
+        if kind == BINARY:
+            return self._pass(self._varint())
+        if kind in (LIST, SET):
             byte = self._byte()
-            for _ in range(self._varint() if byte >> 4 == 15 else byte >> 4):
-                self._skip(byte & 15, depth + 1)
-        elif kind == STRUCT:
-            self.read_struct(depth + 1)
-        else:
-            raise ValueError(f"a page header has a field of kind {kind}")
+            count = byte >> 4
+            return [self._read(byte & 15, depth + 1) for _ in range(self._varint() if count == 15 else count)]
+        if kind == STRUCT:
+            return self.read_struct(depth + 1)
+        raise ValueError(f"a field of kind {kind} is not known")
 
     def _byte(self) -> int:
         self._pass(1)
@@ -81,7 +124,7 @@ class _Header:
     def _pass(self, count: int) -> None:
         self.at += count
         if self.at > len(self.data):
-            raise ValueError("a page header is cut off")
+            raise ValueError("footer or header are cut off")
 
     def _varint(self) -> int:
         value = shift = 0
@@ -89,7 +132,7 @@ class _Header:
             value |= (byte & 127) << shift
             shift += 7
             if shift > 63:
-                raise ValueError("a page header has a number of more than 64 bits")
+                raise ValueError("a number has more than 64 bits")
         return value | byte << shift
 
     def _integer(self) -> int:

@@ -13,7 +13,7 @@ from hma_jax.objective.losses import masked_loss
 from hma_jax.objective.masking import mask_batch, mask_tokens
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
-from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
+from tests.tiny import DIFFUSION, TABLE, lively_params, random_batch, shallow_config, train_config
 
 MIXED = EmbodimentTable(
     (
@@ -30,7 +30,7 @@ def masked_batch(config, masking, table=TABLE, seed=0, batch=64):
 
 
 def test_the_settings_differ_in_what_is_hidden_and_predicted():
-    config = model_config()
+    config = shallow_config()
     seen = {}
     for setting in ("forward", "passive", "full", "policy", "inverse"):
         _, masked = masked_batch(config, MaskingConfig(setting=setting))
@@ -44,20 +44,20 @@ def test_the_settings_differ_in_what_is_hidden_and_predicted():
 
 
 def test_a_policy_s_hidden_actions_are_all_from_one_frame_on():
-    _, masked = masked_batch(model_config(), MaskingConfig(setting="policy"))
+    _, masked = masked_batch(shallow_config(), MaskingConfig(setting="policy"))
     hidden = np.asarray(masked.hidden_T)
     assert (np.diff(hidden.astype(int), axis=1) >= 0).all() and hidden[:, -1].all()
     assert len(np.unique(hidden.sum(1))) == 6
 
 
 def test_frame_zero_is_always_shown():
-    for config in (model_config(), model_config(diffusion=DIFFUSION)):
+    for config in (shallow_config(), shallow_config(diffusion=DIFFUSION)):
         _, masked = masked_batch(config, MaskingConfig())
         assert not np.asarray(masked.masked)[:, 0].any() and np.asarray(masked.masked)[:, 1:].any()
 
 
 def test_an_example_s_masks_do_not_depend_on_its_batch():
-    config = model_config()
+    config = shallow_config()
     data, whole = masked_batch(config, MaskingConfig(setting="full"), batch=8)
     part = mask_batch(
         jax.random.key(0), data["tokens"][:3], data["embodiment"][:3], config, MaskingConfig(setting="full"), TABLE
@@ -66,7 +66,7 @@ def test_an_example_s_masks_do_not_depend_on_its_batch():
 
 
 def test_continuous_tokens_are_masked_whole_unless_by_cell():
-    config = model_config(diffusion=DIFFUSION)
+    config = shallow_config(diffusion=DIFFUSION)
     _, by_patch = masked_batch(config, MaskingConfig())
     assert by_patch.masked.shape == by_patch.targets_TS.shape
     _, by_cell = masked_batch(config, MaskingConfig(mask_unit="cell"))
@@ -78,8 +78,8 @@ def test_continuous_tokens_are_masked_whole_unless_by_cell():
 
 @pytest.mark.parametrize("setting", ["full", "policy", "forward"])
 def test_robots_without_actions_or_video_targets_train_what_they_can(setting: str):
-    _, masked = masked_batch(model_config(), MaskingConfig(setting=setting), MIXED)
-    robots = random_batch(0, model_config(), 64, MIXED)["embodiment"]
+    _, masked = masked_batch(shallow_config(), MaskingConfig(setting=setting), MIXED)
+    robots = random_batch(0, shallow_config(), 64, MIXED)["embodiment"]
     film, blind = robots == 1, robots == 2
     assert np.asarray(masked.hidden_T)[film].all() and not np.asarray(masked.action_targets_T)[film].any()
     assert not np.asarray(masked.masked)[blind].any()
@@ -92,7 +92,7 @@ def test_robots_without_actions_or_video_targets_train_what_they_can(setting: st
 @pytest.mark.parametrize("diffusion, digest", [(None, 1553994923), (DIFFUSION, 988358124)])
 def test_without_a_schedule_masks_are_bit_for_bit_those_of_before_there_was_one(diffusion, digest):
     """Recorded at commit 5cf0343."""
-    _, masked = masked_batch(model_config(diffusion=diffusion), MaskingConfig())
+    _, masked = masked_batch(shallow_config(diffusion=diffusion), MaskingConfig())
     assert zlib.crc32(np.packbits(np.asarray(masked.masked)).tobytes()) == digest
 
 
@@ -116,7 +116,7 @@ def test_the_mean_mask_ratio_of_each_frame_follows_the_schedule_of_the_paper(lea
 
 
 def test_a_whole_horizon_gain_masks_the_last_frame_wholly():
-    for config in (model_config(), model_config(diffusion=DIFFUSION)):
+    for config in (shallow_config(), shallow_config(diffusion=DIFFUSION)):
         _, masked = masked_batch(config, MaskingConfig(horizon_gain=1.0))
         share = np.asarray(masked.masked).reshape(64, config.frames, -1).mean(-1)
         assert np.all(share[:, -1] == 1) and share[:, 1].min() < 1
@@ -160,7 +160,7 @@ def poison_hidden(data, masked):
     ],
 )
 def test_hidden_actions_do_not_reach_the_frames_on_any_path(conditioning: str, alignment: str):
-    config = model_config(conditioning=conditioning, action_alignment=alignment)
+    config = shallow_config(conditioning=conditioning, action_alignment=alignment)
     passive = MaskingConfig(setting="passive")
     np.testing.assert_array_equal(losses(config, passive), losses(config, passive, poison_hidden))
     leaky = dataclasses.replace(passive, action_leak="conditioning")
@@ -170,7 +170,7 @@ def test_hidden_actions_do_not_reach_the_frames_on_any_path(conditioning: str, a
 
 def test_hidden_actions_are_predicted_without_being_seen():
     """What is read off a frame is the same whatever the hidden chunks hold."""
-    config = model_config()
+    config = shallow_config()
     declared, params = lively_params(config)
     data, masked = masked_batch(config, MaskingConfig(setting="full"), batch=8)
     poisoned, _ = poison_hidden(data, masked)
@@ -194,7 +194,7 @@ def test_hidden_actions_are_predicted_without_being_seen():
     ],
 )
 def test_every_setting_learns_a_repeated_batch(setting: str, diffusion):
-    config = model_config(diffusion=diffusion, action_alignment="causal", trunk_gain=0.5, stem_gain=0.5, frames=4)
+    config = shallow_config(diffusion=diffusion, action_alignment="causal", trunk_gain=0.5, stem_gain=0.5, frames=4)
     train = train_config(masking=MaskingConfig(setting=setting), batch=8)
     train = dataclasses.replace(
         train, steps=80, optimizer=dataclasses.replace(train.optimizer, learning_rate=3e-3)
@@ -210,7 +210,7 @@ def test_every_setting_learns_a_repeated_batch(setting: str, diffusion):
 
 
 def test_what_a_step_does_not_concern_stands_still():
-    config = model_config()
+    config = shallow_config()
     for setting, still in (("passive", "actions_shown"), ("policy", "frames_predicted")):
         train = train_config(masking=MaskingConfig(setting=setting), steps=1)
         declared = declare_model(config, TABLE)
@@ -227,7 +227,7 @@ def test_what_a_step_does_not_concern_stands_still():
 
 
 def test_presence_is_by_use_and_robot():
-    config = model_config()
+    config = shallow_config()
     data, masked = masked_batch(config, MaskingConfig(setting="full"), MIXED)
     presence = find_presence(masked, jnp.asarray(data["embodiment"]), jnp.ones(3, bool), config)
     assert presence.robots["actions_shown"].tolist() == [True, False, True]
@@ -236,7 +236,7 @@ def test_presence_is_by_use_and_robot():
 
 
 def test_only_the_named_robots_own_parameters_are_trained():
-    config = model_config()
+    config = shallow_config()
     declared, params = lively_params(config)
     train = train_config(steps=1, only=("arm",))
     state = init_state(declared, TABLE, 0)._replace(params=params)
@@ -262,7 +262,7 @@ def test_only_the_named_robots_own_parameters_are_trained():
     ],
 )
 def test_predicting_actions_without_the_means_is_refused(changes, masking, message):
-    config = model_config(**changes)
+    config = shallow_config(**changes)
     with pytest.raises(ConfigError, match=message):
         train = train_config(masking=MaskingConfig(**masking))
         make_train_step(declare_model(config, TABLE), TABLE, config, train)

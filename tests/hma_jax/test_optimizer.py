@@ -17,7 +17,7 @@ from hma_jax.training.optimizer import (
     learning_rate_multiplier,
     make_schedule,
 )
-from tests.tiny import TABLE, lively_params, model_config
+from tests.tiny import TABLE, lively_params, shallow_config
 
 USES = get_args(Use)
 CONFIG = OptimizerConfig(learning_rate=1e-2, weight_decay=0.1)
@@ -48,7 +48,7 @@ def slices(declared, tree, robot):
 
 
 def test_robots_absent_from_a_step_do_not_move():
-    declared, params = lively_params(model_config())
+    declared, params = lively_params(shallow_config())
     state = init_adam(params, TABLE.size)
     params1, state1 = update(declared, params, state, [True, True, True])
     params2, state2 = update(declared, params1, state1, [True, False, True], seed=1)
@@ -64,7 +64,7 @@ def test_robots_absent_from_a_step_do_not_move():
 
 
 def test_a_robot_that_returns_goes_on_as_if_the_steps_between_had_not_been():
-    declared, params = lively_params(model_config())
+    declared, params = lively_params(shallow_config())
     state = init_adam(params, TABLE.size)
     a, sa = update(declared, params, state, [True, True, True], seed=0)
     away, s_away = update(declared, a, sa, [True, False, True], seed=5)
@@ -75,7 +75,7 @@ def test_a_robot_that_returns_goes_on_as_if_the_steps_between_had_not_been():
 
 
 def test_with_everyone_present_it_is_adamw():
-    declared, params = lively_params(model_config())
+    declared, params = lively_params(shallow_config())
     decayed = jax.tree.map(lambda s: s.decay, declared.specs, is_leaf=is_spec)
     reference = optax.adamw(
         1e-2, CONFIG.beta1, CONFIG.beta2, CONFIG.epsilon, weight_decay=0.1, mask=decayed
@@ -90,12 +90,12 @@ def test_with_everyone_present_it_is_adamw():
 
 
 def test_biases_are_never_decayed_and_matrices_are():
-    leaves = declare_model(model_config(), TABLE).leaves()
+    leaves = declare_model(shallow_config(), TABLE).leaves()
     assert all(spec.decay != name.endswith("bias") for name, spec in leaves.items())
 
 
 def test_mup_divides_the_rate_of_hidden_matrices_only():
-    config = model_config(width=128, mup=MupConfig(base_width=32))
+    config = shallow_config(width=128, mup=MupConfig(base_width=32))
     leaves = declare_model(config, TABLE).leaves()
     scaled = {n for n, s in leaves.items() if learning_rate_multiplier(s, config) == 0.25}
     assert {"trunk/blocks/space/qkv", "trunk/blocks/mlp_in/kernel", "stem/out/kernel"} <= scaled

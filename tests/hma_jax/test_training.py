@@ -14,18 +14,18 @@ from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.runs import load_run
 from hma_jax.training.train import train_model
-from tests.tiny import TABLE, batches, model_config, train_config
+from tests.tiny import TABLE, batches, shallow_config, train_config
 
+MODEL = shallow_config()
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
 
 
 def train(run_dir: Path, *, config=None, make=None, options=EVERY_TWO, provenance=None, **kwargs):
-    model = model_config()
     return train_model(
-        model,
+        MODEL,
         TABLE,
         config or train_config(),
-        make or batches(model),
+        make or batches(MODEL),
         run_dir=run_dir,
         provenance=provenance or {"data": "random"},
         options=options,
@@ -39,7 +39,7 @@ def equal_trees(a, b) -> bool:
 
 def dying_batches(after: int):
     """The usual stream, whose source breaks once `after` batches were taken."""
-    usual = batches(model_config())
+    usual = batches(MODEL)
 
     def make(start: int):
         for number, batch in enumerate(usual(start), start + 1):
@@ -110,7 +110,7 @@ def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path):
 
 
 def test_divergence_stops_the_run_and_spares_the_last_checkpoint(tmp_path: Path):
-    usual = batches(model_config())
+    usual = batches(MODEL)
 
     def poisoned(start: int):
         for number, batch in enumerate(usual(start), start + 1):
@@ -141,8 +141,7 @@ def test_micro_batches_change_nothing_but_rounding(tmp_path: Path):
 
 
 def test_training_lowers_the_loss_on_a_repeated_batch(tmp_path: Path):
-    model = model_config()
-    one = next(batches(model)(0))
+    one = next(batches(MODEL)(0))
 
     def same(start: int):
         while True:
@@ -158,7 +157,7 @@ def test_training_lowers_the_loss_on_a_repeated_batch(tmp_path: Path):
 def test_a_run_reads_back_with_everything_it_needs(tmp_path: Path):
     result = train(tmp_path)
     run = load_run(tmp_path)
-    assert run.model == model_config() and run.train == train_config() and run.table == TABLE
+    assert run.model == MODEL and run.train == train_config() and run.table == TABLE
     assert run.step == 6 and run.provenance == {"data": "random"}
     assert equal_trees(run.params, result.state.params)
 
@@ -176,8 +175,7 @@ def test_an_unwritable_run_directory_is_one_clear_message(tmp_path: Path):
 
 
 def test_every_step_counts_robots_that_were_present(tmp_path: Path):
-    model = model_config()
-    usual = batches(model)
+    usual = batches(MODEL)
 
     def only_pusher(start: int):
         for batch in usual(start):
@@ -188,7 +186,7 @@ def test_every_step_counts_robots_that_were_present(tmp_path: Path):
 
 
 def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):
-    given = declare_model(model_config(), TABLE).init(7)
+    given = declare_model(MODEL, TABLE).init(7)
     before = [np.array(x) for x in jax.tree.leaves(given)]
     result = train(tmp_path, initial=given)
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))

@@ -10,12 +10,14 @@ from data_pipelines.sources.parquet_pages import MOST_UNPACKED, check_pages
 parquet, arrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
 
 
-def chunks(path):
-    metadata = parquet.read_metadata(path)
-    for group in map(metadata.row_group, range(metadata.num_row_groups)):
-        for column in map(group.column, range(group.num_columns)):
-            start = min(at for at in (column.dictionary_page_offset, column.data_page_offset) if at)
-            yield start, column.total_compressed_size
+def first_page(path) -> int:
+    column = parquet.read_metadata(path).row_group(0).column(0)
+    return min(at for at in (column.dictionary_page_offset, column.data_page_offset) if at)
+
+
+def check(path):
+    with path.open("rb") as file:
+        check_pages(file)
 
 
 @pytest.fixture(params=[("NONE", "1.0"), ("snappy", "2.0"), ("zstd", "1.0")], ids=lambda p: p[0])
@@ -34,22 +36,49 @@ def table(request, tmp_path):
 
 
 def test_sound_files_pass_whatever_their_pages_are(table):
-    with table.open("rb") as file:
-        assert sum(1 for start, size in chunks(table) if check_pages(file, start, size) is None) == 18
+    check(table)
+
+
+def test_every_page_is_looked_at(table):
+    """Each header that is made unreadable is missed."""
+    metadata, data = parquet.read_metadata(table), table.read_bytes()
+    assert metadata.num_row_groups == 3
+    for group in map(metadata.row_group, range(3)):
+        for column in map(group.column, range(group.num_columns)):
+            for at in (column.dictionary_page_offset, column.data_page_offset):
+                if at:
+                    table.write_bytes(data[:at] + b"\x1d" + data[at + 1 :])  # a field of kind 13
+                    with pytest.raises(ValueError, match="kind 13"):
+                        check(table)
 
 
 def test_a_page_that_lies_about_its_size_is_refused(table):
-    data = bytearray(table.read_bytes())
-    start, size = next(chunks(table))
+    data, start = bytearray(table.read_bytes()), first_page(table)
     header = b"\x15\x00\x15\xfe\xff\xff\xff\x0f\x15\x02\x00"  # of kind 0, 2**31 - 1 bytes unpacked, one packed
     data[start : start + len(header)] = header
     table.write_bytes(data)
-    with table.open("rb") as file, pytest.raises(ValueError, match=f"{MOST_UNPACKED} are the most"):
-        check_pages(file, start, size)
+    with pytest.raises(ValueError, match=f"{MOST_UNPACKED} are the most"):
+        check(table)
 
 
-@pytest.mark.parametrize("cut", [1, 2, 5, 9])
-def test_a_header_that_is_cut_off_is_refused(table, cut):
-    start, _ = next(chunks(table))
-    with table.open("rb") as file, pytest.raises(ValueError, match="cut off|reaches out"):
-        check_pages(file, start, cut)
+def test_a_page_that_reaches_out_of_its_column_is_refused(table):
+    data, start = bytearray(table.read_bytes()), first_page(table)
+    header = b"\x15\x00\x15\x02\x15\xfe\xff\xff\xff\x0f\x00"  # one byte unpacked, 2**31 - 1 packed
+    data[start : start + len(header)] = header
+    table.write_bytes(data)
+    with pytest.raises(ValueError, match="reaches out"):
+        check(table)
+
+
+@pytest.mark.parametrize("kept", [0, 3, 8, 11, 12, 100])
+def test_a_file_that_is_cut_off_is_refused(table, kept):
+    table.write_bytes(table.read_bytes()[:kept])
+    with pytest.raises(ValueError, match="does not end as"):
+        check(table)
+
+
+def test_a_footer_that_would_be_read_for_ever_is_refused(table):
+    nested = b"\x1c" * 100
+    table.write_bytes(b"PAR1" + nested + len(nested).to_bytes(4, "little") + b"PAR1")
+    with pytest.raises(ValueError, match="nested too deep"):
+        check(table)

@@ -18,11 +18,11 @@ from hma_jax.model.embodiments import Embodiment
 from hma_jax.model.hma import declare_model
 from hma_jax.training.adapt import add_embodiments
 from tests.hma_jax.evaluation.fakes import SIZE, GreyTokenizer, make_batches
-from tests.tiny import DIFFUSION, TABLE, lively_params, model_config
+from tests.tiny import DIFFUSION, TABLE, lively_params, shallow_config
 
 DECODE = DecodeConfig(2, temperature=0.5, sampler=SamplerConfig(steps=3))  # every kind of random number is drawn
 EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=3)
-CONFIG = model_config()
+CONFIG = shallow_config()
 TOKENIZER = GreyTokenizer()  # one for all: an evaluator is compiled for a tokenizer
 
 
@@ -88,7 +88,7 @@ NEWCOMERS = (
 )
 def test_new_robots_change_no_number_of_the_old_ones(diffusion):
     """Random actions, decoding, likelihood and policy: all random numbers are a window's own."""
-    config = model_config(diffusion=diffusion)
+    config = shallow_config(diffusion=diffusion)
     _, params = lively_params(config)
     wider, table = add_embodiments(params, config, TABLE, NEWCOMERS, seed=3)
     inputs, found = [], []
@@ -107,7 +107,7 @@ def test_new_robots_change_no_number_of_the_old_ones(diffusion):
 
 @pytest.mark.slow
 def test_latents_that_are_no_numbers_are_not_decoded_into_images():
-    config = model_config(diffusion=DIFFUSION)
+    config = shallow_config(diffusion=DIFFUSION)
     broken = jax.tree.map(lambda x: x * jnp.nan, lively_params(config)[1])
     batches = make_batches(config, names=("arm",), each=4)
     with pytest.raises(ConfigError, match=r"predicted latents are not finite \(arm\); did the model diverge"):
@@ -158,7 +158,7 @@ def test_windows_longer_than_the_model_s_are_continued_past_it(params):
     def judge(batches, settings):
         return evaluate(params, CONFIG, TABLE, TOKENIZER, batches, settings)
 
-    (long,) = make_batches(model_config(frames=9), names=("arm",), each=4)
+    (long,) = make_batches(shallow_config(frames=9), names=("arm",), each=4)
     exact, streamed = (
         judge([long], replace(EVAL, decode=DecodeConfig(1, slide=slide))) for slide in ("exact", "streaming")
     )

@@ -1,0 +1,94 @@
+"""Figures of README and docs/ are those of the committed tables and records, to the last digit that is shown."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from experiments.bench.beside import OURS, RELEASED, THEIRS
+from experiments.rows import OVERALL, Row, read_csv
+
+ROOT = Path(__file__).parents[1]
+README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
+STUDY, ABLATIONS, BENCH = (ROOT / "experiments" / "results" / name for name in ("cpu", "ablations", "bench/cpu"))
+
+TRAINED = {
+    "untrained (vocabulary 65,536)": ("width", 48, "untrained"),
+    "copying the last prompt frame": ("width", 48, "point"),
+    "**reference**: 40 robots, all trajectories, width 48": ("width", 48, "point"),
+    "control: actions of other episodes": ("width", 48, "control"),
+    "at most 4 trajectories per robot": ("trajectories", 4, "point"),
+    "at most 32 trajectories per robot": ("trajectories", 32, "point"),
+    "width 16": ("width", 16, "point"),
+    "width 32": ("width", 32, "point"),
+    "5 robots, judged on these five": ("datasets", 5, "point"),
+    "20 robots, judged on the first five": ("datasets", 20, "point"),
+    "40 robots, judged on the first five": ("datasets", 40, "point"),
+}
+"""Row of the table -> (sweep, x, role)."""
+
+METRICS = ("perplexity", "delta_psnr", "psnr")
+DIGITS = {"perplexity": 2, "delta_psnr": 3, "psnr": 2}
+
+STAGES = {
+    "a frame while the window fills": "fill",
+    "a frame past the window, exact": "slide",
+    "a pass over the window": "forward",
+    "a training step": "step",
+    "a continuous frame, the same 100 sampler steps": "continuous fill",
+}
+
+
+def table(page: Path, header: str) -> dict[str, list[str]]:
+    """First cell -> the others, of the table that begins with `header`."""
+    lines = page.read_text().split(header, 1)[1].splitlines()[2:]
+    rows = {}
+    for line in lines:
+        if not line.startswith("|"):
+            break
+        first, *rest = (cell.strip() for cell in line.strip().strip("|").split("|"))
+        rows[first] = rest
+    assert rows
+    return rows
+
+
+def shown(row: Row, digits: int) -> str:
+    return f"{row.mean:,.{digits}f} ± {row.sem:.{digits}f}"
+
+
+@pytest.mark.parametrize("page", [README, RESULTS], ids=lambda page: page.name)
+def test_the_study_s_figures(page):
+    rows = {(r.sweep, r.x, r.role, r.metric): r for r in read_csv(STUDY / "results.csv") if r.scope == OVERALL}
+    for label, cells in table(page, "| trained model |").items():
+        for metric, cell in zip(METRICS, cells, strict=True):
+            found = "psnr_copy" if label.startswith("copying") and metric == "psnr" else metric
+            assert cell in ("", shown(rows[(*TRAINED[label], found)], DIGITS[metric])), (label, metric)
+        assert cells[-1], f"{label} shows nothing"
+
+
+def test_the_speed_beside_the_release():
+    record = json.loads((BENCH / "release-base-float32-cpu.json").read_text())
+    median = {stage["name"]: stage["timing"]["median"] for stage in record["stages"]}
+    for label, (release, here, times) in table(README, "| | release | here |").items():
+        stage = STAGES[label]
+        theirs, ours = median[THEIRS + RELEASED[stage]], median[OURS + stage]
+        assert (release, here) == (f"{theirs:.2f} s", f"{ours:.2f} s"), label
+        ratio = float(re.search(r"[\d.]+", times)[0])
+        digits = len(times.split(".")[1].rstrip("*").split(":")[0])
+        assert ratio == round(theirs / ours, digits), label
+        assert ("slower" in times) == (theirs < ours), label
+    assert f"`{record['machine']['commit']}`" in README.read_text() and record["date"] in README.read_text()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "experiments" / "results").rglob("results.csv")), ids=str)
+def test_committed_tables_are_read(path):
+    rows = read_csv(path)
+    assert rows and all(row.status == "finished" for row in rows)
+
+
+def test_readme_is_read_in_a_few_minutes():
+    words = README.read_text().replace("|", " ").split()
+    assert len(words) <= 900
