@@ -88,5 +88,6 @@ def test_another_tokenizer_or_damaged_robots_are_refused(run, tmp_path):
     (out / "robots.json").unlink()
     with pytest.raises(ConfigError, match="starts.npz cannot be read"):
         Simulator.load(out)
+    (out / "starts.npz").unlink()
     with pytest.raises(ConfigError, match="no tokenizer at"):
         Simulator.load(out, tmp_path / "nowhere")
