@@ -153,7 +153,7 @@ PLAY = replace(
     ),
     dataset_counts=(8,),
     widths=(64,),
-    transfer=TransferConfig(datasets=8, steps=1200),
+    transfer=TransferConfig(widths=(32, 48, 64), datasets=8, steps=1200),
 )
 
 PRESETS = {p.name: p for p in (SMOKE, CPU, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS, PLAY)}
