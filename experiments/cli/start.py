@@ -1,11 +1,13 @@
 """Where the program starts: before anything large is imported, it settles how the process holds memory."""
 
+import faulthandler
 import sys
 
 from hma_jax.runtime.host_memory import restart_keeping_pages
 
 
 def start() -> None:
+    faulthandler.enable()  # what each thread did, when a library ends the process by a signal
     restart_keeping_pages()
     from experiments.cli.main import main
 

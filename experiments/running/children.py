@@ -7,6 +7,7 @@ JAX, whose thread pools take their size from the cores a process may use.
 from __future__ import annotations
 
 import ctypes
+import faulthandler
 import os
 import signal
 import sys
@@ -43,6 +44,7 @@ def child_environment(compile_cache: Path, slot: Slot = Slot()) -> dict[str, str
 
 def enter_child() -> None:
     """Called first in a child: takes its cores, arranges to die with its parent and to end in order when asked to."""
+    faulthandler.enable()  # a library that ends the process by a signal is named by what its threads did
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where a shell's background had it ignored
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})  # Ray's workers have them blocked
     for number in (signal.SIGUSR1, signal.SIGUSR2):  # Slurm's, for the process above

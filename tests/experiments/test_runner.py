@@ -71,6 +71,8 @@ def test_failures_are_recorded_and_the_sweep_goes_on(tmp_path):
     }  # fmt: skip
     assert states["nan"].message == "loss is nan"
     assert "SIGABRT" in states["abort"].message and "output.txt" in states["abort"].message
+    (said,) = tmp_path.rglob("abort/output.txt")
+    assert "Fatal Python error: Aborted" in said.read_text()  # and what its threads did
     assert "exit code 1" in states["crash"].message
     assert "no such luck" in (tmp_path / "trials/crash/output.txt").read_text()
 
