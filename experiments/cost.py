@@ -75,7 +75,8 @@ def estimate(trial: Trial) -> Cost:
 
 
 def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
-    """The protocol on one window: likelihood, predicted frames, those under random actions, and the policy."""
+    """The protocol on one window: likelihood under the recorded actions and other episodes', predicted frames, those under
+    random actions and (counted though users' data have none) under another episode's, and the policy."""
     from hma_jax.evaluation.protocol import predicts_actions
     from hma_jax.generation.flops import rollout_flops, sampler_flops
     from hma_jax.model.flops import denoiser_flops, pass_flops
@@ -83,14 +84,17 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
     model, config, decode = trial.model, trial.eval, trial.eval.decode
     frames, draws = model.frames, config.random_actions
     beside = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, true or masked
-    flops = 2 * beside
+    likelihood = 2 * beside
     if model.diffusion:
-        flops += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
+        likelihood += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
+    flops = (1 + config.other_actions) * likelihood
     if config.context == "recorded":
+        flops += 2 * beside * (config.other_actions > 0)  # the likelihood once more, for decoding
         flops += (decode.unmask_steps - 1) * beside + (frames - 1) * sampler_flops(model, decode)
         flops += draws * rollout_flops(model, table, decode, frames, frames - 1)
     else:
-        flops += rollout_flops(model, table, decode, frames, config.prompt_frames, sequences=1 + draws)
+        sequences = 1 + draws + (config.other_actions > 0)
+        flops += rollout_flops(model, table, decode, frames, config.prompt_frames, sequences=sequences)
     if predicts_actions(model, trial.train.masking.setting):
         copies = 1 if model.action_alignment == "causal" else 2
         flops += copies * pass_flops(model, table, frames, frames / 2)

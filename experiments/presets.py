@@ -33,7 +33,9 @@ SMOKE = Study(
     ),
     train=TrainConfig(steps=3, batch=4, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=1),
                       masking=MaskingConfig(prompt_frames=2)),
-    eval=EvalConfig(windows_per_dataset=2, prompt_frames=2, random_actions=1, batch=2, perplexity_group=1),
+    eval=EvalConfig(
+        windows_per_dataset=2, prompt_frames=2, random_actions=1, other_actions=2, batch=2, perplexity_group=1
+    ),
     dataset_counts=(2, 3),
     trajectory_counts=(2, 4),
     widths=(8, 16),
@@ -66,7 +68,9 @@ CPU = Study(
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
         masking=MaskingConfig(max_corrupt_rate=0.0, non_mlm_ratio=0.0),
     ),
-    eval=EvalConfig(windows_per_dataset=8, batch=8),
+    # Each other sequence costs a seventh of what evaluation costs without any: three, of which a trial's evaluation takes
+    # a third longer, say whether actions are followed; the sixteen of retrieval need fifteen.
+    eval=EvalConfig(windows_per_dataset=8, batch=8, other_actions=3),
     dataset_counts=(5, 20, 40),
     trajectory_counts=(4, 32, 500),
     widths=(16, 32, 48),

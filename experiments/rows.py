@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
@@ -22,6 +22,10 @@ from experiments.running.provenance import Provenance, read_record
 from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
+from hma_jax.config import ConfigError
+
+if TYPE_CHECKING:
+    from hma_jax.evaluation.statistics import Stat
 
 OVERALL = "overall"
 """The scope that averages over all datasets of a sweep, each counting equally."""
@@ -86,7 +90,7 @@ def collect(
 def _rows(
     sweep: Sweep, point: Point, id: str, state: str, result: dict[str, Any] | None, origin: dict[str, Any]
 ) -> list[Row]:
-    from hma_jax.evaluation.statistics import Stat, mean_and_sem
+    from hma_jax.evaluation.statistics import Stat
     from hma_jax.evaluation.summary import Summary
 
     def row(role: str, scope: str, metric: str, stat: Stat) -> Row:
@@ -104,8 +108,7 @@ def _rows(
     parts = [(point.role, Summary.from_dict(result["evaluation"]))]
     if result["untrained"]:
         parts.append((UNTRAINED, Summary.from_dict(result["untrained"])))
-    last = result["losses"][-max(round(LAST * len(result["losses"])), 1) :]
-    rows = [row(point.role, TRAINING, LOSS, mean_and_sem(last))]
+    rows = [row(point.role, TRAINING, LOSS, last_loss(result["losses"]))]
     for role, summary in parts:
         judged = [name for name in sweep.scope if name in summary.datasets]  # those with windows
         scopes = {OVERALL: summary.over(judged)}
@@ -113,6 +116,13 @@ def _rows(
         for scope, metrics in scopes.items():
             rows += [row(role, scope, m, s) for m, s in sorted(metrics.items())]
     return rows
+
+
+def last_loss(losses: Sequence[float]) -> Stat:
+    """The mean of a run's last steps."""
+    from hma_jax.evaluation.statistics import mean_and_sem
+
+    return mean_and_sem(losses[-max(round(LAST * len(losses)), 1) :])
 
 
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
@@ -126,11 +136,20 @@ def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
 
 
 def read_csv(path: Path) -> list[Row]:
-    """The rows of a table that this or an earlier version wrote."""
+    """The rows of a table that this or an earlier version wrote. Raises ConfigError for a damaged one."""
     kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int, "results": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
+    rows = []
     with open(path, newline="") as file:
-        return [Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}) for record in csv.DictReader(file)]
+        for number, record in enumerate(csv.DictReader(file), start=2):
+            try:
+                rows.append(Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}))
+            except (ValueError, TypeError) as error:
+                raise ConfigError(
+                    f"{path}, line {number}: not a row of results ({error}); restore the file, or remove it and draw it "
+                    "again from the trials with `hma report`"
+                ) from error
+    return rows
 
 
 def _number(text: str) -> float:

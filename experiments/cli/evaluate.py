@@ -26,7 +26,7 @@ SHOWN = (
     "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain"
 )  # fmt: skip
 """Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all, and
-windows.csv.gz those of every window."""
+windows.parquet those of every window."""
 
 
 def evaluate(

@@ -1,4 +1,5 @@
-"""From datasets to everything a trial needs: suite, tokenizer, token store, frozen windows.
+"""From datasets to everything a trial needs: suite, tokenizer, token store, frozen windows and, of the suite, what is
+true in them under other actions.
 
 Each step is skipped when its output is there and was made from the same inputs, and goes on where it was cut
 short. What was made from other inputs is refused unless it may be replaced (`preparing.made_from`). What was
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.preparing.counterfactual import make_counterfactual
 from experiments.preparing.made_from import Step
 from experiments.preparing.sources import find_sources
 from experiments.preparing.store import make_store
@@ -44,4 +46,7 @@ def prepare(
     else:
         adopt_tokenizer(tokenizer, study, workspace, replace)
     make_store(study, workspace, sources, replace=replace, batch=batch, threads=threads)
-    return freeze_windows(study, workspace, replace)
+    provenance = freeze_windows(study, workspace, replace)
+    if not data and study.eval.other_actions and study.eval.context == "generated":
+        make_counterfactual(study, workspace)
+    return provenance

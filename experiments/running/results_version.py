@@ -2,6 +2,7 @@
 
 CHANGES = {
     1: "the first that is numbered; before, the bytes of the sources were part of a trial's name",
+    2: "action-nats, retrieval of the true actions and, on the suite, counterfactual PSNR are measured",
 }
 """What each number changed. Add one when a change to the code alters the numbers of a trial whose configuration and
 inputs stay as they are: finished trials of the number before are then other trials, which nobody mistakes for these.

@@ -4,7 +4,7 @@ A trial's directory holds
     job.json        the trial and its provenance (written by the runner)
     run/            the training run (`hma_jax.training`): log, checkpoints
     samples.npz     true and predicted frames of a few windows per dataset
-    windows.csv.gz  every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
+    windows.parquet every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
     provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
     result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
 """
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from data_pipelines.loading.selection import LoaderConfig
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.evalset import EvalManifest
+    from data_pipelines.windows.truth import OtherTruth
     from hma_jax.evaluation.evaluate import Evaluation
     from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.model.params import Params
@@ -78,18 +79,21 @@ class Materials:
     store: TokenStore
     tokenizer: Tokenizer
     manifest: EvalManifest
+    truth: OtherTruth | None = None  # what the frozen windows would be under other actions, where it is simulated
 
 
 def open_materials(workspace: Workspace) -> Materials:
     """Raises ConfigError or DataError for what is missing or damaged."""
     from data_pipelines.tokens.store import TokenStore
     from data_pipelines.windows.evalset import EvalManifest
+    from data_pipelines.windows.truth import OtherTruth
     from hma_jax.tokenizers.io import load_tokenizer
 
     return Materials(
         TokenStore(workspace.store),
         load_tokenizer(workspace.tokenizer),
         EvalManifest.load(workspace.manifest),
+        OtherTruth.load(workspace.counterfactual) if workspace.counterfactual.exists() else None,
     )
 
 
@@ -207,12 +211,19 @@ def evaluate_on(
     first: int | None = None,
     progress: Progress = lambda *_: None,
 ) -> Evaluation:
-    """The protocol over the frozen windows of `names`, or over the `first` ones of each."""
+    """The protocol over the frozen windows of `names`, or over the `first` ones of each.
+
+    Counterfactual PSNR needs simulated frames for this very prompt, and generated ones.
+    """
     from data_pipelines.windows.evalset import eval_batches
     from hma_jax.evaluation.evaluate import evaluate
 
     manifest = materials.manifest
-    batches = eval_batches(materials.store, table, manifest, config.batch, names, first=first)
+    truth = materials.truth if config.context == "generated" and config.other_actions else None
+    truth = truth if truth and truth.prompt == config.prompt_frames else None
+    batches = eval_batches(
+        materials.store, table, manifest, config.batch, names, first=first, others=config.other_actions, truth=truth
+    )
     windows = sum(len(d.windows[:first]) for d in manifest.datasets if d.dataset in names)
     progress("evaluating", 0, windows)
     return evaluate(
@@ -286,10 +297,10 @@ def run_trial(
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
-    """Writes windows.csv.gz and samples.npz into `directory`."""
+    """Writes windows.parquet and samples.npz into `directory`."""
     from hma_jax.evaluation.windows import FILE
 
-    evaluation.windows.save(directory / FILE)
+    evaluation.windows.save(directory / FILE, directory.name)
     write_samples(directory / "samples.npz", evaluation.samples)
 
 

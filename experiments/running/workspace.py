@@ -49,6 +49,11 @@ class Workspace:
         return self.root / "eval_manifest.json"
 
     @property
+    def counterfactual(self) -> Path:
+        """What would be seen in them under other actions, of the suite."""
+        return self.root / "counterfactual.npz"
+
+    @property
     def data_summary(self) -> Path:
         """Episodes and windows per dataset, as JSON."""
         return self.root / "data.json"
@@ -66,9 +71,24 @@ class Workspace:
         return self.root / "results.csv"
 
     @property
+    def trial_table(self) -> Path:
+        """A row per trial, its configuration and results flat."""
+        return self.root / "trials.parquet"
+
+    @property
+    def controllability(self) -> Path:
+        """Per robot, whether the reference model follows actions."""
+        return self.root / "controllability.csv"
+
+    @property
     def optima(self) -> Path:
         """Best learning rates per width, where they were swept."""
         return self.root / "optima.csv"
+
+    @property
+    def fits(self) -> Path:
+        """Coefficients of scaling fits."""
+        return self.root / "fits.csv"
 
     @property
     def figures(self) -> Path:

@@ -30,7 +30,7 @@ from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
 
-OUT = Path("experiments/results/suite/explained.csv")
+OUT = Path(__file__).parents[1] / "results" / "suite" / "explained.csv"
 STATES = 96
 ACTIONS = 8
 """Drawn for each state."""

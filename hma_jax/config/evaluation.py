@@ -87,6 +87,7 @@ class EvalConfig:
     # Continuous tokens: the mean of each diffusion step, not a draw.
     decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
     random_actions: int = 5  # draws for delta PSNR
+    other_actions: int = 15  # of other episodes, that the true ones are told from; 0: neither action-nats nor retrieval
     batch: int = 32
     perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
     seed: int = 0
@@ -95,6 +96,7 @@ class EvalConfig:
         require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
         require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
         require(self.random_actions >= 1, "eval.random_actions must be at least 1")
+        require(self.other_actions >= 0, "eval.other_actions must not be negative")
 
     @property
     def first_predicted(self) -> int:

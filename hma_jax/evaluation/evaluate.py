@@ -34,7 +34,7 @@ T = TypeVar("T")
 ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
 """What of a batch goes to the devices."""
 
-PERHAPS = ("real", "action_mean", "action_std")
+PERHAPS = ("real", "action_mean", "action_std", "other_actions", "other_valid", "other_images", "other_seen")
 """And this, where a batch has it."""
 
 
@@ -44,7 +44,7 @@ class Evaluation:
 
     windows: WindowTable
     summary: Summary
-    samples: dict[str, dict[str, np.ndarray]]  # {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}}
+    samples: dict[str, dict[str, np.ndarray]]  # {dataset: {kind: uint8 [n, T, H, W, 3]}}, see `images.make_clips`
 
 
 def evaluate(
@@ -95,7 +95,10 @@ def evaluate(
                 real = batch["real"][row] if "real" in batch else np.ones(len(batch["images"][row]), bool)
                 clips = (batch["images"][row], np.asarray(predicted.tokens)[row])
                 random = None if predicted.random is None else held(np.asarray(predicted.random)[row], real)
-                own.append(Sample(*(held(clip, real) for clip in clips), random))
+                other = (None, None)
+                if predicted.other is not None and batch["other_seen"][row]:
+                    other = (held(np.asarray(predicted.other)[row], real), held(batch["other_images"][row], real))
+                own.append(Sample(*(held(clip, real) for clip in clips), random, *other))
         if progress is not None:
             progress(sum(map(len, tables)))
     windows = join(tables)
@@ -121,15 +124,16 @@ def make_evaluator(
     predict = make_predictor(model, table, config, setting, execution)
 
     def compare(
-        params: Params, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None]
+        params: Params, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None, Any]
     ) -> dict[str, jax.Array]:
-        images, real = recorded
-        return image_metrics(decode, piece, params, predicted, images, config, real)
+        images, real, others = recorded
+        return image_metrics(decode, piece, params, predicted, images, config, real, others)
 
     def evaluate_group(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
         metrics, predicted = predict(params, batch)
-        recorded = batch["images"], batch.get("real")
+        others = (batch["other_images"], batch["other_seen"]) if "other_images" in batch else None
+        recorded = batch["images"], batch.get("real"), others
         compared = _on_each_device(compare, mesh)(decoder_params, predicted, recorded)
         return metrics | compared, predicted
 
@@ -224,4 +228,6 @@ def _rows_of(batch: dict[str, Any], found: dict[str, jax.Array]) -> WindowTable:
         f"predicted latents are not finite ({', '.join(sorted(set(dataset[~finite])))}); did the model diverge?",
     )
     episode, start = (np.asarray(batch[name], np.int64)[valid] for name in ("episode", "start"))
-    return WindowTable(dataset, episode, start, {m: np.asarray(x, np.float64) for m, x in columns.items()})
+    real = batch.get("real", np.ones(np.shape(batch["tokens"])[:2], bool))
+    frames = np.sum(real, axis=1, dtype=np.int64)[valid]
+    return WindowTable(dataset, episode, start, frames, {m: np.asarray(x, np.float64) for m, x in columns.items()})

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import EvalConfig, require
+from hma_jax.evaluation.controllability import counterfactual
 from hma_jax.evaluation.metrics import last_frames, mean_over_frames, psnr, ssim
 from hma_jax.evaluation.protocol import Predicted
 from hma_jax.model.params import Params
@@ -45,15 +46,17 @@ def image_metrics(
     images: jax.Array,
     config: EvalConfig,
     real_BT: jax.Array | None = None,
+    others: tuple[jax.Array, jax.Array] | None = None,
 ) -> dict[str, jax.Array]:
     """Per window [B], over the frames that are `real_BT` (None: all are); `images` are those recorded, uint8
-    [B, T, height, width, 3].
+    [B, T, height, width, 3]. `others` are other_images and other_seen of a batch that has them.
 
     `finite`, bool [B], says whether the tokens are numbers at all: images of latents that are not mean
     nothing.
     """
-    made = predicted.tokens.shape[1]
-    tokens = jnp.concatenate([predicted.tokens, predicted.random_last], axis=1)
+    made, draws = predicted.tokens.shape[1], predicted.random_last.shape[1]
+    under_others = [] if predicted.other is None else [predicted.other]
+    tokens = jnp.concatenate([predicted.tokens, predicted.random_last, *under_others], axis=1)
     decoded = decode_in_pieces(decode, piece, params, tokens.reshape(-1, *tokens.shape[2:]))
     decoded = decoded.reshape(*tokens.shape[:2], *decoded.shape[1:])
     require(
@@ -61,7 +64,7 @@ def image_metrics(
         f"the tokenizer decodes images of {decoded.shape[2:]}, recorded are {images.shape[2:]}; "
         "evaluate with the tokenizer that the token store was made with",
     )
-    shown, random_last = decoded[:, :made], decoded[:, made:]
+    shown, random_last, other = jnp.split(decoded, (made, made + draws), axis=1)
     first = config.first_predicted
     future, last = images[:, first:], last_frames(images, real_BT)
     real = None if real_BT is None else real_BT[:, first:]
@@ -72,7 +75,7 @@ def image_metrics(
     of_last = psnr(jnp.concatenate([shown_last, random_last], axis=1), _beside(last, 1 + random_last.shape[1]))
     of_last = jax.lax.optimization_barrier(of_last)
     psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
-    return {
+    found = {
         "psnr": mean_over_frames(psnr(shown, future), real),
         "psnr_last": psnr_last,
         "psnr_random": psnr_random.mean(1),
@@ -81,6 +84,11 @@ def image_metrics(
         "ssim": mean_over_frames(ssim(shown, future), real),
         "finite": _finite(tokens[:, :made], real) & _finite(predicted.random_last, None),
     }
+    if predicted.other is not None:
+        truth, seen = others
+        found["finite"] &= _finite(predicted.other, real)
+        found |= counterfactual(shown, other, truth[:, first:], before, seen, real)
+    return found
 
 
 def _finite(tokens: jax.Array, real_BT: jax.Array | None) -> jax.Array:
@@ -111,14 +119,16 @@ class Sample(NamedTuple):
     images: np.ndarray  # recorded, uint8 [T, height, width, 3]
     tokens: np.ndarray  # predicted under the recorded actions, of the last n frames [n, S (, C)]
     random: np.ndarray | None  # under random actions
+    other: np.ndarray | None = None  # under another episode's
+    other_images: np.ndarray | None = None  # what would have been seen under those
 
 
 def make_clips(decoder: Decoder, samples: Mapping[str, Sequence[Sample]]) -> dict[str, dict[str, np.ndarray]]:
-    """{dataset: {true, predicted and, where made, random: uint8 [samples, T, height, width, 3]}}.
+    """{dataset: {true, predicted and, where made, random, other, other_true: uint8 [samples, T, height, width, 3]}}.
 
     A predicted clip begins with the recorded images up to its first predicted one.
     """
-    tokens = [x for own in samples.values() for s in own for x in (s.tokens, s.random) if x is not None]
+    tokens = [x for own in samples.values() for s in own for x in (s.tokens, s.random, s.other) if x is not None]
     if not tokens:
         return {}
     decoded = decoder.decode(np.concatenate(tokens))  # in one call: decoders take many images at a time
@@ -126,9 +136,11 @@ def make_clips(decoder: Decoder, samples: Mapping[str, Sequence[Sample]]) -> dic
     clips: dict[str, dict[str, list[np.ndarray]]] = {}
     for name, own in samples.items():
         for sample in own:
-            kinds = clips.setdefault(name, {"true": [], "predicted": [], "random": []})
+            kinds = clips.setdefault(name, {"true": [], "predicted": [], "random": [], "other": [], "other_true": []})
             kinds["true"].append(sample.images)
-            for kind, made in (("predicted", sample.tokens), ("random", sample.random)):
+            if sample.other_images is not None:
+                kinds["other_true"].append(sample.other_images)
+            for kind, made in (("predicted", sample.tokens), ("random", sample.random), ("other", sample.other)):
                 if made is not None:
                     given = sample.images[: len(sample.images) - len(made)]
                     kinds[kind].append(np.concatenate([given, next(pieces)]))

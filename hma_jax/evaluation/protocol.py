@@ -9,6 +9,8 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
   continued past it, and their likelihood is that of the first T frames;
 * controllability: delta PSNR = PSNR of the last frame under the true actions minus its mean
   under random action sequences, unmasking with the same random numbers;
+* controllability again, where a batch has other episodes' actions: action-nats, retrieval and counterfactual PSNR
+  (`controllability`);
 * policy, where the model was trained to predict actions: squared error of every chunk after the
   prompt, given the true frames and actions before it (inverse dynamics: all frames and no
   action), against that of the mean action.
@@ -32,6 +34,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.evaluation.controllability import told_apart, under_each
 from hma_jax.evaluation.draws import own_statistics, random_actions, window_keys
 from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
@@ -46,7 +49,10 @@ Batch = dict[str, jax.Array]
 embodiment int32 [B], and episode and start, int32 [B], which with the robot's name say what window it is.
 Perhaps real, bool [B, T], False for frames at the end that only fill up a short window: they are neither
 predicted from nor counted, and its last frame is the last real one. Perhaps action_mean and action_std,
-float32 [B, U], of all recorded actions, to draw random ones and judge errors by; otherwise the table's are."""
+float32 [B, U], of all recorded actions, to draw random ones and judge errors by; otherwise the table's are. Perhaps
+other_actions, float32 [B, N, T, U], of other episodes of the same robot, and other_valid, bool [B, N], which of them there
+are; and then perhaps other_images, uint8 [B, T, H, W, 3], what would have been seen under the first of them from the
+prompt on, and other_seen, bool [B], whether that is known."""
 
 
 class Predicted(NamedTuple):
@@ -55,6 +61,7 @@ class Predicted(NamedTuple):
     tokens: jax.Array  # under the recorded actions [B, n, S (, C)]
     random_last: jax.Array  # of the last (real) frame, under each random sequence [B, draws, S (, C)]
     random: jax.Array | None  # under the first random one [B, n, S (, C)]; None where only the last frame was made
+    other: jax.Array | None = None  # under the first of another episode; None where nobody knows what is true then
 
 
 def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
@@ -113,6 +120,14 @@ def make_predictor(
         real = batch.get("real")
         seen = None if real is None else real[:, : model.frames]
         shown = None if hidden is None else hidden[:, : model.frames]
+        followed = None if seen is None else seen[:, 1:]
+
+        def judge(out: jax.Array) -> dict[str, jax.Array]:
+            return _likelihood(hma, out, window[0][:, 1:], keys["likelihood"], followed)
+
+        def judge_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
+            return judge(next_frame_outputs(hma, window[0], actions_BTU, robots, shown))
+
         if config.context == "recorded":
             require(
                 tokens.shape[1] == model.frames,
@@ -120,13 +135,22 @@ def make_predictor(
             )
             out, predicted = _after_recorded(hma, window, sequences, decoding, config, hidden, real)
         else:
-            out = next_frame_outputs(hma, *window, shown)
+            if counterfactual := "other_images" in batch:
+                other = batch["other_actions"][:, :1]
+                before = jnp.arange(tokens.shape[1])[:, None] < config.first_predicted - 1
+                sequences = jnp.concatenate([sequences, jnp.where(before, actions[:, None], other)], axis=1)
             prompt = tokens[:, : config.prompt_frames]
             made = rollout(hma, prompt, sequences, robots, decoding, config.decode, hidden_BT=hidden)
             ahead = None if real is None else real[:, config.prompt_frames :]
-            predicted = Predicted(made[:, 0], last_frames(made[:, 1:], ahead, axis=2), made[:, 1])
-        followed = None if seen is None else seen[:, 1:]
-        metrics = _likelihood(hma, out, window[0][:, 1:], keys["likelihood"], followed)
+            random = made[:, 1 : 1 + config.random_actions]
+            last = last_frames(random, ahead, axis=2)
+            predicted = Predicted(made[:, 0], last, random[:, 0], made[:, -1] if counterfactual else None)
+        if "other_actions" in batch:
+            found = under_each(judge_under, window[1], batch["other_actions"][:, :, : model.frames])
+            loss = found["diffusion_loss" if model.diffusion else "cross_entropy"]
+            metrics = {name: x[0] for name, x in found.items()} | told_apart(loss, batch["other_valid"])
+        else:
+            metrics = judge_under(window[1]) if config.context == "generated" else judge(out)
         if predicts_actions(model, setting):
             causally, statistics = setting != "inverse", judged_by(batch, table)
             metrics |= _policy_errors(hma, *window, keys["policy"], config, causally, statistics, seen)

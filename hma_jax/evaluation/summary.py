@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from hma_jax.config import require
+from hma_jax.evaluation.controllability import OPTIONAL
 from hma_jax.evaluation.statistics import (
     Estimate,
     Stat,
@@ -27,10 +30,11 @@ class Summary:
     datasets: dict[str, dict[str, Stat]] = field(default_factory=dict)
 
     def over(self, names: Iterable[str]) -> dict[str, Stat]:
-        """Each metric averaged over the named datasets, all counting equally."""
+        """Each metric averaged over those of the named datasets that have it, all counting equally."""
         chosen = [self.datasets[name] for name in names]
         require(len(chosen) > 0, "no datasets to average an evaluation over")
-        return {metric: stratified(d[metric] for d in chosen) for metric in chosen[0]}
+        metrics = dict.fromkeys(metric for d in chosen for metric in d)
+        return {metric: stratified(d[metric] for d in chosen if metric in d) for metric in metrics}
 
     @property
     def overall(self) -> dict[str, Stat]:
@@ -47,12 +51,15 @@ class Summary:
 def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
     """Means over the windows of each dataset, and its perplexities; errors clustered by episode.
 
+    Of what some windows have not (`controllability.OPTIONAL`) the mean is over those that have it; a dataset
+    without any has no such metric.
     `perplexity_group` is the number of windows per exp(mean loss) of the official perplexity.
     """
     found = {}
     for name in windows.datasets:
         own = windows.of(name)
         found[name] = {m: stat_of(e, own.episode) for m, e in _estimates(own, perplexity_group).items()}
+        found[name] |= _of_some(own, own.metrics)
     return Summary(found)
 
 
@@ -68,16 +75,30 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
     found = {}
     for name in shared:
         mine = a.of(name)
-        ours, theirs = (_estimates(x, perplexity_group) for x in (mine, b.of(name).matched_to(mine)))
+        other = b.of(name).matched_to(mine)
+        ours, theirs = (_estimates(x, perplexity_group) for x in (mine, other))
         found[name] = {m: stat_of(e.minus(theirs[m]), mine.episode) for m, e in ours.items() if m in theirs}
+        both = [m for m in OPTIONAL if m in mine.metrics and m in other.metrics]
+        found[name] |= _of_some(mine, {m: mine.metrics[m] - other.metrics[m] for m in both})
     return Summary(found)
 
 
 def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimate]:
     """Of one dataset: the mean of each metric, and for discrete tokens the perplexities."""
-    estimates = {metric: estimate_mean(column) for metric, column in windows.metrics.items()}
+    own = {metric: column for metric, column in windows.metrics.items() if metric not in OPTIONAL}
+    estimates = {metric: estimate_mean(column) for metric, column in own.items()}
     if "cross_entropy" in windows.metrics:
         losses = windows.metrics["cross_entropy"]
         estimates["perplexity"] = estimate_perplexity(losses, perplexity_group)
         estimates["perplexity_corpus"] = estimate_corpus_perplexity(losses)
     return estimates
+
+
+def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray]) -> dict[str, Stat]:
+    """Means of the optional metrics in `columns`, of the windows that have them."""
+    found = {}
+    for metric in OPTIONAL:
+        there = ~np.isnan(columns[metric]) if metric in columns else np.zeros(0, bool)
+        if there.any():
+            found[metric] = stat_of(estimate_mean(columns[metric][there]), windows.episode[there])
+    return found

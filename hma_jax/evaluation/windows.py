@@ -1,35 +1,39 @@
 """Every window's numbers: one row per window, from which all means follow.
 
-On disk a gzipped CSV, which pandas (`pandas.read_csv("windows.csv.gz")`), R or a spreadsheet opens as it
-is; numbers are written so that reading them gives the same float64 again. Columns:
+On disk a Parquet file in long form, a row for every window and metric, which pandas, polars, DuckDB or R open as
+it is and which is joined with those of other trials by putting one after the other:
 
-    dataset   name of the dataset, which is that of the robot
+    trial     name of the trial, or of the directory of a model that is evaluated alone
+    robot     name of the dataset, which is that of the robot
     episode   number of the episode in its source
-    start     first native frame of the window in the episode
-    ...       one column per metric (`protocol`, `images`)
+    window    first native frame of the window in the episode
+    frames    real frames of the window; what is left of the model's T is padding, which no number counts
+    metric    (`protocol`, `images`)
+    value     float32, as devices compute it
 
-(dataset, episode, start) names a window: the same one in every evaluation of any model, whatever
-other datasets there are. Rows stand in the order of the frozen manifest.
+(robot, episode, window) names a window: the same one in every evaluation of any model, whatever
+other datasets there are. Within a metric, rows stand in the order of the frozen manifest.
 """
 
 from __future__ import annotations
 
-import csv
-import gzip
 import io
 import os
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hma_jax.config import ConfigError, require
 
-FILE = "windows.csv.gz"
-NAME = ("dataset", "episode", "start")
-"""Columns that name a window."""
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+FILE = "windows.parquet"
+FORMER = "windows.csv.gz"
+"""What versions before it wrote."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,12 @@ class WindowTable:
     dataset: np.ndarray  # str
     episode: np.ndarray  # int64
     start: np.ndarray  # int64
+    frames: np.ndarray  # int64: real ones
     metrics: Mapping[str, np.ndarray]  # float64
 
     def __post_init__(self):
-        lengths = {len(column) for column in (self.dataset, self.episode, self.start, *self.metrics.values())}
+        named = (self.dataset, self.episode, self.start, self.frames)
+        lengths = {len(column) for column in (*named, *self.metrics.values())}
         require(len(lengths) == 1, f"the columns of a table of windows differ in length: {sorted(lengths)}")
 
     def __len__(self) -> int:
@@ -65,12 +71,15 @@ class WindowTable:
 
     def rows(self, index: np.ndarray) -> WindowTable:
         metrics = {name: column[index] for name, column in self.metrics.items()}
-        return WindowTable(self.dataset[index], self.episode[index], self.start[index], metrics)
+        return WindowTable(self.dataset[index], self.episode[index], self.start[index], self.frames[index], metrics)
 
     def matched_to(self, other: WindowTable) -> WindowTable:
-        """The same windows in the order of `other`. Raises ConfigError if `other` has others."""
+        """The same windows in the order of `other`. Raises ConfigError, naming the first window that differs, if
+        `other` has others, or one of them twice."""
         mine, theirs = self.names, other.names
         at = {name: i for i, name in enumerate(mine)}
+        for names in (mine, theirs):
+            require(len(set(names)) == len(names), f"a window stands twice in an evaluation: {_first_twice(names)}")
         strangers = sorted(set(mine) ^ set(theirs))
         require(
             not strangers,
@@ -79,35 +88,93 @@ class WindowTable:
         )
         return self.rows(np.asarray([at[name] for name in theirs], np.int64))
 
-    def save(self, path: str | Path) -> None:
-        """Writes the CSV; whole or not at all, and the same bytes for the same numbers."""
-        path, text = Path(path), io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow([*NAME, *self.metrics])
-        columns = [column.tolist() for column in (self.dataset, self.episode, self.start, *self.metrics.values())]
-        writer.writerows(zip(*columns, strict=True))
+    def to_arrow(self, trial: str) -> pa.Table:
+        """The long form, of the windows of `trial`."""
+        import pyarrow as pa
+
+        metrics, n = len(self.metrics), len(self)
+
+        def names(of: Sequence[str], index: np.ndarray) -> pa.DictionaryArray:
+            return pa.DictionaryArray.from_arrays(pa.array(index, pa.int32()), pa.array(list(of), pa.string()))
+
+        def number(column: np.ndarray, kind: pa.DataType) -> pa.Array:
+            return pa.array(np.tile(column, metrics), kind)
+
+        robots = self.datasets
+        robot = np.asarray([robots.index(name) for name in self.dataset.tolist()], np.int32)
+        values = [np.asarray(column, np.float32) for column in self.metrics.values()]
+        return pa.table(
+            {
+                "trial": names([trial], np.zeros(metrics * n, np.int32)),
+                "robot": names(robots, np.tile(robot, metrics)),
+                "episode": number(self.episode, pa.int32()),
+                "window": number(self.start, pa.int32()),
+                "frames": number(self.frames, pa.int16()),
+                "metric": names(list(self.metrics), np.repeat(np.arange(metrics), n)),
+                "value": pa.array(np.concatenate([np.zeros(0, np.float32), *values]), pa.float32()),
+            }
+        )
+
+    @classmethod
+    def from_arrow(cls, table: pa.Table) -> WindowTable:
+        """The inverse, of one trial's rows in any order of metrics. Raises ValueError unless every metric has the
+        same windows in the same order."""
+        metric = np.asarray(table["metric"].to_pylist(), object)
+        names = list(dict.fromkeys(metric.tolist()))
+        blocks = [np.flatnonzero(metric == name) for name in names]
+        if not blocks or len(set(table["trial"].to_pylist())) != 1:
+            raise ValueError("it holds no trial, or several")
+        columns = {name: table[name].to_numpy() for name in ("robot", "episode", "window", "frames", "value")}
+        first = {name: column[blocks[0]] for name, column in columns.items()}
+        for name, block in zip(names, blocks, strict=True):
+            if any(not np.array_equal(columns[c][block], first[c]) for c in ("robot", "episode", "window", "frames")):
+                raise ValueError(f"{name} is of other windows than {names[0]}")
+        whole = (np.asarray(first[name], np.int64) for name in ("episode", "window", "frames"))
+        values = {n: columns["value"][block].astype(np.float64) for n, block in zip(names, blocks, strict=True)}
+        return cls(np.asarray(first["robot"], str), *whole, values)
+
+    def save(self, path: str | Path, trial: str) -> None:
+        """Writes the Parquet file; whole or not at all, and the same bytes for the same numbers."""
+        import pyarrow.parquet as pq
+
+        path, content = Path(path), io.BytesIO()
+        pq.write_table(self.to_arrow(trial), content, compression="zstd", write_page_checksum=True)
         aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        aside.write_bytes(gzip.compress(text.getvalue().encode(), mtime=0))
+        with open(aside, "wb") as file:
+            file.write(content.getvalue())
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(aside, path)
 
     @classmethod
     def load(cls, path: str | Path) -> WindowTable:
         """Reads what `save` wrote. Raises ConfigError if it is missing or damaged."""
+        import pyarrow as pa
+
         try:
-            with gzip.open(path, "rt", newline="") as file:
-                head, *lines = csv.reader(file)
-            require(tuple(head[:3]) == NAME, f"its first columns are {', '.join(head[:3])}, not {', '.join(NAME)}")
-            columns = list(zip(*lines, strict=True)) or [()] * len(head)
-            dataset, episode, start, *metrics = columns
-            numbers = {name: np.asarray(c, np.float64) for name, c in zip(head[3:], metrics, strict=True)}
-            return cls(np.asarray(dataset, str), np.asarray(episode, np.int64), np.asarray(start, np.int64), numbers)
-        except (OSError, EOFError, ValueError, zlib.error, csv.Error) as error:
-            raise ConfigError(f"{path}: no table of windows can be read ({error}). Evaluate again.") from error
+            return cls.from_arrow(read_arrow(path))
+        except (OSError, ValueError, KeyError, pa.ArrowException) as error:
+            former = Path(path).with_name(FORMER)
+            reason = f"{former.name} beside it is of an earlier version" if former.exists() else error
+            raise ConfigError(f"{path}: no table of windows can be read ({reason}). Evaluate again.") from error
+
+
+def read_arrow(path: str | Path) -> pa.Table:
+    """The long form from a file. Raises OSError or pyarrow's exceptions."""
+    import pyarrow.parquet as pq
+
+    with open(path, "rb") as file:  # its own error for a file that is not there
+        return pq.read_table(file, page_checksum_verification=True)
+
+
+def _first_twice(names: Sequence[tuple[str, int, int]]) -> tuple[str, int, int] | None:
+    seen: set[tuple[str, int, int]] = set()
+    return next((name for name in names if name in seen or seen.add(name)), None)
 
 
 def join(tables: Sequence[WindowTable]) -> WindowTable:
     """One table after the other. Raises ConfigError if there is none."""
     require(len(tables) > 0, "the evaluation has no windows; freeze a manifest over other datasets")
-    dataset, episode, start = (np.concatenate([getattr(t, name) for t in tables]) for name in NAME)
+    columns = (np.concatenate([getattr(t, name) for t in tables]) for name in ("dataset", "episode", "start", "frames"))
     metrics = {m: np.concatenate([t.metrics[m] for t in tables]) for m in tables[0].metrics}
-    return WindowTable(dataset, episode, start, metrics)
+    return WindowTable(*columns, metrics)

@@ -24,7 +24,7 @@ def test_evaluation_counts_what_the_protocol_multiplies(diffusion, context, sett
     config = model_config(width=64, diffusion=diffusion, action_heads=setting == "policy")
     steps = replace(EvalConfig().decode.sampler, steps=5)
     protocol = replace(
-        EvalConfig(), context=context, prompt_frames=2, random_actions=3,
+        EvalConfig(), context=context, prompt_frames=2, random_actions=3, other_actions=4,
         decode=replace(EvalConfig().decode, sampler=steps),
     )  # fmt: skip
     trial = replace(
@@ -34,6 +34,10 @@ def test_evaluation_counts_what_the_protocol_multiplies(diffusion, context, sett
     execution = ExecutionConfig(attention="plain")
     number = np.arange(ROWS, dtype=np.int32)
     batch = {k: v[:ROWS] for k, v in random_batch(0, config).items()} | {"episode": number, "start": number}
+    others = (ROWS, protocol.other_actions)
+    batch |= {"other_actions": np.zeros((*others, *batch["actions"].shape[1:])), "other_valid": np.ones(others, bool)}
+    if context == "generated":
+        batch |= {"other_images": number, "other_seen": number > 0}
     predict = make_predictor(config, TABLE, protocol, setting, execution)
     params = jax.eval_shape(lambda: declare_model(config, TABLE, execution).init(0))
     # Action heads, attention over time and what is masked make the difference.
@@ -52,7 +56,7 @@ def test_batches_hold_windows_of_several_datasets_and_the_last_is_filled_up():
 
 
 def test_samplers_of_latents_are_paid_for_step_by_step():
-    trial = reference_trial(SMOKE_CONTINUOUS, 0)
+    trial = reference_trial(replace(SMOKE_CONTINUOUS, eval=replace(SMOKE_CONTINUOUS.eval, other_actions=0)), 0)
     sampler = trial.eval.decode.sampler
 
     def flops(steps: int) -> float:

@@ -3,10 +3,13 @@
 import itertools
 
 import numpy as np
+import pytest
 
+from data_pipelines.errors import DataError
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.windows.evalset import eval_batches
+from experiments.preparing import counterfactual
 from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
 from experiments.running.trial import open_materials
@@ -14,7 +17,8 @@ from experiments.running.workspace import Workspace
 from experiments.study import override
 
 
-def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path):
+def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeypatch):
+    """And what the suite's simulator says of other actions, once it has given back what was recorded."""
     study = override(get_preset("smoke-continuous"), ["dataset_counts=1"])
     workspace, model = Workspace(tmp_path), study.model
     prepare(study, workspace)
@@ -28,3 +32,23 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path):
         assert tokens.dtype == np.float32
         assert tokens.shape == (2, model.frames, model.tokens, model.diffusion.token_channels)
     assert materials.tokenizer.decode(validation["tokens"][0]).shape == validation["images"][0].shape
+
+    truth, prompt = materials.truth, study.eval.prompt_frames
+    assert truth.prompt == prompt and set(truth.frames) == set(materials.manifest.names)
+    (batch,) = eval_batches(store, table, materials.manifest, 4, others=3, truth=truth)
+    rows = np.flatnonzero(batch["valid"])
+    assert batch["other_seen"][rows].all()
+    np.testing.assert_array_equal(batch["other_images"][:, :prompt], batch["images"][:, :prompt])
+    assert (batch["other_images"][rows, -1] != batch["images"][rows, -1]).any((1, 2, 3)).all()
+    made = workspace.counterfactual.stat().st_mtime_ns
+    counterfactual.make_counterfactual(study, workspace)
+    assert workspace.counterfactual.stat().st_mtime_ns == made  # it is there
+    workspace.counterfactual.write_bytes(b"torn")
+    counterfactual.make_counterfactual(study, workspace)
+    assert open_materials(workspace).truth.frames.keys() == truth.frames.keys()
+    workspace.counterfactual.unlink()
+    seed_of = counterfactual._seed_of
+    monkeypatch.setattr(counterfactual, "_seed_of", lambda *args: seed_of(*args) + 1)
+    with pytest.raises(DataError, match="does not give back the recorded frames"):
+        counterfactual.make_counterfactual(study, workspace)
+    assert not workspace.counterfactual.exists()

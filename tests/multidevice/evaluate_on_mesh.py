@@ -26,7 +26,7 @@ def main(mesh: str, path: str) -> None:
     )
     assert seen == [5, 10, 14]
     assert evaluation.samples["arm"]["random"].shape == (1, 6, 8, 8, 3)
-    evaluation.windows.save(Path(path))
+    evaluation.windows.save(Path(path), "model")
     print(jax.device_count())
 
 

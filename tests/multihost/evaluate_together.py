@@ -28,7 +28,7 @@ def main(path: str) -> None:
     )
     assert seen[-1] == len(evaluation.windows) == 6
     if is_writer():
-        evaluation.windows.save(Path(path))
+        evaluation.windows.save(Path(path), "model")
         np.savez(path + ".npz", **evaluation.samples["arm"])
     end()
 

@@ -96,6 +96,6 @@ def _sweep(out: Path) -> Iterator[tuple[str, bytes]]:
     """The CSV, and of every trial its windows, losses and parameters."""
     yield "results.csv", (out / "results.csv").read_bytes()
     for trial in sorted((out / "trials").iterdir()):
-        yield f"{trial.name}/windows", (trial / "windows.csv.gz").read_bytes()
+        yield f"{trial.name}/windows", (trial / "windows.parquet").read_bytes()
         for name, value in _run(trial / "run"):
             yield f"{trial.name}/{name}", value

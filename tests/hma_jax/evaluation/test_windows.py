@@ -1,10 +1,11 @@
 """Tables of windows, on disk and summed up, and two models on the same windows."""
 
-import gzip
 import math
 from dataclasses import replace
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from hma_jax.config import ConfigError
@@ -13,8 +14,12 @@ from hma_jax.evaluation.summary import Summary, paired_difference, summarise
 from hma_jax.evaluation.windows import FILE, WindowTable, join
 
 
+def as_float32(x: np.ndarray) -> np.ndarray:
+    return x.astype(np.float32).astype(np.float64)
+
+
 def make_table(name: str = "arm", seed: int = 0, episodes: int = 8, each: int = 3) -> WindowTable:
-    """Two metrics; windows of an episode resemble each other."""
+    """Two metrics, as devices compute them; windows of an episode resemble each other; the last one is short."""
     rng = np.random.default_rng(seed)
     n = episodes * each
     psnr = 20 + np.repeat(rng.normal(size=episodes), each) + 0.1 * rng.normal(size=n)
@@ -22,43 +27,88 @@ def make_table(name: str = "arm", seed: int = 0, episodes: int = 8, each: int = 
         np.full(n, name),
         np.repeat(np.arange(episodes) * 7, each),
         np.tile(np.arange(each) * 12, episodes),
-        {"psnr": psnr, "cross_entropy": np.abs(rng.normal(size=n))},
+        np.where(np.arange(n) == n - 1, 5, 12),
+        {"psnr": as_float32(psnr), "cross_entropy": as_float32(np.abs(rng.normal(size=n)))},
     )
 
 
 def test_a_table_survives_the_disk_to_the_last_bit(tmp_path):
     table = join([make_table("arm", 0), make_table("base", 1)])
     table.metrics["psnr"][:3] = [math.nan, math.inf, np.float32(0.1)]
-    table.save(tmp_path / FILE)
+    table.save(tmp_path / FILE, "t0")
     again = WindowTable.load(tmp_path / FILE)
     assert again.names == table.names and again.datasets == ("arm", "base")
+    np.testing.assert_array_equal(again.frames, table.frames)
     for metric, column in table.metrics.items():
         np.testing.assert_array_equal(again.metrics[metric], column)
     (tmp_path / "more").mkdir()
-    again.save(tmp_path / "more" / FILE)
+    again.save(tmp_path / "more" / FILE, "t0")
     assert (tmp_path / "more" / FILE).read_bytes() == (tmp_path / FILE).read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["more", FILE]
 
 
-def test_any_program_reads_it_as_a_csv(tmp_path):
-    make_table(episodes=1, each=2).save(tmp_path / FILE)
-    head, first, second = gzip.decompress((tmp_path / FILE).read_bytes()).decode().splitlines()
-    assert head == "dataset,episode,start,psnr,cross_entropy"
-    assert first.startswith("arm,0,0,") and second.startswith("arm,0,12,")
+def test_any_program_reads_it_as_a_long_table(tmp_path):
+    make_table(episodes=1, each=2).save(tmp_path / FILE, "t0")
+    table = pq.read_table(tmp_path / FILE)
+    assert table.column_names == ["trial", "robot", "episode", "window", "frames", "metric", "value"]
+    assert table.schema.field("value").type == pa.float32()
+    assert all(pa.types.is_dictionary(table.schema.field(name).type) for name in ("trial", "robot", "metric"))
+    rows = table.to_pylist()
+    assert [(r["trial"], r["robot"], r["window"], r["frames"], r["metric"]) for r in rows] == [
+        ("t0", "arm", 0, 12, "psnr"), ("t0", "arm", 12, 5, "psnr"),
+        ("t0", "arm", 0, 12, "cross_entropy"), ("t0", "arm", 12, 5, "cross_entropy"),
+    ]  # fmt: skip
 
 
 def test_a_damaged_table_is_named(tmp_path):
-    make_table().save(tmp_path / FILE)
+    make_table().save(tmp_path / FILE, "t0")
     whole = (tmp_path / FILE).read_bytes()
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    foreign = gzip.compress(b"a,b,c\n1,2,3\n")
-    for content in (b"", b"csv", whole[:-20], bytes(flipped), foreign):
+    for content in (b"", b"csv", whole[:-20], flipped(whole, 100)):
         (tmp_path / FILE).write_bytes(content)
         with pytest.raises(ConfigError, match=f"{FILE}: no table of windows can be read"):
             WindowTable.load(tmp_path / FILE)
+    (tmp_path / FILE).unlink()
     with pytest.raises(ConfigError, match="no table"):
-        WindowTable.load(tmp_path / "absent")
+        WindowTable.load(tmp_path / FILE)
+    (tmp_path / "windows.csv.gz").touch()
+    with pytest.raises(ConfigError, match="windows.csv.gz beside it is of an earlier version"):
+        WindowTable.load(tmp_path / FILE)
+
+
+def flipped(content: bytes, at: int) -> bytes:
+    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+
+
+def test_no_flipped_bit_gives_other_numbers(tmp_path):
+    table = make_table()
+    table.save(tmp_path / FILE, "t0")
+    whole, refused = (tmp_path / FILE).read_bytes(), 0
+    places = range(0, len(whole), 17)
+    for at in places:
+        (tmp_path / FILE).write_bytes(flipped(whole, at))
+        try:
+            again = WindowTable.load(tmp_path / FILE)
+        except ConfigError:
+            refused += 1
+            continue
+        assert again.names == table.names and list(again.metrics) == list(table.metrics)
+        for metric, column in table.metrics.items():
+            np.testing.assert_array_equal(again.metrics[metric], column)
+    assert refused > len(places) / 2
+
+
+def test_a_table_whose_metrics_are_of_different_windows_is_refused(tmp_path):
+    long = make_table().to_arrow("t0")
+    moved = long.set_column(2, "episode", pa.array(np.r_[7, long["episode"].to_numpy()[1:]], pa.int32()))
+    for table, why in (
+        (moved, "cross_entropy is of other windows than psnr"),
+        (long.slice(0, len(long) - 1), "of other windows"),
+        (long.drop_columns(["frames"]), "frames"),
+        (pa.concat_tables([long, make_table().to_arrow("t1")]), "no trial, or several"),
+    ):
+        pq.write_table(table, tmp_path / FILE)
+        with pytest.raises(ConfigError, match=f"no table of windows can be read .*{why}"):
+            WindowTable.load(tmp_path / FILE)
 
 
 def test_all_means_follow_from_the_table():
@@ -104,6 +154,9 @@ def test_other_windows_or_other_datasets_are_not_compared():
     a = make_table()
     with pytest.raises(ConfigError, match=r"only one of two evaluations has window \('arm', 0, 0\) \(and 1 others\)"):
         paired_difference(a, a.rows(np.arange(2, len(a))), 1)
+    twice = a.rows(np.r_[0, np.arange(len(a) - 1)])
+    with pytest.raises(ConfigError, match=r"a window stands twice in an evaluation: \('arm', 0, 0\)"):
+        paired_difference(a, twice, 1)
     with pytest.raises(ConfigError, match="without a common dataset"):
         paired_difference(a, make_table("base"), 1)
     with pytest.raises(ConfigError, match="no windows"):

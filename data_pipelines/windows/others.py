@@ -1,0 +1,84 @@
+"""Other episodes' actions for a frozen window: what a model is shown in place of the true ones.
+
+They come from the same robot and from other episodes than the window's own, held-out ones as far as there are
+enough, and cover every real frame of the window: each sequence is one that the robot was given, whole.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from data_pipelines.sampling.order import hash64, stream_seed
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.cut import Cut
+from data_pipelines.windows.windows import TO_TRAIN, WindowSet, train_windows, val_windows
+
+KEPT = 512
+"""Episodes whose actions are kept in memory."""
+
+
+class Other(NamedTuple):
+    """A window of another episode: its split, its position there, and its start in stored frames."""
+
+    split: str
+    episode: int
+    start: int
+
+
+class OtherWindows:
+    """Chooses, by hash of the window's name alone, and reads the actions of what was chosen."""
+
+    def __init__(self, store: TokenStore, cuts: dict[str, Cut], frames: int, rate: float | None, seed: int):
+        self._store, self._cuts, self._frames, self._rate, self._seed = store, cuts, frames, rate, seed
+        self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray]] = {}
+        self._actions = lru_cache(KEPT)(lambda name, split, i: store.episode(name, split, i))
+
+    def choose(self, name: str, episode: int, start: int, count: int) -> list[Other]:
+        """Up to `count`, as many as there are, for the held-out window at `start` of `episode` (position in the store).
+
+        One of every other held-out episode before a second one of any; then, where these are too few, of training
+        episodes. A longer list begins with the shorter one.
+        """
+        own = int(self._store.manifest(name).val.episodes[episode])
+        steps = int(self._store.manifest(name).val.steps[episode])
+        cut = self._cuts[name]
+        real = int(cut.longest(steps - start * cut.frame_step))
+        seed = stream_seed(self._seed, "other actions", name, own, start)
+        found: list[Other] = []
+        for split in ("val", "train"):
+            if len(found) < count:
+                found += self._of(name, split, real, seed, episode if split == "val" else -1)[: count - len(found)]
+        return found
+
+    def actions(self, name: str, others: Sequence[Other], width: int) -> np.ndarray:
+        """float32 [n, T, U = width]: the chunks of each, as `Cut.actions` cuts them."""
+        cut = self._cuts[name]
+        chunks = [cut.actions(self._actions(name, o.split, o.episode), o.start, width) for o in others]
+        return np.stack(chunks) if chunks else np.zeros((0, self._frames, width), np.float32)
+
+    def _of(self, name: str, split: str, real: int, seed: int, own: int) -> list[Other]:
+        """All windows of at least `real` frames that are not of episode `own`, in the order of choice."""
+        windows, of_window = self._windows(name, split)
+        at = np.flatnonzero((of_window >= real) & (windows.episode_idx != own))
+        episode, h = windows.episode_idx[at], hash64(at, stream_seed(seed, split))
+        by_episode = np.lexsort((h, episode))
+        first = np.searchsorted(episode[by_episode], episode[by_episode])  # where each one's episode begins
+        rank = np.empty(len(at), np.int64)
+        rank[by_episode] = np.arange(len(at)) - first
+        return [Other(split, *windows.locate(int(i))) for i in at[np.lexsort((h, rank))]]
+
+    def _windows(self, name: str, split: str) -> tuple[WindowSet, np.ndarray]:
+        """The windows of a split, and the real frames of each."""
+        if (name, split) not in self._sets:
+            if split == "val":
+                found = val_windows(self._store, name, self._frames, min(TO_TRAIN, self._frames), rate=self._rate)
+            else:
+                found = train_windows(self._store, name, self._frames, rate=self._rate)
+            steps = np.asarray(self._store.manifest(name).split(split).steps, np.int64)[found.episode_idx]
+            real = found.cut.longest(steps - found.start.astype(np.int64) * found.cut.frame_step)
+            self._sets[name, split] = found, np.asarray(real)
+        return self._sets[name, split]

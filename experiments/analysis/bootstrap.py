@@ -1,0 +1,190 @@
+"""Resampling over seeds and episodes: the error of a result that several seeds were judged for on the same windows.
+
+Seeds and episodes are crossed: every seed sees every episode. Both are drawn again, independently, the episodes
+within each robot (Owen 2007, "The pigeonhole bootstrap", Annals of Applied Statistics 1: never too small an error
+for crossed effects, a little too large one where a seed and an episode interact). Of n one draws n - 1 with
+replacement, which makes the variance of a mean unbiased also for three seeds (Rao and Wu 1988, "Resampling
+inference with complex survey data", JASA 83); drawing n would give two thirds of it. The robots are fixed.
+
+All points of a curve are judged on the same windows: one draw takes the same episodes at every point, and the same
+seeds wherever two points have seeds of the same names, so that differences between points, and fits, are paired.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.analysis.intervals import LEVEL, Interval, critical
+from experiments.analysis.paired import NotComparable, require_same_windows
+from hma_jax.config import require
+from hma_jax.evaluation.windows import WindowTable
+
+DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One metric of n windows: for each point of a curve a row per seed, [seeds, n]."""
+
+    robot: np.ndarray  # str [n]
+    episode: np.ndarray  # int [n]: number within the robot
+    points: tuple[np.ndarray, ...]  # float64 [seeds of the point, n]
+    seeds: tuple[tuple[int, ...], ...]  # of each point, in the order of its rows
+
+    def __post_init__(self):
+        require(len(self.points) == len(self.seeds) > 0, "a panel needs points, and the seeds of each")
+        for values, seeds in zip(self.points, self.seeds, strict=True):
+            require(len(set(seeds)) == len(seeds) > 0, f"seeds repeat, or there are none: {seeds}")
+            require(
+                values.shape == (len(seeds), len(self.robot)) and len(self.robot) == len(self.episode) > 0,
+                f"{len(seeds)} seeds of {len(self.robot)} windows do not have values of shape {values.shape}",
+            )
+
+    def minus(self, other: Panel) -> Panel:
+        """Point by point and window by window, over the seeds that both have: a panel of differences.
+
+        Raises NotComparable for other windows, and for points without a common seed.
+        """
+        same = np.array_equal(self.robot, other.robot) and np.array_equal(self.episode, other.episode)
+        if not same or len(self.points) != len(other.points):
+            raise NotComparable("panels of different windows or points cannot be subtracted")
+        points, names = [], []
+        for mine, own, theirs, foreign in zip(self.points, self.seeds, other.points, other.seeds, strict=True):
+            shared = tuple(s for s in own if s in foreign)
+            if not shared:
+                raise NotComparable(f"seeds {own} and {foreign} have none in common; run the same seeds of both")
+            points.append(mine[[own.index(s) for s in shared]] - theirs[[foreign.index(s) for s in shared]])
+            names.append(shared)
+        return Panel(self.robot, self.episode, tuple(points), tuple(names))
+
+
+def make_panel(points: Sequence[dict[int, WindowTable]], metric: str, robots: Sequence[str] | None = None) -> Panel:
+    """From {seed: table} of each point, on `robots` (None: those of the first table).
+
+    Raises NotComparable, naming the first window that differs, unless all saw the same windows of them.
+    """
+    first = next(iter(points[0].values()))
+    chosen = first.datasets if robots is None else tuple(robots)
+    first = first.rows(np.flatnonzero(np.isin(first.dataset, chosen)))
+    lacking = [name for name in chosen if name not in first.datasets]
+    if lacking:
+        raise NotComparable(f"not judged: {', '.join(lacking)}")
+
+    def values(table: WindowTable) -> np.ndarray:
+        shared = require_same_windows(first, table)
+        if len(shared) < len(chosen):
+            raise NotComparable(f"not judged in every trial: {', '.join(sorted(set(chosen) - set(shared)))}")
+        own = table.rows(np.flatnonzero(np.isin(table.dataset, chosen))).matched_to(first)
+        require(metric in own.metrics, f"a trial has no {metric}; it has {', '.join(own.metrics)}")
+        return own.metrics[metric]
+
+    rows = tuple(np.stack([values(table) for table in seeds.values()]) for seeds in points)
+    return Panel(first.dataset, first.episode, rows, tuple(tuple(seeds) for seeds in points))
+
+
+@dataclass(frozen=True)
+class Draws:
+    """What resampling makes of each point: `value` [points] as measured, `drawn` [draws, points]."""
+
+    value: np.ndarray
+    drawn: np.ndarray
+
+
+def resample(
+    panel: Panel, draws: int = DRAWS, seed: int = 0, *, over_seeds: bool = True, over_episodes: bool = True
+) -> Draws:
+    """The mean over robots of each point, as measured and in `draws` resamples; a pure function of its arguments.
+
+    A point of one seed keeps it: its draws say nothing of seeds. A robot of one episode cannot be resampled; it
+    takes the deviation of another robot, drawn anew each time and scaled to one episode, as `stratified` does.
+    """
+    rng = np.random.default_rng(seed)
+    sums, counts, ends = _by_episode(panel)
+    value = _mean_of_robots(sums, counts, ends)  # [all seeds of all points]
+    drawn = _resample_episodes(sums, counts, ends, draws, rng) if over_episodes else np.tile(value, (draws, 1))
+    weights: dict[tuple[int, ...], np.ndarray] = {}
+    found, points, at = [], [], 0
+    for seeds in panel.seeds:
+        own = slice(at, at + len(seeds))
+        at += len(seeds)
+        if seeds not in weights:
+            equal = np.full((draws, len(seeds)), 1 / len(seeds))
+            weights[seeds] = _weights(len(seeds), draws, rng) if over_seeds else equal
+        found.append((weights[seeds] * drawn[:, own]).sum(1))
+        points.append(value[own].mean())
+    return Draws(np.asarray(points), np.stack(found, axis=1))
+
+
+def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0, level: float = LEVEL) -> list[Interval]:
+    """For each point the mean, the standard deviation of its draws, and an interval.
+
+    The interval joins those of the two levels resampled alone, each with its own Student's t: half its width squared
+    is (t sem)^2 of the seeds plus (t sem)^2 of the episodes (the method of variance estimates recovery; Zou and Donner
+    2008, Statistics in Medicine 27). Three seeds that happen to agree then make no interval narrow, as one from the
+    quantiles of the draws would be.
+    """
+    both, by_seed, by_episode = (
+        resample(panel, draws, seed, over_seeds=s, over_episodes=e).drawn.std(0, ddof=1)
+        for s, e in ((True, True), (True, False), (False, True))
+    )
+    sums, _, ends = measured = _by_episode(panel)
+    episodes, value, found, at = sums.shape[1], _mean_of_robots(*measured), [], 0
+    t_episode = critical(episodes - len(ends), level)  # nan, as the interval, if no robot has two episodes
+    for i, seeds in enumerate(panel.seeds):
+        mean = float(value[at : at + len(seeds)].mean())
+        at += len(seeds)
+        t_seed = critical(len(seeds) - 1, level) if len(seeds) > 1 else 0.0
+        half = math.hypot(t_seed * by_seed[i], t_episode * by_episode[i])
+        sem = float(both[i]) if episodes > len(ends) else math.nan
+        found.append(Interval(mean, sem, mean - half, mean + half, len(panel.robot), episodes))
+    return found
+
+
+def _by_episode(panel: Panel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(sums of values [all seeds, episodes], windows [episodes], where each robot's episodes end [robots])."""
+    robots = list(dict.fromkeys(panel.robot.tolist()))
+    code = np.asarray([robots.index(r) for r in panel.robot.tolist()])
+    names, which = np.unique(np.stack([code, panel.episode]), axis=1, return_inverse=True)
+    values, episodes = np.concatenate(panel.points), names.shape[1]
+    sums = np.stack([np.bincount(which.ravel(), weights=row, minlength=episodes) for row in values])
+    counts = np.bincount(which.ravel(), minlength=episodes).astype(np.float64)
+    return sums, counts, np.cumsum(np.bincount(names[0], minlength=len(robots)))
+
+
+def _mean_of_robots(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    starts = np.r_[0, ends[:-1]]
+    return (np.add.reduceat(sums, starts, axis=1) / np.add.reduceat(counts, starts)).mean(1)
+
+
+def _resample_episodes(
+    sums: np.ndarray, counts: np.ndarray, ends: np.ndarray, draws: int, rng: np.random.Generator
+) -> np.ndarray:
+    """[draws, all seeds]: the mean over robots, of which each has other episodes in every draw."""
+    means, known, alone = [], [], []
+    for start, end in zip(np.r_[0, ends[:-1]], ends, strict=True):
+        own_sums, own_counts = sums[:, start:end], counts[start:end]
+        measured = own_sums.sum(1) / own_counts.sum()
+        if end - start == 1:
+            alone.append(len(means))
+            means.append(np.tile(measured, (draws, 1)))
+            continue
+        weight = _weights(end - start, draws, rng)
+        drawn = weight @ own_sums.T / (weight @ own_counts)[:, None]
+        known.append((drawn - measured) * math.sqrt(end - start))  # of one episode
+        means.append(drawn)
+    if known:
+        deviations = np.stack(known)
+        for i in alone:
+            means[i] = means[i] + deviations[rng.integers(len(known), size=draws), rng.permutation(draws)]
+    return np.mean(means, axis=0)
+
+
+def _weights(n: int, draws: int, rng: np.random.Generator) -> np.ndarray:
+    """[draws, n], rows of sum 1: how often each is among n - 1 drawn with replacement; one alone is always drawn."""
+    if n == 1:
+        return np.ones((draws, 1))
+    return rng.multinomial(n - 1, np.full(n, 1 / n), size=draws) / (n - 1)

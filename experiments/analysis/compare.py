@@ -1,0 +1,120 @@
+"""Two models, or two studies' reference models over their seeds, on the windows that both saw.
+
+Differences are paired window by window. With one seed on either side the error is clustered by episode (`intervals`),
+with several it is over seeds and episodes (`bootstrap`), seeds of one name paired.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel
+from experiments.analysis.intervals import NATS, OVERALL, Interval, interval_of, nats_first, overall
+from experiments.analysis.paired import OF_TOKENS, TRUTH, NotComparable, require_same_windows
+from hma_jax.evaluation.statistics import mean_and_sem
+from hma_jax.evaluation.windows import WindowTable
+
+NOT_OF_MODELS = (TRUTH, "counterfactual_copy", "retrieval_chance")
+"""Metrics of the windows alone."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """What is compared: {seed: every window's numbers} of one model, and the tokens that it was judged on."""
+
+    name: str
+    seeds: Mapping[int, WindowTable]
+    tokenizer: str  # "": nobody knows
+
+
+@dataclass(frozen=True)
+class Difference:
+    """a - b of one metric, over one robot or all, with its interval; of nats also the ratio of perplexities."""
+
+    scope: str  # a robot, or OVERALL
+    metric: str
+    a: float
+    b: float
+    mean: float
+    sem: float
+    low: float
+    high: float
+    errors: float  # standard errors from zero
+    seeds: int
+    n: int
+    episodes: int
+    ratio: float = float("nan")  # exp(mean): the perplexity of a over that of b
+    ratio_low: float = float("nan")
+    ratio_high: float = float("nan")
+
+
+def compare(a: Side, b: Side) -> list[Difference]:
+    """Every metric, nats first, overall and by robot, of the robots that both were judged on.
+
+    Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things.
+    Raises NotComparable, naming the first window that differs.
+    """
+    pairs = _pairs(a, b)
+    first = pairs[0][0]
+    robots = require_same_windows(first, pairs[0][1])
+    shared = [m for m in first.metrics if all(m in table.metrics for pair in pairs for table in pair)]
+    foreign = OF_TOKENS if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer else ()
+    found = []
+    for metric in nats_first(m for m in shared if m not in (*foreign, *NOT_OF_MODELS)):
+        panels = [make_panel([dict(enumerate(side))], metric, robots) for side in zip(*pairs, strict=True)]
+        found += _of_metric(metric, *panels)
+    return found
+
+
+def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
+    """Of one seed each, whichever these are, or of all seeds that both have."""
+    if len(a.seeds) == len(b.seeds) == 1:
+        return [(*a.seeds.values(), *b.seeds.values())]
+    shared = [seed for seed in a.seeds if seed in b.seeds]
+    if not shared:
+        raise NotComparable(
+            f"{a.name} has seeds {', '.join(map(str, a.seeds))} and {b.name} {', '.join(map(str, b.seeds))}: none in "
+            "common"
+        )
+    return [(a.seeds[seed], b.seeds[seed]) for seed in shared]
+
+
+def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
+    """Over the windows that have it, of which there may be none."""
+    there = ~np.isnan(np.concatenate([*a.points, *b.points])).any(0)
+    robots = list(dict.fromkeys(a.robot[there].tolist()))
+    chosen = [(robot, there & (a.robot == robot)) for robot in robots]
+    if not robots:
+        return []
+    rows = [(OVERALL, there), *chosen] if len(robots) > 1 else chosen
+    return [_difference(scope, metric, _rows(a, index), _rows(b, index)) for scope, index in rows]
+
+
+def _difference(scope: str, metric: str, a: Panel, b: Panel) -> Difference:
+    interval = _interval(a.minus(b))
+    robots = dict.fromkeys(a.robot.tolist())
+    means = (float(np.mean([p.points[0][:, p.robot == robot].mean() for robot in robots])) for p in (a, b))
+    ratio = interval.exp() if metric in NATS[:1] else None
+    return Difference(
+        scope, metric, *means, interval.mean, interval.sem, interval.low, interval.high, interval.errors,
+        len(a.seeds[0]), interval.n, interval.episodes, *((ratio.mean, ratio.low, ratio.high) if ratio else ()),
+    )  # fmt: skip
+
+
+def _interval(panel: Panel) -> Interval:
+    """Of one point: in closed form where there is one seed."""
+    if len(panel.seeds[0]) > 1:
+        return bootstrap_intervals(panel)[0]
+    values = panel.points[0][0]
+    stats = [
+        mean_and_sem(values[panel.robot == robot], panel.episode[panel.robot == robot])
+        for robot in dict.fromkeys(panel.robot.tolist())
+    ]
+    return overall(stats) if len(stats) > 1 else interval_of(stats[0])
+
+
+def _rows(panel: Panel, index: np.ndarray) -> Panel:
+    return Panel(panel.robot[index], panel.episode[index], tuple(p[:, index] for p in panel.points), panel.seeds)

@@ -1,0 +1,88 @@
+"""Per robot, whether a model follows actions, beside how much there is to follow.
+
+One row per robot and metric: the mean with its interval over episodes and, where several seeds were judged, over
+these (`bootstrap`), how many standard errors it is from what a deaf model has, and what share of the change of this
+robot's pixels its actions explain in truth (`experiments.suite.explained`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.paired import require_same_windows
+from experiments.suite.explained import read_table
+from hma_jax.config import require
+from hma_jax.evaluation.windows import WindowTable
+
+METRICS = ("delta_psnr", "action_nats", "retrieval", "counterfactual_gain")
+"""What a deaf model has none of; of retrieval, more than chance."""
+
+ENOUGH = 2.0
+"""Standard errors beyond which a robot is counted."""
+
+
+@dataclass(frozen=True)
+class Controlled:
+    """A line of the table; `mean` less `deaf` is `errors` standard errors from zero."""
+
+    robot: str
+    metric: str
+    mean: float
+    sem: float
+    low: float
+    high: float
+    deaf: float  # of a model that is deaf to actions: 0, or the chance of retrieval
+    errors: float
+    seeds: int
+    n: int
+    episodes: int
+    explained: float = float("nan")  # share of the change of its pixels that actions decide; nan: nobody measured
+
+
+def controllability(seeds: dict[int, WindowTable]) -> list[Controlled]:
+    """Of one model under several seeds, {seed: table}: every robot that has the metric, in the order of the tables.
+
+    Raises NotComparable unless all seeds saw the same windows.
+    """
+    require(len(seeds) > 0, "no trial to take controllability from")
+    first, truth, rows = next(iter(seeds.values())), read_table(), []
+    matched = {}
+    for seed, table in seeds.items():
+        require_same_windows(first, table)
+        matched[seed] = table.matched_to(first)
+    for robot in first.datasets:
+        own = {seed: table.of(robot) for seed, table in matched.items()}
+        share = truth[robot].share if robot in truth else float("nan")
+        for metric in METRICS:
+            if all(metric in table.metrics for table in own.values()):
+                rows += _row(robot, metric, own, share)
+    return rows
+
+
+def beyond(rows: Iterable[Controlled], metric: str, errors: float = ENOUGH) -> tuple[int, int]:
+    """(robots whose metric is more than `errors` standard errors above that of a deaf model, robots that have it)."""
+    own = [row for row in rows if row.metric == metric]
+    return sum(row.errors > errors for row in own), len(own)
+
+
+def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float) -> Sequence[Controlled]:
+    values = np.stack([table.metrics[metric] for table in tables.values()])
+    there = ~np.isnan(values).any(0)
+    if not there.any():
+        return ()
+    first = next(iter(tables.values()))
+    deaf = float(np.mean(first.metrics["retrieval_chance"][there])) if metric == "retrieval" else 0.0
+    panel = Panel(first.dataset[there], first.episode[there], (values[:, there],), (tuple(tables),))
+    (found,) = bootstrap_intervals(panel)
+    away = found.mean - deaf
+    errors = 0.0 if abs(away) < 1e-7 else away / found.sem if found.sem else float(np.copysign(np.inf, away))
+    return (
+        Controlled(
+            robot, metric, found.mean, found.sem, found.low, found.high, deaf, errors, len(tables), found.n,
+            found.episodes, share,
+        ),
+    )  # fmt: skip

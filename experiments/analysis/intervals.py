@@ -1,0 +1,107 @@
+"""Means with intervals: clustered by episode within a robot, all robots counting equally over them.
+
+Standard errors are `hma_jax.evaluation.statistics.stat_of`: cluster-robust over episodes (Cameron and Miller 2015,
+"A Practitioner's Guide to Cluster-Robust Inference", for a regression on a constant, with G / (G - 1)). Intervals
+take Student's t with G - 1 degrees of freedom for G episodes (ibid., section VI), and for the mean over robots as
+many as Satterthwaite 1946 approximates for a sum of variances that are themselves estimated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from scipy.special import stdtrit
+
+from hma_jax.evaluation.statistics import Stat, stratified
+from hma_jax.evaluation.summary import Summary
+
+OVERALL = "overall"
+"""The scope that averages over all robots, each counting equally."""
+
+LEVEL = 0.95
+
+NATS = ("cross_entropy", "diffusion_loss", "action_nats")
+"""Metrics in nats per token (the diffusion loss in its own unit), which come first in every table."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean with its standard error and the interval that holds the truth in `LEVEL` of all samples.
+
+    nan where there is no telling: with one episode, nobody knows how episodes differ.
+    """
+
+    mean: float
+    sem: float
+    low: float
+    high: float
+    n: int = 0  # windows
+    episodes: int = 0  # that they are of
+
+    @property
+    def errors(self) -> float:
+        """How many standard errors the mean is from zero; 0 where it is zero exactly, nan for an unknown error."""
+        if self.mean == 0:
+            return 0.0
+        return self.mean / self.sem if self.sem else math.copysign(math.inf, self.mean)
+
+    def exp(self) -> Interval:
+        """Of exp(x), the interval transformed: perplexity beside nats, a ratio of perplexities beside a difference of
+        nats. The standard error is by the delta method, sem exp(mean)."""
+        mean = _exp(self.mean)
+        return Interval(mean, self.sem * mean, _exp(self.low), _exp(self.high), self.n, self.episodes)
+
+
+def interval_of(stat: Stat, level: float = LEVEL) -> Interval:
+    """Of the mean over windows of one robot, t with as many degrees of freedom as episodes less one."""
+    return _around(stat, stat.clusters - 1, level)
+
+
+def overall(stats: Iterable[Stat], level: float = LEVEL) -> Interval:
+    """Of the mean over robots, each counting equally (`stratified`).
+
+    The robots are fixed: the interval is about other episodes of these robots, not about other robots. Degrees of
+    freedom: (sum v)^2 / sum(v^2 / (G - 1)) for the robots' variances v, over those with an error of their own.
+    """
+    stats = list(stats)
+    known = [(s.sem**2, s.clusters - 1) for s in stats if s.sem > 0]
+    total, squares = sum(v for v, _ in known), sum(v**2 / df for v, df in known)
+    return _around(stratified(stats), total**2 / squares if squares else math.inf, level)
+
+
+def intervals(summary: Summary, level: float = LEVEL) -> dict[str, dict[str, Interval]]:
+    """{scope: {metric: interval}} of every robot and, under `OVERALL`, of the mean over those that have the metric."""
+    found = {robot: {m: interval_of(s, level) for m, s in stats.items()} for robot, stats in summary.datasets.items()}
+    return {OVERALL: over_robots(summary.datasets, level)} | found
+
+
+def over_robots(robots: Mapping[str, Mapping[str, Stat]], level: float = LEVEL) -> dict[str, Interval]:
+    """Each metric over the robots that have it."""
+    metrics = dict.fromkeys(m for stats in robots.values() for m in stats)
+    return {m: overall((stats[m] for stats in robots.values() if m in stats), level) for m in metrics}
+
+
+def nats_first(metrics: Iterable[str]) -> list[str]:
+    """In the order in which tables show them."""
+    metrics = list(metrics)
+    return [m for m in NATS if m in metrics] + [m for m in metrics if m not in NATS]
+
+
+def critical(df: float, level: float = LEVEL) -> float:
+    """Standard errors on either side of a mean: the quantile of Student's t with `df` degrees of freedom."""
+    return float(stdtrit(min(df, 1e9), (1 + level) / 2)) if df > 0 else math.nan
+
+
+def _around(stat: Stat, df: float, level: float) -> Interval:
+    half = critical(df, level) * stat.sem
+    return Interval(stat.mean, stat.sem, stat.mean - half, stat.mean + half, stat.n, stat.episodes)
+
+
+def _exp(x: float) -> float:
+    """Infinite beyond what a float holds."""
+    try:
+        return math.exp(x)
+    except OverflowError:
+        return math.inf

@@ -1,0 +1,76 @@
+"""Differences between trials that saw the same windows, taken window by window.
+
+What makes a window hard for both models cancels: the error is that of the differences, clustered by episode
+(`hma_jax.evaluation.summary.paired_difference`; the paired t statistic of a stratified cluster sample). Trials are
+comparable if they have the same windows of a robot, with the same number of real frames and the same recorded
+images; anything else is refused.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from experiments.analysis.intervals import LEVEL, Interval, intervals
+from hma_jax.config import ConfigError
+from hma_jax.evaluation.summary import paired_difference
+from hma_jax.evaluation.windows import WindowTable
+
+TRUTH = "psnr_copy"
+"""Of the recorded images alone, whatever the model: equal for equal windows."""
+
+SAME = 1e-3
+"""dB by which two programs may differ on equal images."""
+
+OF_TOKENS = ("cross_entropy", "diffusion_loss", "accuracy", "action_nats", "perplexity", "perplexity_corpus")
+"""Metrics that are comparable within one tokenizer alone."""
+
+
+class NotComparable(ConfigError):
+    """Two trials were judged on different windows."""
+
+
+def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
+    """The robots that both have, in the order of `a`.
+
+    Raises NotComparable, naming the first window that differs, unless both saw the same windows of each.
+    """
+    shared = [name for name in a.datasets if name in b.datasets]
+    if not shared:
+        raise NotComparable(
+            f"no robot was judged in both: {', '.join(a.datasets[:4])}, ... and {', '.join(b.datasets[:4])}, ..."
+        )
+    for robot in shared:
+        try:
+            mine = a.of(robot)
+            theirs = b.of(robot).matched_to(mine)
+        except ConfigError as error:
+            raise NotComparable(f"{robot}: {error}") from error
+        _require_equal(mine, theirs, mine.frames, theirs.frames, "real frames", 0)
+        if TRUTH in mine.metrics and TRUTH in theirs.metrics:
+            _require_equal(mine, theirs, mine.metrics[TRUTH], theirs.metrics[TRUTH], f"dB of {TRUTH}", SAME)
+    return shared
+
+
+def paired(
+    a: WindowTable, b: WindowTable, perplexity_group: int, level: float = LEVEL
+) -> dict[str, dict[str, Interval]]:
+    """`a` minus `b`: {robot or OVERALL: {metric: interval}}, on the robots and metrics that both have.
+
+    Raises NotComparable.
+    """
+    shared = require_same_windows(a, b)
+    mine, theirs = (x.rows(np.flatnonzero(np.isin(x.dataset, shared))) for x in (a, b))
+    return intervals(paired_difference(mine, theirs, perplexity_group), level)
+
+
+def _require_equal(
+    a: WindowTable, b: WindowTable, mine: np.ndarray, theirs: np.ndarray, what: str, tolerance: float
+) -> None:
+    other = np.flatnonzero(~(np.abs(mine - theirs) <= tolerance))
+    if len(other):
+        robot, episode, start = a.names[other[0]]
+        raise NotComparable(
+            f"window ({robot}, episode {episode}, frame {start}) is not the same one in both: {mine[other[0]]:g} and "
+            f"{theirs[other[0]]:g} {what} (and {len(other) - 1} others of {robot}); compare trials of one frozen set of "
+            "windows, on the same data and with the same prompt"
+        )

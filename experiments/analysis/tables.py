@@ -1,0 +1,101 @@
+"""Per-window numbers of finished trials, read from their directories."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.analysis.compare import Side
+from experiments.running.job import read_job
+from experiments.running.provenance import Provenance, inputs_of
+from experiments.running.sealed import RESULT, read_result
+from experiments.running.trial import Trial, trial_id
+from experiments.running.workspace import Workspace, load_record
+from experiments.sweeps.sweep import reference_trial
+from hma_jax.config import ConfigError
+from hma_jax.evaluation.windows import FILE, WindowTable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A finished trial, what names it, and every window's numbers."""
+
+    id: str
+    trial: Trial
+    provenance: Provenance
+    windows: WindowTable
+
+    @property
+    def seed(self) -> int:
+        return self.trial.train.seed
+
+
+def read_trial(directory: Path) -> Judged:
+    """Raises ConfigError for a trial that is not finished, was changed, or kept no numbers of its windows."""
+    if not (directory / RESULT).exists():
+        raise ConfigError(f"{directory}: no finished trial (it has no {RESULT})")
+    read_result(directory)  # that its files are those it was sealed with
+    windows = WindowTable.load(directory / FILE)
+    try:
+        job = json.loads((directory / "job.json").read_text())
+        provenance = inputs_of(job["provenance"])
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(
+            f"{directory}: the finished trial does not say what it is ({error}). Copy it again from where it ran"
+        ) from error
+    return Judged(directory.name, read_job(job)[0], provenance, windows)
+
+
+def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, Judged]:
+    """The finished ones among `ids` (None: all in the directory), by id and sorted by it. Raises ConfigError."""
+    chosen = [p.name for p in trials.iterdir()] if ids is None else ids
+    return {id: read_trial(trials / id) for id in sorted(chosen) if (trials / id / RESULT).exists()}
+
+
+def long_table(trials: Iterable[Judged]) -> pa.Table:
+    """Windows of all trials in one table of the columns of `hma_jax.evaluation.windows`, for any other program."""
+    import pyarrow as pa
+
+    return pa.concat_tables([judged.windows.to_arrow(judged.id) for judged in trials]).unify_dictionaries()
+
+
+def read_side(path: Path) -> Side:
+    """What `hma compare` takes: a study (its reference trials, by seed), a finished trial, or an evaluated model.
+
+    Raises ConfigError for what is none of them, or whose trials have no result.
+    """
+    workspace = Workspace(path.absolute())
+    if workspace.record.exists():
+        record = load_record(workspace)
+        if record.provenance is None:
+            raise ConfigError(f"the study in {path} has not run yet; run `{record.command}`")
+        ids = {s: trial_id(reference_trial(record.study, s), record.provenance) for s in record.study.seeds}
+        found = read_trials(workspace.trials, ids.values()) if workspace.trials.is_dir() else {}
+        seeds = {seed: found[id].windows for seed, id in ids.items() if id in found}
+        if not seeds:
+            raise ConfigError(
+                f"{path}: no reference trial of this study ({', '.join(ids.values())}) is finished here; run "
+                f"`{record.command}`, or name two trials"
+            )
+        return Side(path.name, seeds, record.provenance.tokenizer)
+    if (path / RESULT).exists():
+        judged = read_trial(path)
+        return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer)
+    if (path / FILE).exists():
+        return Side(path.name, {0: WindowTable.load(path / FILE)}, _tokenizer_of(path))
+    raise ConfigError(f"{path}: neither a study, nor a finished trial, nor a model that was evaluated (no {FILE})")
+
+
+def _tokenizer_of(run: Path) -> str:
+    """Of a training run's latest checkpoint; "" where it does not say."""
+    from hma_jax.training.reading import list_steps, read_description
+
+    steps = list_steps(run / "checkpoints")
+    described = read_description(run / "checkpoints" / str(steps[-1])) if steps else {}
+    return described.get("provenance", {}).get("tokenizer", "")

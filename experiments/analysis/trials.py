@@ -1,0 +1,69 @@
+"""trials.parquet: a row per trial of a study, its configuration and its results, flat.
+
+Columns:
+
+    trial, title, status       its id, what tells it from the others, and a state of the ledger
+    config.*                   every setting by its dotted path ("config.train.optimizer.learning_rate"); lists as JSON
+    store, manifest, tokenizer, results     what it depends on (`experiments.running.provenance`)
+    parameters, train_flops, training_loss  the last is the mean over the last steps
+    <metric>, <metric>.sem     over all robots that it was judged on, each counting equally
+    windows, episodes, robots  that these are means over
+
+It holds nothing of clocks or machines: a study that was killed and resumed writes the same bytes. Results of a
+trial without one are null.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from data_pipelines.publishing.files import write_file
+from experiments.running.provenance import Provenance
+from experiments.running.trial import Trial
+from hma_jax.config.json import to_dict
+from hma_jax.evaluation.summary import Summary
+
+
+def trial_row(
+    id: str, title: str, status: str, trial: Trial, provenance: Provenance, result: dict[str, Any] | None, loss: float
+) -> dict[str, Any]:
+    """One row; `result` is that of result.json (None: there is none), `loss` its training loss."""
+    row = {"trial": id, "title": title, "status": status}
+    row |= {f"config.{path}": value for path, value in _flat(to_dict(trial))}
+    row |= dataclasses.asdict(provenance)
+    if result is None:
+        return row
+    summary = Summary.from_dict(result["evaluation"])
+    row |= {"parameters": result["parameters"], "train_flops": result["train_flops"], "training_loss": loss}
+    row["robots"] = len(summary.datasets)
+    for metric, stat in summary.overall.items():
+        row |= {metric: stat.mean, f"{metric}.sem": stat.sem}
+        row["windows"], row["episodes"] = max(row.get("windows", 0), stat.n), max(row.get("episodes", 0), stat.episodes)
+    return row
+
+
+def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:
+    """Writes the rows, which need not have the same columns; whole or not at all."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = list(rows)
+    columns = dict.fromkeys(name for row in rows for name in row)
+    table = pa.table({name: [row.get(name) for row in rows] for name in columns})
+    content = io.BytesIO()
+    pq.write_table(table, content, compression="zstd", write_page_checksum=True)
+    write_file(path, content.getvalue())
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    """(dotted path, value) of everything that is no group of settings."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, json.dumps(value) if isinstance(value, list | tuple) else value

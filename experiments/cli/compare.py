@@ -1,0 +1,76 @@
+"""`hma compare`: two models on the windows that both saw, window by window."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+from experiments.progress import console, tidy_table
+from experiments.wrote import wrote
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from experiments.analysis.compare import Difference, Side
+
+SHOWN = ("cross_entropy", "diffusion_loss", "action_nats", "psnr", "delta_psnr", "counterfactual_gain")
+"""Metrics in the table, as far as both have them; the CSV has all."""
+
+
+def compare(
+    a: Annotated[Positional[Path], arg(metavar="A")],
+    b: Annotated[Positional[Path], arg(metavar="B")],
+    to: Path = Path("comparison.csv"),
+) -> None:
+    """Compare two models, or the reference models of two studies, on the windows that both saw.
+
+    Prints A - B with standard errors, per robot and overall, nats per token first, and writes every metric with
+    its 95 % interval. Differences are paired window by window; errors count episodes and, between studies of several
+    seeds, seeds. Ends with exit code 2 if the two did not see the same windows.
+
+    Args:
+        a: Directory of a finished trial, of an evaluated model, or of a study.
+        b: The one it is compared with.
+        to: Where the CSV is written.
+    """
+    from experiments.analysis import compare as analysis
+    from experiments.analysis.tables import read_side
+    from experiments.rows import write_csv
+
+    first, second = read_side(a), read_side(b)
+    rows = analysis.compare(first, second)
+    console.print(_table(rows, first, second))
+    to.parent.mkdir(parents=True, exist_ok=True)
+    write_csv(to, analysis.Difference, rows)
+    wrote(to)
+
+
+def _table(rows: list[Difference], a: Side, b: Side) -> Table:
+    """A line per scope, overall first; differences of the shown metrics with their standard errors."""
+    metrics = [m for m in SHOWN if any(row.metric == m for row in rows)]
+    found = {(row.scope, row.metric): row for row in rows}
+    ratio = "cross_entropy" in metrics
+    columns = ["robot", *(f"{m} ({_unit(m)})" for m in metrics), *["perplexity"] * ratio]
+    table = tidy_table(f"{a.name} - {b.name}", *columns)
+    for scope in dict.fromkeys(row.scope for row in rows):
+        cells = [_cell(found.get((scope, metric))) for metric in metrics]
+        nats = found.get((scope, "cross_entropy"))
+        table.add_row(scope, *cells, *([f"x {nats.ratio:.4g}"] if nats else [""] * ratio))
+    several = max((row.seeds for row in rows), default=1)
+    seeds = f" and over {several} seeds" if several > 1 else ""
+    table.caption = f"Differences with standard errors over episodes{seeds}, window by window."
+    if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
+        table.caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
+    elif not (a.tokenizer and b.tokenizer):
+        table.caption += " Nats are comparable only if both saw the same tokens, which one of them does not say."
+    return table
+
+
+def _unit(metric: str) -> str:
+    return {"cross_entropy": "nats", "action_nats": "nats", "diffusion_loss": "loss"}.get(metric, "dB")
+
+
+def _cell(row: Difference | None) -> str:
+    return f"{row.mean:+.4f} ± {row.sem:.4f}" if row else ""

@@ -1,0 +1,107 @@
+"""The true frames of the suite's frozen windows under other episodes' actions (`data_pipelines.windows.truth`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from experiments.progress import step
+from experiments.running.workspace import Workspace
+from experiments.study import Study
+
+if TYPE_CHECKING:
+    from data_pipelines.suite.spec import EmbodimentSpec
+    from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.cut import Cut
+    from data_pipelines.windows.evalset import DatasetWindows
+    from data_pipelines.windows.others import OtherWindows
+
+
+def make_counterfactual(study: Study, workspace: Workspace) -> None:
+    """Simulates them, unless they are there for these windows and this prompt.
+
+    Robots whose dataset does not say their actions have none. Raises DataError if the simulator does not give back
+    what was recorded, under the recorded actions.
+    """
+    from data_pipelines.errors import DataError
+    from data_pipelines.suite.generate import select
+    from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.cut import make_cut
+    from data_pipelines.windows.evalset import EvalManifest
+    from data_pipelines.windows.others import OtherWindows
+    from data_pipelines.windows.truth import OtherTruth
+
+    store, manifest = TokenStore(workspace.store), EvalManifest.load(workspace.manifest)
+    prompt = study.eval.prompt_frames
+    if workspace.counterfactual.exists():
+        try:
+            there = OtherTruth.load(workspace.counterfactual)
+            if (there.manifest, there.prompt) == (manifest.hash(), prompt):
+                return
+        except DataError:  # it follows from what is here: made again
+            pass
+    cuts = {name: make_cut(store, name, manifest.frames, manifest.rate) for name in manifest.names}
+    others = OtherWindows(store, cuts, manifest.frames, manifest.rate, manifest.seed)
+    chosen = [d for d in manifest.datasets if d.windows and store.manifest(d.dataset).spec.action_dim]
+    frames = {}
+    with step(f"simulate {sum(len(d.windows) for d in chosen)} windows under other actions") as update:
+        for i, dataset in enumerate(chosen):
+            (spec,) = select([dataset.dataset])
+            frames[dataset.dataset] = _of_robot(spec, store, cuts[dataset.dataset], others, dataset, prompt, study)
+            update(i + 1, len(chosen), dataset.dataset)
+    OtherTruth(manifest.hash(), prompt, frames).save(workspace.counterfactual)
+
+
+def _of_robot(
+    spec: EmbodimentSpec,
+    store: TokenStore,
+    cut: Cut,
+    others: OtherWindows,
+    dataset: DatasetWindows,
+    prompt: int,
+    study: Study,
+) -> np.ndarray:
+    """uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros."""
+    from data_pipelines.errors import DataError
+    from data_pipelines.suite.counterfactual import frames_under
+
+    name, size = spec.name, study.tokenizer.image_size
+    own, changed, seeds, images = [], [], [], []
+    times, real = np.zeros((len(dataset.windows), cut.frames), np.int64), []
+    for row, (episode, start) in enumerate(dataset.windows):
+        item, first = store.episode(name, "val", episode), start * cut.frame_step
+        frames = cut.real(item, start)
+        (other,) = others.choose(name, episode, start, 1)
+        instead = store.episode(name, other.split, other.episode).actions
+        there = other.start * cut.frame_step
+        until, end = (prompt - 1) * cut.stride, (frames - 1) * cut.stride
+        own.append(item.actions)
+        changed.append(np.concatenate([item.actions[: first + until], instead[there + until : there + end]]))
+        times[row] = first + np.minimum(np.arange(cut.frames), frames - 1) * cut.stride
+        real.append(frames)
+        seeds.append(_seed_of(store, spec, item.episode, study.suite.seed))
+        images.append(cut.of_frames(item.frames, item, start))
+    valid = np.arange(cut.frames) < np.asarray(real)[:, None]
+    recorded = frames_under(spec, seeds, own, times, size) * valid[..., None, None, None]
+    if not np.array_equal(recorded, np.stack(images)):
+        raise DataError(
+            f"{name}: the simulator does not give back the recorded frames under the recorded actions; the suite was made "
+            "by another version of it. Make the suite again."
+        )
+    seen = frames_under(spec, seeds, changed, times, size) * valid[..., None, None, None]
+    return seen[:, prompt:].astype(np.uint8)
+
+
+def _seed_of(store: TokenStore, spec: EmbodimentSpec, number: int, seed: int) -> int:
+    """The seed of a held-out episode by its number in the source."""
+    from data_pipelines.suite.rollout import episode_seeds
+
+    before: dict[str, int] = {}
+    for run in store.manifest(spec.name).runs:
+        if number < run.count:
+            place = before.get(run.split, 0) + number
+            return int(episode_seeds(spec, place + 1, seed, run.split)[place])
+        number -= run.count
+        before[run.split] = before.get(run.split, 0) + run.count
+    raise IndexError(number)

@@ -1,0 +1,44 @@
+"""Tables of a study beside its CSV: its trials flat, and which robots its reference model follows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.running.attempts import State
+from experiments.running.ledger import FINISHED
+from experiments.running.sealed import read_result
+from experiments.running.trial import trial_id
+from experiments.running.workspace import Record, Workspace
+from experiments.sweeps.sweep import Sweep, reference_trial, titles, unique_trials
+
+if TYPE_CHECKING:
+    from experiments.running.provenance import Provenance
+
+
+def write_tables(
+    workspace: Workspace, record: Record, sweeps: Sequence[Sweep], states: Mapping[str, State], provenance: Provenance
+) -> list[Path]:
+    """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv."""
+    from experiments.analysis.controllability import Controlled, controllability
+    from experiments.analysis.tables import read_trials
+    from experiments.analysis.trials import trial_row, write_trials
+    from experiments.rows import last_loss, write_csv
+    from hma_jax.evaluation.windows import FILE
+
+    names, rows = titles(sweeps, provenance), []
+    for id, trial in unique_trials(sweeps, provenance).items():
+        state = states[id].event
+        result = read_result(workspace.trials / id) if state == FINISHED else None
+        loss = last_loss(result["losses"]).mean if result else 0.0
+        rows.append(trial_row(id, names[id], state, trial, provenance, result, loss))
+    write_trials(workspace.trial_table, rows)
+    ids = [trial_id(reference_trial(record.study, seed), provenance) for seed in record.study.seeds]
+    kept = [id for id in ids if (workspace.trials / id / FILE).exists()]
+    seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
+    found = controllability(dict(sorted(seeds.items()))) if seeds else []
+    if not found:
+        return [workspace.trial_table]
+    write_csv(workspace.controllability, Controlled, found)
+    return [workspace.trial_table, workspace.controllability]

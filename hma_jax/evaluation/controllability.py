@@ -1,0 +1,85 @@
+"""Whether a model's frames are those of the actions it is given, and not of any others.
+
+* action-nats: what the likelihood of the recorded frames loses when the actions are those of another episode of
+  the same robot, in nats per token (continuous: in units of the diffusion loss, at common noise). Paired, over all
+  tokens, and in distribution, where random actions of delta PSNR are none that the robot was ever given.
+* retrieval: how often the true actions give the recorded frames the highest likelihood among them and those of the
+  other episodes. Of sequences that are equally likely each is taken with equal chance: a model that is deaf to
+  actions finds the true ones one time in sixteen, exactly.
+* counterfactual PSNR: a rollout under another episode's actions against the true frames under those actions, where a
+  simulator made them. Its gain is over the rollout under the recorded actions, compared with the same frames: more
+  than zero only if the model goes where the other actions lead.
+
+Every sequence is judged by one program, one after the other, so that equal likelihoods are equal to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.evaluation.metrics import mean_over_frames, psnr
+
+OPTIONAL = (
+    "action_nats",
+    "retrieval",
+    "retrieval_rank",
+    "retrieval_chance",
+    "counterfactual_psnr",
+    "counterfactual_copy",
+    "counterfactual_gain",
+)
+"""Metrics that some windows have not (nan): there is no other episode, or nobody simulates their robot."""
+
+
+def under_each(
+    judge: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BNTU: jax.Array
+) -> dict[str, jax.Array]:
+    """`judge`, which maps actions [B, T, U] to numbers of each window [B], of the true ones and all others: [1 + N, B]."""
+    sequences = jnp.concatenate([actions_BTU[:, None], others_BNTU], axis=1)
+    return jax.lax.map(judge, jnp.moveaxis(sequences, 1, 0))
+
+
+def told_apart(loss_NB: jax.Array, valid_BN: jax.Array) -> dict[str, jax.Array]:
+    """Action-nats and retrieval, [B] each, nan where no other sequence is valid.
+
+    `loss_NB` [1 + N, B]: of the true actions, then of the others, of which those count that `valid_BN` says.
+    """
+    truth, others, valid = loss_NB[0], loss_NB[1:], valid_BN.T
+    count = jnp.sum(valid, axis=0)
+    some = count > 0
+    lost = jnp.sum(jnp.where(valid, others - truth, 0), axis=0) / jnp.maximum(count, 1)
+    better = jnp.sum(valid & (others < truth), axis=0)
+    equal = jnp.sum(valid & (others == truth), axis=0)
+    found = {
+        "action_nats": lost,
+        "retrieval": jnp.where(better == 0, 1 / (1 + equal), 0),
+        "retrieval_rank": 1 + better + equal / 2,
+        "retrieval_chance": 1 / (1 + count),
+    }
+    return {name: jnp.where(some, x, jnp.nan) for name, x in found.items()}
+
+
+def counterfactual(
+    shown: jax.Array,
+    other: jax.Array,
+    truth: jax.Array,
+    before: jax.Array,
+    seen_B: jax.Array,
+    real_BT: jax.Array | None,
+) -> dict[str, jax.Array]:
+    """Counterfactual PSNR, that of copying, and the gain, [B] each, nan where not `seen_B`.
+
+    Images uint8 [B, n, H, W, 3] after the prompt: made under the recorded actions (`shown`), under the `other` ones,
+    and the `truth` under those; `before` [B, 1, H, W, 3] is the last of the prompt. Over frames that are `real_BT`.
+    """
+    made = jnp.stack([other, shown], axis=1)  # in one array: equal images get equal numbers, to the last bit
+    of_frames = jax.lax.optimization_barrier(psnr(made, jnp.broadcast_to(truth[:, None], made.shape)))
+    found = {
+        "counterfactual_psnr": mean_over_frames(of_frames[:, 0], real_BT),
+        "counterfactual_copy": mean_over_frames(psnr(jnp.broadcast_to(before, truth.shape), truth), real_BT),
+        "counterfactual_gain": mean_over_frames(of_frames[:, 0] - of_frames[:, 1], real_BT),
+    }
+    return {name: jnp.where(seen_B, x, jnp.nan) for name, x in found.items()}

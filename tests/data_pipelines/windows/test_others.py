@@ -1,0 +1,115 @@
+"""Other episodes' actions for a window, and what would have been seen under them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_pipelines.errors import DataError
+from data_pipelines.windows.evalset import eval_batches, freeze_manifest
+from data_pipelines.windows.truth import OtherTruth
+from hma_jax.config import ConfigError
+from tests.data_pipelines.windows.test_evalset import small_store
+
+
+def batches(store, count: int, prompt: int | None = None, **options):
+    """(frozen windows, the one batch of all of them)."""
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=prompt)
+    table = store.embodiment_table(store.names)
+    (batch,) = eval_batches(store, table, frozen, sum(len(d.windows) for d in frozen.datasets), others=count, **options)
+    return frozen, batch
+
+
+def episodes_and_steps(batch):
+    """What each other sequence's actions say where they are from: episode and step of every frame, int [B, N, T] each."""
+    return (batch["other_actions"][..., i].astype(int) for i in (0, 1))
+
+
+def test_they_are_whole_sequences_of_other_episodes(tmp_path):
+    store = small_store(tmp_path, lengths=(20,) * 16, min_val=8, max_val_fraction=0.5)
+    _, batch = batches(store, 7)
+    episode, step = episodes_and_steps(batch)
+    assert batch["other_valid"].all() and batch["other_actions"].shape == (len(batch["tokens"]), 7, 4, 3)
+    assert (episode == episode[..., :1]).all() and (np.diff(step, axis=-1) == 1).all()
+    held_out = set(store.manifest("toy").val.episodes)
+    for own, others in zip(batch["episode"].tolist(), episode[..., 0].tolist(), strict=True):
+        assert set(others) == held_out - {own}  # one of each of the seven
+
+
+def test_a_window_has_the_same_ones_in_any_batch_and_a_longer_list_begins_with_the_shorter(tmp_path):
+    store = small_store(tmp_path, lengths=(20,) * 8, min_val=4, max_val_fraction=0.5)
+    frozen, five = batches(store, 5)
+    _, nine = batches(store, 9)
+    np.testing.assert_array_equal(five["other_actions"], nine["other_actions"][:, :5])
+    for row, single in enumerate(eval_batches(store, store.embodiment_table(("toy",)), frozen, 1, others=5)):
+        np.testing.assert_array_equal(single["other_actions"][0], five["other_actions"][row])
+    assert len(np.unique(five["other_actions"], axis=0)) > 1  # not the same for all windows
+
+
+def test_more_are_taken_from_episodes_once_each_has_given_one_then_from_training(tmp_path):
+    """Two episodes held out, each of three windows: one other episode gives three, training the rest."""
+    store = small_store(tmp_path, lengths=(6,) * 8, min_val=2, max_val_fraction=0.25)
+    _, batch = batches(store, 5)
+    episode, step = episodes_and_steps(batch)
+    held_out = set(store.manifest("toy").val.episodes)
+    for row, own in enumerate(batch["episode"].tolist()):
+        (other,) = held_out - {own}
+        assert episode[row, :3, 0].tolist() == [other] * 3 and sorted(step[row, :3, 0].tolist()) == [0, 1, 2]
+        assert not set(episode[row, 3:, 0].tolist()) & held_out
+
+
+def test_fewer_than_asked_for_are_marked(tmp_path):
+    store = small_store(tmp_path, lengths=(4, 4), min_val=1)
+    _, batch = batches(store, 5)
+    assert batch["other_valid"].tolist() == [[True, False, False, False, False]]
+    assert not batch["other_actions"][0, 1:].any()
+
+
+def test_they_cover_every_real_frame_of_a_short_window(tmp_path):
+    """Episodes of three frames and of four: a whole window takes only whole ones."""
+    store = small_store(tmp_path, lengths=(3, 4) * 6, min_val=6, max_val_fraction=0.5)
+    _, batch = batches(store, 20, prompt=2)
+    _, step = episodes_and_steps(batch)
+    real = batch["real"].sum(1)
+    assert set(real.tolist()) == {3, 4}
+    for row, frames in enumerate(real.tolist()):
+        chosen = step[row][batch["other_valid"][row]]
+        assert len(chosen) > 0 and (chosen[:, :frames] == np.arange(frames)).all()
+
+
+# --- What would have been seen ----------------------------------------------------------------
+
+
+def truth_for(frozen, dataset: str = "toy") -> OtherTruth:
+    (windows,) = [d.windows for d in frozen.datasets if d.dataset == dataset]
+    frames = np.random.default_rng(0).integers(0, 255, (len(windows), 2, 8, 8, 3)).astype(np.uint8)
+    return OtherTruth(frozen.hash(), 2, {dataset: frames})
+
+
+def test_frames_under_other_actions_follow_the_prompt(tmp_path):
+    small_store(tmp_path, "arm")
+    store = small_store(tmp_path, "toy")
+    frozen = freeze_manifest(store, store.names, 4, 5, 0)
+    truth = truth_for(frozen)
+    truth.save(tmp_path / "t.npz")
+    before = (tmp_path / "t.npz").read_bytes()
+    truth.save(tmp_path / "t.npz")
+    assert (tmp_path / "t.npz").read_bytes() == before
+    _, batch = batches(store, 1, truth=OtherTruth.load(tmp_path / "t.npz"))
+    toy = np.asarray([name == "toy" for name in batch["dataset"]])
+    assert batch["other_seen"].tolist() == toy.tolist()
+    np.testing.assert_array_equal(batch["other_images"][:, :2], batch["images"][:, :2])
+    np.testing.assert_array_equal(batch["other_images"][toy, 2:], truth.frames["toy"])
+
+
+def test_frames_of_other_windows_or_damaged_ones_are_refused(tmp_path):
+    store = small_store(tmp_path)
+    frozen = freeze_manifest(store, store.names, 4, 5, 1)
+    with pytest.raises(ConfigError, match="made for other windows than those frozen here"):
+        batches(store, 1, truth=truth_for(frozen))
+    truth_for(frozen).save(tmp_path / "t.npz")
+    whole = (tmp_path / "t.npz").read_bytes()
+    for content in (b"", whole[:-30]):
+        (tmp_path / "t.npz").write_bytes(content)
+        with pytest.raises(DataError, match="t.npz: the frames under other actions cannot be read"):
+            OtherTruth.load(tmp_path / "t.npz")

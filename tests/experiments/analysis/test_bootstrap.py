@@ -1,0 +1,118 @@
+"""Resampling over seeds and episodes: of the right things, by the right amount, quickly."""
+
+import time
+
+import numpy as np
+import pytest
+
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel, resample
+from experiments.analysis.intervals import OVERALL, intervals
+from experiments.analysis.paired import NotComparable
+from hma_jax.config import ConfigError
+from hma_jax.evaluation.summary import summarise
+from tests.experiments.analysis.worlds import judged, under_seeds, with_loss
+
+LOSS = "cross_entropy"
+
+
+def three_seeds(seed: int, of_seed: float, **world) -> Panel:
+    rng = np.random.default_rng(seed)
+    return make_panel([under_seeds(judged(rng, **world), rng, 3, of_seed)], LOSS)
+
+
+@pytest.mark.parametrize(("of_seed", "episodes"), [(1.0, 12), (0.02, 6)])
+def test_intervals_hold_the_truth_whichever_level_scatters_most(of_seed, episodes):
+    """Of 200 studies, 95 in 100; one of the episodes alone only if seeds agree, one of windows never."""
+    both = alone = windows = 0
+    for seed in range(200):
+        panel = three_seeds(seed, of_seed, robots=2, episodes=episodes, each=3)
+        (interval,) = bootstrap_intervals(panel, draws=150, seed=seed)
+        both += interval.low < 0 < interval.high
+        fixed = resample(panel, 150, seed, over_seeds=False)
+        alone += abs(fixed.value[0]) < 1.96 * fixed.drawn.std()
+        flat = panel.points[0].ravel()
+        windows += abs(flat.mean()) < 1.96 * flat.std() / np.sqrt(len(flat))
+    assert 0.92 * 200 <= both <= 0.985 * 200
+    assert windows < 0.8 * 200 and (alone < 0.8 * 200) == (of_seed == 1.0)
+
+
+def test_without_a_scatter_of_seeds_it_is_the_clustered_error():
+    table = judged(np.random.default_rng(0), robots=4, episodes=10, each=3)
+    (interval,) = bootstrap_intervals(make_panel([{0: table}], LOSS), draws=20_000)
+    want = intervals(summarise(table, 1))[OVERALL][LOSS]
+    assert interval.mean == pytest.approx(want.mean) and interval.sem == pytest.approx(want.sem, rel=0.03)
+    assert (interval.n, interval.episodes) == (want.n, want.episodes) == (120, 40)
+
+
+def test_three_seeds_have_the_variance_of_their_mean_not_two_thirds_of_it():
+    table = judged(np.random.default_rng(0), episodes=5)
+    loss = table.metrics[LOSS]
+    seeds = {s: with_loss(table, loss + shift) for s, shift in enumerate((0.0, 1.0, 5.0))}
+    drawn = resample(make_panel([seeds], LOSS), 20_000, over_episodes=False).drawn
+    assert drawn.var() == pytest.approx(np.var([0, 1, 5], ddof=1) / 3, rel=0.05)
+
+
+def test_a_robot_of_one_episode_is_taken_to_scatter_as_the_others():
+    table = judged(np.random.default_rng(1), robots=3, episodes=6)
+    kept = table.rows(np.flatnonzero((table.dataset != "r2") | (table.episode == 100)))
+    (interval,) = bootstrap_intervals(make_panel([{0: kept}], LOSS), draws=20_000)
+    want = intervals(summarise(kept, 1))[OVERALL][LOSS]
+    assert interval.sem == pytest.approx(want.sem, rel=0.05)
+    assert interval.sem > 1.2 * bootstrap_intervals(make_panel([{0: table}], LOSS))[0].sem
+    (nothing,) = bootstrap_intervals(make_panel([{0: kept.of("r2")}], LOSS))
+    assert np.isnan(nothing.sem) and np.isnan(nothing.low)
+
+
+def test_permuted_episode_ids_change_the_error():
+    panel = three_seeds(3, 0.01, episodes=20, each=8, of_window=0.1)
+    tampered = Panel(panel.robot, np.random.default_rng(0).permutation(panel.episode), panel.points, panel.seeds)
+    honest, wrong = (bootstrap_intervals(p)[0].sem for p in (panel, tampered))
+    assert wrong < 0.6 * honest
+
+
+def test_points_of_a_curve_are_drawn_together():
+    """Models of one curve find the same episodes hard: their difference is known far better than either."""
+    rng = np.random.default_rng(0)
+    table = judged(rng, robots=3)
+    points = [under_seeds(with_loss(table, table.metrics[LOSS] + shift), rng, 3, 0.01, 0.01) for shift in (0.0, 0.2)]
+    panel = make_panel(points, LOSS)
+    drawn = resample(panel).drawn
+    assert (drawn[:, 1] - drawn[:, 0]).std() < 0.1 * drawn[:, 0].std()
+    (difference,) = bootstrap_intervals(make_panel(points[1:], LOSS).minus(make_panel(points[:1], LOSS)))
+    assert 0 < difference.low < 0.2 < difference.high
+    swapped = make_panel([dict(reversed(points[1].items()))], LOSS).minus(make_panel(points[:1], LOSS))
+    assert swapped.seeds == ((2, 1, 0),)
+    np.testing.assert_allclose(swapped.points[0][::-1], panel.points[1] - panel.points[0])
+
+
+def test_the_same_seed_draws_the_same_and_a_thousand_draws_are_quick():
+    rng = np.random.default_rng(0)
+    table = judged(rng, robots=40, episodes=24, each=1)
+    panel = make_panel([under_seeds(table, rng, 3, 0.1) for _ in range(5)], LOSS)
+    began = time.process_time()
+    first = resample(panel, 1000, seed=7).drawn
+    assert time.process_time() - began < 3.0  # about 0.1 s
+    np.testing.assert_array_equal(first, resample(panel, 1000, seed=7).drawn)
+    assert not np.array_equal(first, resample(panel, 1000, seed=8).drawn)
+    assert first.shape == (1000, 5)
+
+
+def test_what_does_not_belong_together_is_refused():
+    rng = np.random.default_rng(0)
+    table = judged(rng, robots=2)
+    other = judged(np.random.default_rng(1), robots=2)
+    with pytest.raises(NotComparable, match=r"window \(r0, episode 100, frame 0\) is not the same one in both"):
+        make_panel([{0: table, 1: other}], LOSS)
+    with pytest.raises(NotComparable, match="not judged in every trial: r1"):
+        make_panel([{0: table, 1: table.of("r0")}], LOSS)
+    with pytest.raises(NotComparable, match="not judged: r9"):
+        make_panel([{0: table}], LOSS, ["r9"])
+    with pytest.raises(ConfigError, match="a trial has no ssim"):
+        make_panel([{0: table}], "ssim")
+    one, two = make_panel([{0: table}], LOSS), make_panel([{1: table}], LOSS)
+    with pytest.raises(NotComparable, match=r"seeds \(0,\) and \(1,\) have none in common"):
+        one.minus(two)
+    with pytest.raises(NotComparable, match="different windows"):
+        one.minus(make_panel([{0: table.of("r0")}], LOSS))
+    with pytest.raises(ConfigError, match="seeds repeat"):
+        Panel(one.robot, one.episode, one.points, ((),))

@@ -1,0 +1,71 @@
+"""Two models side by side: what differs, by how much, and what cannot be compared."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.analysis.compare import Side, compare
+from experiments.analysis.intervals import OVERALL
+from experiments.analysis.paired import NotComparable, paired
+from tests.experiments.analysis.worlds import judged, under_seeds, with_loss
+
+
+def sides(gain: float = 0.2, seeds: int = 1, robots: int = 3):
+    rng = np.random.default_rng(0)
+    table = judged(rng, robots=robots, mean=2.0)
+    nats = np.where(table.dataset == "r0", np.nan, rng.normal(size=len(table)))
+    table = replace(table, metrics={**table.metrics, "action_nats": nats})
+    better = with_loss(table, table.metrics["cross_entropy"] - gain)
+    a, b = (under_seeds(x, rng, seeds, 0.01 * (seeds > 1), 0.05) for x in (better, table))
+    return Side("a", a, "t"), Side("b", b, "t")
+
+
+def test_one_seed_is_the_paired_interval_clustered_by_episode():
+    a, b = sides()
+    rows = {(r.scope, r.metric): r for r in compare(a, b)}
+    want = paired(a.seeds[0], b.seeds[0], 1)
+    for scope in (OVERALL, "r0", "r1", "r2"):
+        row, interval = rows[scope, "cross_entropy"], want[scope]["cross_entropy"]
+        assert (row.mean, row.sem, row.low, row.high) == pytest.approx(
+            (interval.mean, interval.sem, interval.low, interval.high)
+        )
+        assert row.ratio == pytest.approx(np.exp(row.mean)) and row.ratio_low < row.ratio < row.ratio_high
+        assert row.a - row.b == pytest.approx(row.mean)
+    assert rows[OVERALL, "cross_entropy"].errors < -5
+    assert next(iter(rows)) == (OVERALL, "cross_entropy") and not any(m == "psnr_copy" for _, m in rows)
+
+
+def test_what_some_robots_have_not_is_over_the_others():
+    rows = {(r.scope, r.metric): r for r in compare(*sides())}
+    assert ("r0", "action_nats") not in rows and rows[OVERALL, "action_nats"].n == 2 * 48
+    assert rows[OVERALL, "action_nats"].mean == rows[OVERALL, "action_nats"].errors == 0
+
+
+def test_several_seeds_are_paired_by_name_and_their_scatter_counts():
+    a, b = sides(seeds=3)
+    rows = {(r.scope, r.metric): r for r in compare(a, b)}
+    row = rows[OVERALL, "cross_entropy"]
+    assert row.seeds == 3 and row.low < -0.2 < row.high < 0
+    backwards = Side("b", dict(reversed(b.seeds.items())), "t")
+    again = {(r.scope, r.metric): r for r in compare(a, backwards)}
+    assert again[OVERALL, "cross_entropy"].mean == pytest.approx(row.mean)
+    with pytest.raises(NotComparable, match="a has seeds 0, 1, 2 and c 7, 8: none in common"):
+        compare(a, Side("c", {7: b.seeds[0], 8: b.seeds[1]}, "t"))
+    (one,) = [r for r in compare(a, Side("c", {2: b.seeds[2]}, "t")) if (r.scope, r.metric) == ("r1", "cross_entropy")]
+    assert one.seeds == 1
+
+
+def test_nats_of_other_tokens_are_not_compared():
+    a, b = sides()
+    assert {r.metric for r in compare(a, b)} == {"cross_entropy", "action_nats"}
+    psnr = {s: replace(t, metrics={**t.metrics, "psnr": t.metrics["psnr_copy"] + s}) for s, t in a.seeds.items()}
+    other = Side("b", psnr, "u")
+    assert {r.metric for r in compare(Side("a", psnr, "t"), other)} == {"psnr"}
+
+
+def test_other_windows_are_refused():
+    a, b = sides()
+    table = b.seeds[0]
+    with pytest.raises(NotComparable, match=r"window \(r0, episode 100, frame 0\) is not the same one"):
+        compare(a, Side("b", {0: replace(table, frames=table.frames - 1)}, "t"))

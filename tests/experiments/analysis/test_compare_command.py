@@ -1,0 +1,85 @@
+"""`hma compare` on trials and studies as they lie on disk."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.analysis.intervals import OVERALL
+from experiments.cli.main import main
+from experiments.running.workspace import Workspace, save_record
+from experiments.sweeps.sweep import reference_trial
+from hma_jax.runtime.exits import Exit
+from tests.experiments.analysis.trials import write_trial
+from tests.experiments.analysis.worlds import judged, under_seeds, with_loss
+from tests.experiments.fakes import PROVENANCE, STUDY, record_of
+
+
+def better(table, by=0.1):
+    return with_loss(table, table.metrics["cross_entropy"] - by)
+
+
+@pytest.fixture
+def table():
+    return judged(np.random.default_rng(0), robots=3, mean=2.0)
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return {(row["scope"], row["metric"]): row for row in csv.DictReader(file)}
+
+
+def test_two_trials_are_compared_per_robot_and_overall(table, tmp_path, capsys):
+    trial = reference_trial(STUDY, 0)
+    a = write_trial(tmp_path / "a", trial, better(table))
+    b = write_trial(tmp_path / "b", replace(trial, max_trajectories=4), table)
+    assert main(["compare", str(a), str(b), "--to", str(tmp_path / "made" / "c.csv")]) == Exit.DONE
+    rows = rows_of(tmp_path / "made" / "c.csv")
+    assert set(rows) == {(scope, "cross_entropy") for scope in (OVERALL, "r0", "r1", "r2")}
+    overall = rows[OVERALL, "cross_entropy"]
+    assert float(overall["mean"]) == pytest.approx(-0.1, abs=1e-6) and overall["seeds"] == "1"
+    assert float(overall["ratio"]) == pytest.approx(np.exp(-0.1), rel=1e-6)
+    said = capsys.readouterr().out
+    assert f"{a.name} - {b.name}" in said and "-0.1000 ± 0.0000" in said and "x 0.9048" in said
+
+
+def test_two_studies_are_compared_by_their_reference_models_over_seeds(table, tmp_path, capsys):
+    rng = np.random.default_rng(1)
+    for name, own in (("one", better(table, 0.3)), ("two", table)):
+        workspace = Workspace(tmp_path / name)
+        for seed, windows in under_seeds(own, rng, 2, 0.01).items():
+            write_trial(workspace.trials, reference_trial(STUDY, seed), windows)
+        save_record(workspace, record_of())
+    assert main(["compare", *(str(tmp_path / n) for n in ("one", "two")), "--to", str(tmp_path / "c.csv")]) == 0
+    overall = rows_of(tmp_path / "c.csv")[OVERALL, "cross_entropy"]
+    assert overall["seeds"] == "2" and float(overall["low"]) < -0.3 < float(overall["high"])
+    assert "over 2 seeds" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path, capsys):
+    trial = reference_trial(STUDY, 0)
+    a = write_trial(tmp_path / "a", trial, table)
+    shorter = write_trial(tmp_path / "b", trial, table.rows(np.arange(1, len(table))))
+    (tmp_path / "nothing").mkdir()
+    for b, why in (
+        (shorter, "only one of two evaluations has window ('r0', 100, 0)"),
+        (tmp_path / "nothing", "neither a study, nor a finished trial, nor a model that was evaluated"),
+    ):
+        assert main(["compare", str(a), str(b), "--to", str(tmp_path / "c.csv")]) == Exit.REFUSED == 2
+        assert why in capsys.readouterr().err and not (tmp_path / "c.csv").exists()
+    workspace = Workspace(tmp_path / "empty")
+    workspace.root.mkdir()
+    save_record(workspace, record_of())
+    assert main(["compare", str(a), str(workspace.root)]) == 2
+    assert "no reference trial of this study" in capsys.readouterr().err
+
+
+def test_nats_of_two_tokenizers_are_left_out_and_it_is_said(table, tmp_path, capsys):
+    trial = reference_trial(STUDY, 0)
+    psnr = replace(table, metrics={**table.metrics, "psnr": table.metrics["psnr_copy"] + 1})
+    a = write_trial(tmp_path / "a", trial, psnr)
+    b = write_trial(tmp_path / "b", trial, psnr, replace(PROVENANCE, tokenizer="other"))
+    assert main(["compare", str(a), str(b), "--to", str(tmp_path / "c.csv")]) == 0
+    assert {metric for _, metric in rows_of(tmp_path / "c.csv")} == {"psnr"}
+    assert "Nats are not compared: the tokenizers differ (70c3, other)" in " ".join(capsys.readouterr().out.split())

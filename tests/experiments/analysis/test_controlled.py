@@ -1,0 +1,53 @@
+"""Robots that a model follows, and how sure that is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.analysis.controllability import beyond, controllability
+from experiments.suite.explained import read_table
+from tests.experiments.analysis.worlds import judged
+
+
+def model(follows: float, seed: int = 0, shift: float = 0.0):
+    """Two robots of the suite and one of nobody's; of the first, nobody simulates another truth."""
+    rng = np.random.default_rng(seed)
+    table = judged(rng, robots=3, episodes=8)
+    n = len(table)
+    names = {"r0": "two_link_arm", "r1": sorted(read_table())[0], "r2": "mine"}
+    scatter = np.repeat(np.random.default_rng(1).normal(size=n // 4), 4)
+    metrics = {
+        "psnr_copy": table.metrics["psnr_copy"],
+        "delta_psnr": follows * (1 + 0.2 * scatter) + shift,
+        "action_nats": follows * (0.3 + 0.1 * scatter),
+        "retrieval": np.where(np.arange(n) % 16 == 0, 1.0, float(follows > 0)),
+        "retrieval_chance": np.full(n, 1 / 16),
+        "counterfactual_gain": np.where(table.dataset == "r0", np.nan, follows * (2 + scatter)),
+    }
+    dataset = np.asarray([names[r] for r in table.dataset.tolist()])
+    return replace(table, dataset=dataset, metrics=metrics)
+
+
+def test_robots_beyond_two_errors_are_counted_against_what_a_deaf_model_has():
+    follows, deaf = controllability({0: model(1.0)}), controllability({0: model(0.0)})
+    for metric, robots in (("delta_psnr", 3), ("action_nats", 3), ("retrieval", 3), ("counterfactual_gain", 2)):
+        assert beyond(follows, metric) == (robots, robots)
+        assert beyond(deaf, metric) == (0, robots)
+    assert all(row.errors == 0 for row in deaf if row.metric != "retrieval")
+    assert {row.deaf for row in deaf if row.metric == "retrieval"} == {1 / 16}
+
+
+def test_a_row_says_what_there_is_to_follow():
+    rows, truth = controllability({0: model(1.0)}), read_table()
+    for row in rows:
+        assert row.explained == truth[row.robot].share if row.robot in truth else np.isnan(row.explained)
+    assert {row.robot for row in rows} >= {"mine", sorted(truth)[0]}
+
+
+def test_seeds_that_differ_make_the_error_larger():
+    one = controllability({0: model(1.0)})
+    three = controllability({s: model(1.0, shift=s) for s in range(3)})
+    own = [next(r for r in rows if r.metric == "delta_psnr") for rows in (one, three)]
+    assert own[1].seeds == 3 and own[1].sem > 3 * own[0].sem
+    assert own[1].mean == pytest.approx(own[0].mean + 1)

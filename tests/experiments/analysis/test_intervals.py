@@ -1,0 +1,91 @@
+"""Intervals hold the truth as often as they say, and only because they count episodes."""
+
+import math
+
+import numpy as np
+import pytest
+
+from experiments.analysis.intervals import OVERALL, critical, interval_of, intervals, nats_first, overall
+from hma_jax.evaluation.statistics import Stat, mean_and_sem
+from hma_jax.evaluation.summary import summarise
+from tests.experiments.analysis.worlds import judged
+
+
+def held(interval, truth: float = 0.0) -> bool:
+    return interval.low < truth < interval.high
+
+
+def test_few_episodes_need_t_and_windows_are_no_episodes():
+    """Of 400 samples of six episodes, 95 in 100 intervals should hold the truth."""
+    hits = {"t": 0, "normal": 0, "windows": 0}
+    for seed in range(400):
+        table = judged(np.random.default_rng(seed), episodes=6)
+        loss = table.metrics["cross_entropy"]
+        stat, naive = mean_and_sem(loss, table.episode), mean_and_sem(loss)
+        hits["t"] += held(interval_of(stat))
+        hits["normal"] += abs(stat.mean) < 1.96 * stat.sem
+        hits["windows"] += held(interval_of(naive))
+    assert 0.93 * 400 <= hits["t"] <= 0.97 * 400
+    assert hits["normal"] < 0.92 * 400 and hits["windows"] < 0.75 * 400
+
+
+def test_the_mean_over_robots_holds_its_truth():
+    """Three robots of four episodes, of which one scatters most: few degrees of freedom, and a wide interval."""
+    hits = normal = 0
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        tables = [judged(rng, episodes=4, of_episode=scale) for scale in (0.1, 0.1, 2.0)]
+        stats = [mean_and_sem(t.metrics["cross_entropy"], t.episode) for t in tables]
+        interval = overall(stats)
+        hits += held(interval)
+        normal += abs(interval.mean) < 1.96 * interval.sem
+    assert 0.92 * 400 <= hits <= 0.98 * 400 and normal < 0.90 * 400
+
+
+def test_episode_ids_carry_the_error():
+    """Shuffled over the windows of a robot, each episode looks like all of it, and the error is a fraction."""
+    table = judged(np.random.default_rng(0), episodes=20, each=8, of_window=0.1)
+    ids = np.random.default_rng(1).permutation(table.episode)
+    loss = table.metrics["cross_entropy"]
+    truth, tampered = mean_and_sem(loss, table.episode), mean_and_sem(loss, ids)
+    assert truth.sem == pytest.approx(np.std(loss.reshape(20, 8).mean(1), ddof=1) / math.sqrt(20), rel=1e-9)
+    assert tampered.sem < 0.6 * truth.sem
+
+
+def test_one_window_per_episode_is_the_textbook_interval():
+    table = judged(np.random.default_rng(2), episodes=9, each=1)
+    loss = table.metrics["cross_entropy"]
+    interval = interval_of(mean_and_sem(loss, table.episode))
+    half = 2.306004 * np.std(loss, ddof=1) / 3
+    assert (interval.low, interval.high) == pytest.approx((loss.mean() - half, loss.mean() + half), rel=1e-6)
+    assert (interval.n, interval.episodes) == (9, 9)
+
+
+def test_one_episode_has_no_interval_and_takes_none_from_the_others():
+    table = judged(np.random.default_rng(3), episodes=1, each=5)
+    alone = interval_of(mean_and_sem(table.metrics["cross_entropy"], table.episode))
+    assert math.isnan(alone.sem) and math.isnan(alone.low) and math.isnan(alone.errors)
+    among = overall([Stat(1.0, math.nan, 5, 1), Stat(3.0, 0.5, 40, 4)])
+    assert among.mean == 2.0 and among.high > 2.0
+
+
+def test_quantiles_are_those_of_the_tables():
+    assert critical(2) == pytest.approx(4.302653, rel=1e-6)
+    assert critical(math.inf) == pytest.approx(1.959964, rel=1e-6)
+    assert math.isnan(critical(0))
+
+
+def test_perplexity_is_the_transformed_interval_of_nats():
+    table = judged(np.random.default_rng(4), robots=2, mean=2.0)
+    found = intervals(summarise(table, 4))
+    assert list(found) == [OVERALL, "r0", "r1"]
+    nats = found["r0"]["cross_entropy"]
+    perplexity = nats.exp()
+    assert perplexity.mean == pytest.approx(found["r0"]["perplexity_corpus"].mean)
+    assert (perplexity.low, perplexity.high) == (math.exp(nats.low), math.exp(nats.high))
+    assert perplexity.sem == pytest.approx(found["r0"]["perplexity_corpus"].sem)
+    assert interval_of(Stat(800.0, 1.0, 4, 4)).exp().mean == math.inf
+
+
+def test_nats_come_first():
+    assert nats_first(["psnr", "action_nats", "cross_entropy"]) == ["cross_entropy", "action_nats", "psnr"]
