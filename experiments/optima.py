@@ -30,6 +30,7 @@ class Optimum:
     edge: str  # "edge": the best is at an end of what was tried, so that it may lie beyond; or ""
     loss: float
     seed_sem: float  # over seeds, nan for one
+    moved: float  # steps of the grid from the best x of the base series, downwards negative; nan without one
     transferred_x: float  # the best x of the base series in the same role; nan without one
     penalty: float  # loss there minus `loss`; inf if it diverged, nan if it has no result
     penalty_seed_sem: float
@@ -83,9 +84,10 @@ def _optimum(
     best: CurvePoint,
     base: CurvePoint | None,
 ) -> Optimum:
-    transferred, penalty, error = math.nan, math.nan, math.nan
+    transferred, moved, penalty, error = math.nan, math.nan, math.nan, math.nan
     if base:
-        transferred = base.x
+        transferred, grid = base.x, sorted({r.x for r in rows if r.sweep == sweep})
+        moved = grid.index(best.x) - grid.index(base.x)
         there = next((p for p in points if p.x == base.x), None)
         if base.x in diverged(rows, sweep, role, series):
             penalty = math.inf
@@ -94,7 +96,7 @@ def _optimum(
     return Optimum(
         sweep, metric, role, series, best.x,
         edge="edge" if best.x in ends(rows, sweep, role, series) else "",
-        loss=best.mean, seed_sem=best.seed_sem,
+        loss=best.mean, seed_sem=best.seed_sem, moved=moved,
         transferred_x=transferred, penalty=penalty, penalty_seed_sem=error,
     )  # fmt: skip
 

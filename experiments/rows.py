@@ -22,6 +22,7 @@ from experiments.running.provenance import Provenance, read_record
 from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
+from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
     from hma_jax.evaluation.statistics import Stat
@@ -135,11 +136,20 @@ def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
 
 
 def read_csv(path: Path) -> list[Row]:
-    """The rows of a table that this or an earlier version wrote."""
+    """The rows of a table that this or an earlier version wrote. Raises ConfigError for a damaged one."""
     kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int, "results": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
+    rows = []
     with open(path, newline="") as file:
-        return [Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}) for record in csv.DictReader(file)]
+        for number, record in enumerate(csv.DictReader(file), start=2):
+            try:
+                rows.append(Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}))
+            except (ValueError, TypeError) as error:
+                raise ConfigError(
+                    f"{path}, line {number}: not a row of results ({error}); restore the file, or remove it and draw it "
+                    "again from the trials with `hma report`"
+                ) from error
+    return rows
 
 
 def _number(text: str) -> float:

@@ -15,10 +15,13 @@ from tyro.extras import SubcommandApp
 
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
+from experiments.cli.check import check
 from experiments.cli.compare import compare
 from experiments.cli.data import app as data
 from experiments.cli.evaluate import evaluate
+from experiments.cli.fit import fit
 from experiments.cli.plan import plan
+from experiments.cli.play import play
 from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
@@ -36,11 +39,14 @@ app.command(name="adapt")(adapt)
 app.command(name="evaluate")(evaluate)
 app.command(name="compare")(compare)
 app.command(name="report")(study.report)
+app.command(name="fit")(fit)
 app.command(data.data_app, name="data", help=data.HELP)
 app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)
 app.command(convert.convert_app, name="convert", help=convert.HELP)
 app.command(bench.bench_app, name="bench", help=bench.HELP)
 app.command(name="plan")(plan)
+app.command(name="play")(play)
+app.command(name="check")(check)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -19,6 +19,7 @@ from experiments.wrote import wrote
 from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:
+    from experiments.report.numbers import Numbers
     from experiments.rows import Row
 
 
@@ -35,8 +36,11 @@ def draw(workspace: Workspace, record: Record) -> None:
 
 def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.optima import Optimum, find_optima
+    from experiments.report.fits import FitRow, fit_rows
+    from experiments.report.numbers import compute_numbers
     from experiments.report.page import write_report
     from experiments.report.tables import write_tables
+    from experiments.report.validity import check_numbers
     from experiments.rows import Row, collect, read_csv, write_csv
 
     provenance = record.provenance
@@ -44,26 +48,39 @@ def _draw(workspace: Workspace, record: Record) -> None:
         raise ConfigError(f"the study in {workspace.root} has not run yet; run `{record.command}`")
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
+    written = read_csv(workspace.results) if workspace.results.exists() else []
     write_csv(workspace.results, Row, collect(sweeps, provenance, workspace.trials, states))
     rows = read_csv(workspace.results)  # figures show what the file says
-    draw_figures(workspace, sweeps, rows)
-    tables = [workspace.results, *write_tables(workspace, record, sweeps, states, provenance)]
+    numbers = compute_numbers(workspace, sweeps, provenance)
+    checked = check_numbers(written, rows, numbers.results, numbers.windows, record.study.eval.perplexity_group)
+    if checked.verdict == "bad":
+        console.print(f"note: {checked.text}", markup=False, soft_wrap=True)
+    draw_figures(workspace, sweeps, rows, numbers)
+    write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
+    others = write_tables(workspace, record, sweeps, states, provenance)
+    tables = [workspace.results, workspace.fits, *others]
     optima = find_optima(rows, sweeps)
     if optima:
         write_csv(workspace.optima, Optimum, optima)
         tables.append(workspace.optima)
-    write_report(workspace, record, sweeps, rows, optima, states, provenance)
+    write_report(workspace, record, sweeps, rows, optima, states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 
 
-def draw_figures(workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row]) -> None:
-    """A figure for each sweep, and one of the scaling ones together."""
+def draw_figures(
+    workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row], numbers: Numbers | None = None
+) -> None:
+    """A figure for each sweep, one of the scaling ones together, and of fits, where there are `numbers` for them."""
+    from experiments.report.plot_fits import plot_fits, plot_isoflop
     from experiments.report.plots import plot_overview, plot_sweep
 
     workspace.figures.mkdir(exist_ok=True)
     for sweep in sweeps:
         plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
     plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")
+    if numbers is not None:
+        plot_fits(numbers.fits, numbers.outcomes, workspace.figures / "fits.png")
+        plot_isoflop(numbers.isoflop, workspace.figures / "isoflop.png")
 
 
 def draw_again(out: Path) -> None:

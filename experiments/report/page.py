@@ -13,14 +13,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from experiments.optima import Optimum
-from experiments.report.pieces import card, frames, picture, pm, section, table
+from experiments.report.clips import describe_clips
+from experiments.report.fits import describe_fits
+from experiments.report.numbers import Numbers
+from experiments.report.pieces import card, picture, section, table
 from experiments.report.plot_style import drawn_metrics
+from experiments.report.robots import Robot, describe_robots, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import describe
-from experiments.rows import OVERALL, UNTRAINED, CurvePoint, Row, curve
+from experiments.report.validity import Check, check_study, draw_box
+from experiments.rows import UNTRAINED, CurvePoint, Row, curve
 from experiments.running.agreement import describe as describe_sources
 from experiments.running.agreement import group_by_sources
 from experiments.running.attempts import State
@@ -32,9 +35,6 @@ from experiments.running.workspace import Record, Workspace
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, titles
 from hma_jax.config.json import to_json
 
-SHOWN_STRIPS = 6
-"""Datasets whose frames are visible at once; the others unfold."""
-
 
 def write_report(
     workspace: Workspace,
@@ -44,21 +44,29 @@ def write_report(
     optima: Sequence[Optimum],
     states: dict[str, State],
     provenance: Provenance,
+    numbers: Numbers,
+    checked: Check,
 ) -> None:
-    """Writes workspace.report from `rows` and the figures already drawn."""
+    """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
     home = _home(sweeps)
     reference = trial_id(_reference(home), provenance) if home else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
     shown = reference in finished
     witness = reference if shown else next(iter(finished), None)
     result = read_result(workspace.trials / witness) if witness else None
+    robots = robots_of(rows, home, provenance, numbers.windows) if home else []
+    model = record.study.model
+    vocabulary = None if model.diffusion else model.vocab_size
+    checks = check_study(sweeps, rows, optima, states, robots if shown else [], numbers.outcomes, checked, vocabulary)
     body = [
         _headline(workspace, record, sweeps, rows, states, home, result),
+        draw_box(checks),
         *_curves(workspace, sweeps, rows, optima),
-        section("True and predicted frames", _strips(
-            workspace.trials / reference / "samples.npz", record.study.eval.prompt_frames
+        _fits(workspace, numbers),
+        _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
+        section("Robots, the most controllable first", describe_robots(
+            rows, home, robots, workspace.data_summary
         )) if shown else "",
-        section("Reference trial by dataset", _dataset_table(rows, home, workspace)) if shown else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, result)),
     ]  # fmt: skip
@@ -160,54 +168,20 @@ def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
     return CurvePoint(0, quality["mean"], quality["sem"], math.nan, {}, 0)
 
 
-def _strips(path: Path, prompt: int) -> str:
-    """Rows of frames per dataset: recorded, predicted, and predicted under random actions."""
-    with np.load(path) as samples:
-        names = list(dict.fromkeys(key.split("/")[0] for key in samples.files))
-        strips = [
-            f"<figure class=strip><figcaption>{html.escape(name)}</figcaption>"
-            + "".join(
-                f"<div><span>{label}</span>{frames(samples[f'{name}/{kind}'][0], prompt)}</div>"
-                for kind, label in (
-                    ("true", "true"),
-                    ("predicted", "predicted"),
-                    ("random", "random actions"),
-                )
-            )
-            + "</figure>"
-            for name in names
-        ]
-    rest = "".join(strips[SHOWN_STRIPS:])
-    more = f"<details><summary>{len(names) - SHOWN_STRIPS} more datasets</summary>{rest}</details>"
-    return (
-        f"<p>The first validation window of each dataset. The first {prompt} frames are given; the rest is "
-        "predicted from actions alone, once under the recorded actions and once under random ones.</p>"
-        f"{''.join(strips[:SHOWN_STRIPS])}{more if rest else ''}"
-    )
+def _fits(workspace: Workspace, numbers: Numbers) -> str:
+    if not numbers.fits:
+        return ""
+    figures = {"fits.png": "Scaling fits with residuals", "isoflop.png": "Best sizes for budgets"}
+    drawn = "".join(picture(workspace.figures / name, title) for name, title in figures.items())
+    return section("Fits", describe_fits(numbers.fits, numbers.isoflop, numbers.outcomes, drawn))
 
 
-def _dataset_table(rows: Sequence[Row], sweep: Sweep, workspace: Workspace) -> str:
-    """One line per dataset; data.json says how much of it there was."""
-    data = json.loads(workspace.data_summary.read_text()) if workspace.data_summary.exists() else {}
-    head = {"perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)",
-            "psnr_copy": "copying (dB)", "ssim": "SSIM", "delta_psnr": "ΔPSNR (dB)"}  # fmt: skip
-    measured = {r.metric for r in rows if r.sweep == sweep.name}
-    metrics = [m for m in head if m in measured]
-
-    def cell(name: str, metric: str) -> str:
-        at = [p for p in curve(rows, sweep.name, metric, scope=name) if p.x == sweep.reference_x]
-        return pm(at[0].mean, at[0].sem) if at else "–"
-
-    lines = []
-    for name in (*sweep.scope, OVERALL):
-        facts = data.get(name, {})
-        counts = [str(facts.get(k, "–")) for k in ("episodes", "too_short", "skipped", "windows")]
-        lines.append([html.escape(name), *counts, *(cell(name, metric) for metric in metrics)])
-    return (
-        "<p>PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR "
-        "of repeating the last given frame. Errors are standard errors over episodes and seeds.</p>"
-        + table(["dataset", "episodes", "too short", "skipped", "windows", *map(head.get, metrics)], lines)
-    )
+def _clips(path: Path, record: Record, robots: Sequence[Robot]) -> str:
+    """Of the reference trial, the most controllable robots first; without samples there are none."""
+    if not path.exists():
+        return ""
+    order = [robot.name for robot in robots]
+    return section("What it predicts", describe_clips(path, record.study.eval.prompt_frames, order))
 
 
 def _trial_table(

@@ -53,7 +53,8 @@ def number(value: float, error: float) -> str:
 def picture(path: Path, title: str) -> str:
     if not path.exists():
         return ""
-    return f'<img class=plot alt="{html.escape(title)}" src="{data_uri(path.read_bytes())}">'
+    source = data_uri(path.read_bytes())
+    return f'<div class=scroll><img class=plot alt="{html.escape(title)}" src="{source}"></div>'
 
 
 def frames(clip: np.ndarray, prompt: int) -> str:
@@ -70,5 +71,5 @@ def frames(clip: np.ndarray, prompt: int) -> str:
     return f'<img alt="" src="{data_uri(buffer.getvalue())}">'
 
 
-def data_uri(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode()
+def data_uri(picture: bytes, kind: str = "png") -> str:
+    return f"data:image/{kind};base64," + base64.b64encode(picture).decode()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 
 import matplotlib
@@ -11,7 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullLocator
 
 from experiments.rows import CurvePoint, Row, tally
 
@@ -60,22 +60,53 @@ def save(figure: plt.Figure, path: Path) -> None:
     aside.replace(path)
 
 
-def plain_log(panel: Axes, axis: Axis) -> None:
-    """A log scale for values within a decade or two, with plain numbers at 1, 2, 3 and 5."""
+class LogTicks(Locator):
+    """At least three ticks on a log axis: at 1, 2, 3 and 5 of each decade, or where its ends lie closer together, at
+    round numbers."""
+
+    def __call__(self):
+        return self.tick_values(*self.axis.get_view_interval())
+
+    def tick_values(self, vmin: float, vmax: float):
+        low, high = sorted((vmin, vmax))
+        ticks = LogLocator(subs=(1, 2, 3, 5)).tick_values(low, high)
+        if sum(low <= t <= high for t in ticks) < 3 or high < 4 * low:
+            ticks = MaxNLocator(nbins=5, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high)
+        elif high > 300 * low:
+            ticks = LogLocator().tick_values(low, high)
+        elif high > 20 * low:
+            ticks = LogLocator(subs=(1, 2, 5)).tick_values(low, high)
+        return [t for t in ticks if t > 0]
+
+
+def plain_number(value: float) -> str:
+    return f"{value:.10g}"
+
+
+def count(n: float) -> str:
+    """1234567 -> '1.2M'."""
+    for unit, size in (("E", 1e18), ("P", 1e15), ("T", 1e12), ("G", 1e9), ("M", 1e6), ("k", 1e3)):
+        if n >= size:
+            return f"{n / size:.3g}{unit}" if n / size >= 100 or n % size == 0 else f"{n / size:.1f}{unit}"
+    return f"{n:g}"
+
+
+def plain_log(panel: Axes, axis: Axis, label: Callable[[float], str] = plain_number) -> None:
+    """A log scale for values within a few decades, every tick labelled by a plain number."""
     panel.set(**{f"{axis.axis_name}scale": "log"})
-    axis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_major_locator(LogTicks())
+    axis.set_major_formatter(FuncFormatter(lambda v, _: label(v)))
+    axis.set_minor_locator(NullLocator())
 
 
 def show_control(panel: Axes, points: list[CurvePoint]) -> None:
-    """A line where the trial on shuffled actions finished, with its standard error."""
-    if not points:
-        return
-    mean, sem = points[-1].mean, points[-1].sem
-    panel.axhline(mean, **CONTROL_LINE, label="shuffled actions")
-    if sem > 0:  # not nan
-        panel.axhspan(mean - sem, mean + sem, color=MUTED, alpha=0.12, linewidth=0, zorder=0)
+    """The trials on shuffled actions, where on the axis they stand, with their standard errors."""
+    if points:
+        panel.errorbar(
+            [p.x for p in points], [p.mean for p in points], [p.sem if p.sem > 0 else 0.0 for p in points],
+            fmt="s", color=MUTED, markersize=5, markerfacecolor="white", capsize=3, elinewidth=1.2, zorder=2,
+            label="trained on shuffled actions",
+        )  # fmt: skip
 
 
 def show_tally(panel: Axes, rows: Iterable[Row], sweep: str) -> None:

@@ -21,6 +21,7 @@ from experiments.report.plot_style import (
     LABELS,
     MUTED,
     STYLE,
+    count,
     drawn_metrics,
     plain_log,
     save,
@@ -65,13 +66,13 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
         )  # fmt: skip
         for column, sweep in enumerate(sweeps):
             for panel, metric in zip(panels[:, column], metrics, strict=True):
-                _draw(panel, rows, sweep, metric)
+                _draw(panel, rows, sweep, metric, legend=not column)
                 if column:
                     panel.set_ylabel("")
         save(figure, path)
 
 
-def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, legend: bool = True) -> None:
     """One curve with standard errors, every seed's point, and the reference lines."""
     points = curve(rows, sweep.name, metric)
     colour = COLOURS[metric]
@@ -100,25 +101,17 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     show_tally(panel, rows, sweep.name)
     panel.set_xlabel(sweep.axis + (" · parameters" if sweep.name == "width" else ""))
     panel.set_ylabel(LABELS[metric])
-    if panel.get_legend_handles_labels()[0]:
+    if legend and panel.get_legend_handles_labels()[0]:
         panel.legend(loc="best")
 
 
 def _x_axis(panel: Axes, points: list[CurvePoint], sweep: Sweep) -> None:
     """A log axis whose ticks are the points themselves."""
     panel.set_xscale("log")
-    names = [_count(p.x) for p in points]
+    names = [count(p.x) for p in points]
     if sweep.name == "width":
-        names = [f"{p.x}\n{_count(p.parameters)}" for p in points]
+        names = [f"{p.x}\n{count(p.parameters)}" for p in points]
     panel.set_xticks([p.x for p in points], names)
     panel.xaxis.set_minor_locator(NullLocator())
     if len(points) == 1:
         panel.set_xlim(points[0].x / 2, points[0].x * 2)
-
-
-def _count(n: float) -> str:
-    """1234567 -> '1.2M'."""
-    for unit, size in (("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if n >= size:
-            return f"{n / size:.3g}{unit}" if n / size >= 100 or n % size == 0 else f"{n / size:.1f}{unit}"
-    return f"{n:g}"

@@ -15,12 +15,13 @@ h2 { font-size: 1.25rem; margin: 2.8rem 0 .8rem; padding-top: .9rem; border-top:
 h3 { font-size: 1.02rem; margin: 1.6rem 0 .2rem; }
 p { margin: .4rem 0 .8rem; max-width: 46rem; }
 .lead { font-size: 1.08rem; } .meta, .sem { color: var(--muted); }
-.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(185px, 1fr)); gap: .8rem; margin: 1.4rem 0; }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(180px, 1fr)); gap: .8rem; margin: 1.4rem 0; }
 .card { background: var(--soft); border-radius: 8px; padding: .8rem 1rem; }
-.card small { display: block; color: var(--muted); } .card b { font-size: 1.45rem; font-weight: 600; }
-.card b .sem { font-size: 1rem; font-weight: 400; }
+.card small { display: block; color: var(--muted); } .card b { font-size: 1.4rem; font-weight: 600; }
+.card b { white-space: nowrap; } .card b .sem { font-size: .95rem; font-weight: 400; }
 .warning { color: var(--bad); }
-.plot { display: block; width: 100%; border-radius: 8px; background: white; padding: .5rem; }
+.plot { display: block; max-width: 100%;
+  max-height: 46rem; margin: 0 auto; border-radius: 8px; background: white; padding: .5rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; margin: .5rem 0 .8rem; }
 th, td { text-align: right; padding: .28rem .8rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
@@ -29,6 +30,19 @@ th.text, td.text { text-align: left; } th:first-child, td:first-child { padding-
 td:nth-child(3).text { white-space: normal; min-width: 8rem; }
 .finished { color: var(--good); } .failed, .diverged { color: var(--bad); font-weight: 600; }
 .missing, .interrupted { color: var(--muted); }
+.checks { list-style: none; margin: .6rem 0; padding: 0; border: 1px solid var(--line); border-radius: 8px; }
+.checks li { display: flex; gap: .7rem; padding: .5rem .9rem; border-top: 1px solid var(--line); font-size: .95rem; }
+.checks li:first-child { border-top: 0; } .checks .mark { flex: 0 0 1.1rem; font-weight: 700; text-align: center; }
+.checks div { min-width: 0; overflow-wrap: anywhere; }
+.checks .bad { background: color-mix(in srgb, var(--bad) 9%, transparent); }
+.good .mark { color: var(--good); } .bad .mark, .bad b { color: var(--bad); } .open .mark { color: var(--muted); }
+.trios { display: grid; grid-template-columns: repeat(auto-fill, minmax(300px, 1fr)); gap: 1.1rem 1.2rem;
+  margin: .8rem 0; }
+.trio { margin: 0; min-width: 0; } .trio figcaption { font-weight: 600; font-size: .9rem; margin-bottom: .2rem; }
+.trio img { display: block; width: 100%; image-rendering: pixelated; background: white; border-radius: 4px; }
+.trio div { display: grid; grid-auto-flow: column; grid-auto-columns: 1fr; font-size: .76rem; color: var(--muted);
+  text-align: center; }
+.paper { display: none; }
 .strip { margin: 1.1rem 0; } .strip figcaption { font-weight: 600; font-size: .92rem; }
 .strip div { display: flex; align-items: center; gap: .8rem; margin: 3px 0; }
 .strip span { flex: 0 0 6.6rem; color: var(--muted); font-size: .82rem; }
@@ -38,5 +52,17 @@ dt { color: var(--muted); } dd { margin: 0; overflow-wrap: anywhere; }
 code, pre { font: .86em/1.45 ui-monospace, SFMono-Regular, Menlo, Consolas, monospace; }
 pre { background: var(--soft); padding: 1rem; border-radius: 8px; overflow-x: auto; }
 summary { cursor: pointer; color: var(--muted); margin: .8rem 0; }
-@media print { details { display: none; } }
+td.text:last-child:nth-child(n+4) { white-space: normal; min-width: 11rem; }
+@media (max-width: 560px) { main { padding: 1.2rem .9rem 3rem; } h1 { font-size: 1.5rem; }
+  .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); }
+  .card { padding: .6rem .7rem; } .card b { font-size: 1.15rem; } .card b .sem { font-size: .8rem; }
+  .strip div { display: block; } .plot { padding: .2rem; width: auto; min-width: 100%; height: 24rem;
+  max-width: none; } dl { grid-template-columns: 1fr; } dd { margin-bottom: .5rem; } }
+@media print { :root { color-scheme: light; --ink: #000; --muted: #444; --line: #bbb; --paper: #fff; --soft: #f5f7f8;
+    --good: #1d5c36; --bad: #9c2415; }
+  @page { margin: 14mm; } body { font-size: 10.5pt; } main { max-width: none; padding: 0; }
+  details, .trios { display: none; } .paper { display: block; } .scroll { overflow: visible; }
+  table { font-size: 7.5pt; } th, td { padding: .15rem .35rem; white-space: normal; }
+  .plot { max-height: 100mm; }
+  figure, .card, .checks li, tr, .plot { break-inside: avoid; } h2, h3 { break-after: avoid; } }
 """

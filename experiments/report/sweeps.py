@@ -110,20 +110,38 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
             _bold(o.series, o.series == sweep.base),
             LOSSES[o.metric],
             f"{o.x:.3g}" + (f" <span class=failed>{o.edge}</span>" if o.edge else ""),
+            _moved(o.moved),
             pm(o.loss, o.seed_sem),
             "–" if math.isnan(o.transferred_x) else f"{o.transferred_x:.3g}",
             _penalty(o),
         ]
         for o in optima
     ]
-    head = ["", "curve", "loss", "best rate", "lowest", "base width's best rate", "penalty"]
-    return table(head, lines, text=3) + (
-        "<p>The penalty is what the loss is higher by when a width takes the rate that is best at the base "
-        "width (bold); that of the held-out loss is in nats per token. Errors are over seeds, where there "
-        "are several; the grid is not interpolated. "
+    head = ["", "curve", "loss", "best rate", "steps moved", "lowest", "base width's best rate", "penalty"]
+    return f"<p>{_transfer(optima)}</p>" + table(head, lines, text=3) + (
+        "<p><em>Steps moved</em>: of the grid of rates, from the best of the base width. The penalty is what the loss "
+        "is higher by when a width takes the rate that is best at the base width (bold); that of the held-out loss is "
+        "in nats per token. Errors are over seeds, where there are several; the grid is not interpolated. "
         "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
         "beyond.</p>"
     )
+
+
+def _transfer(optima: Sequence[Optimum]) -> str:
+    """How far the best rate moves from that of the base width, with muP and without, on held-out data."""
+    parts = []
+    for role, words in ROLES.items():
+        own = [o for o in optima if o.role == role and o.metric == "cross_entropy" and not math.isnan(o.moved)]
+        if own:
+            far = max(own, key=lambda o: abs(o.moved))
+            open_ended = ", at an end of the grid, so perhaps further" if far.edge else ""
+            steps = f"{abs(far.moved):.0f} step{'s' * (abs(far.moved) != 1)}"
+            parts.append(f"{words}: the best rate of {len(own)} widths moves by at most {steps}{open_ended}")
+    return f"{'; '.join(parts)} (held-out loss)." if parts else ""
+
+
+def _moved(steps: float) -> str:
+    return "–" if math.isnan(steps) else f"{steps:+.0f}".replace("-", "\u2212") if steps else "0"
 
 
 def _penalty(optimum: Optimum) -> str:

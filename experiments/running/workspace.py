@@ -86,6 +86,11 @@ class Workspace:
         return self.root / "optima.csv"
 
     @property
+    def fits(self) -> Path:
+        """Coefficients of scaling fits."""
+        return self.root / "fits.csv"
+
+    @property
     def figures(self) -> Path:
         return self.root / "figures"
 

@@ -1,0 +1,186 @@
+"""What a scaling fit says, with intervals, and when it says nothing.
+
+L = E + A N^-alpha, or jointly L = E + A N^-alpha + B D^-beta, of a loss L in nats per token: the smallest loss E,
+and how fast each axis brings it down. Residuals are weighted by the noise that seeds were measured to have, and
+intervals are percentiles over bootstraps of seeds x episodes (`measured`).
+
+Points that cannot tell the form from another are refused, with the reason: fewer than four positions on an axis, a
+loss that does not fall, an exponent at the end of what was searched. What is only doubtful is said beside the
+numbers: one seed per point, a coefficient that a good part of the bootstraps leaves at its bound.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.analysis.measured import Measured
+from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, predict_log
+
+DRAWS, LEVEL = 1000, 0.90
+LEAST = 4
+"""Distinct positions on an axis that a power law with a constant needs: three parameters leave one to be wrong by."""
+
+NAMES = (("A", "alpha"), ("B", "beta"))
+WIDE = 4.0
+"""An exponent whose interval spans more than this factor is hardly told; it is said."""
+
+OFTEN = 0.05
+"""The part of the bootstraps at a bound from which a coefficient's interval is called open: it then ends there."""
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    name: str
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class PowerFit:
+    """A fit of `Measured`, or why there is none (`refused`)."""
+
+    axes: tuple[str, ...]
+    trials: tuple[str, ...]
+    refused: str = ""
+    doubts: tuple[str, ...] = ()
+    coefficients: tuple[Coefficient, ...] = ()
+    residuals: np.ndarray | None = None  # [n], of log L
+    noise: np.ndarray | None = None  # [n], standard deviation over seeds of log L; nan where nothing is known
+    theta: np.ndarray | None = None  # [p]
+    thetas: np.ndarray | None = None  # [R, p]
+    centre: np.ndarray | None = None  # [K], mean of log x
+
+    def __getitem__(self, name: str) -> Coefficient:
+        return next(c for c in self.coefficients if c.name == name)
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """L [m] at `x` [m, K]."""
+        return np.exp(predict_log(self.theta, np.log(x) - self.centre))
+
+    def all_at(self, x: np.ndarray) -> np.ndarray:
+        """L [R, m] at `x` [m, K] of every bootstrap."""
+        return np.exp(predict_log(self.thetas, np.log(x) - self.centre))
+
+    def band(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """LEVEL interval [m], [m] of the curve at `x` [m, K]."""
+        return interval(self.all_at(x))
+
+    def formula(self) -> str:
+        """In words: 'L = 1.5 + 98 x^-0.5'."""
+        names = ("N", "D") if len(self.axes) == 2 else ("x",)
+        powers = zip(NAMES, names, strict=False)
+        terms = [f"{self[scale].value:.3g} {x}^-{self[exponent].value:.3g}" for (scale, exponent), x in powers]
+        return " + ".join([f"L = {self['E'].value:.3g}", *terms])
+
+
+def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """LEVEL interval of `values` [R, ...] over the first axis."""
+    return tuple(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
+
+
+def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: bool = True) -> PowerFit:
+    """The saturating power law of a loss over one axis or two, or the reason why there is none.
+
+    `episodes`: whether bootstraps draw episodes too. Without, intervals are conditional on the frozen windows, as
+    what is compared on the same windows needs them.
+    """
+    refused = _unfit(measured)
+    if refused:
+        return PowerFit(measured.axes, measured.trial, refused)
+    noise = measured.noise()
+    weight = _weight(noise)
+    centre = np.log(measured.x).mean(0)
+    z = np.log(measured.x) - centre
+    values = measured.draw(draws, np.random.default_rng(seed), episodes)
+    theta, thetas = fit_draws(z, measured.value, values, weight)
+    residuals = np.log(measured.value) - predict_log(theta, z)
+    found = _coefficients(theta, thetas, centre)
+    refused, doubts = _verdict(measured, theta, thetas)
+    wide = [c for c in found if c.name in ("alpha", "beta") and c.high > WIDE * c.low]
+    doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide if not refused)
+    return PowerFit(
+        measured.axes, measured.trial, refused, doubts, found, residuals, noise, theta, thetas, centre
+    )
+
+
+def _weight(noise: np.ndarray) -> np.ndarray:
+    """Residuals count in units of the typical noise, so that the Huber threshold keeps its meaning."""
+    if np.isnan(noise).any() or not (noise > 0).all():
+        return np.ones(len(noise))
+    return np.exp(np.log(noise).mean()) / noise
+
+
+def _unfit(measured: Measured) -> str:
+    """Why no power law can be fitted; '' if one can."""
+    for name, column in zip(measured.axes, measured.x.T, strict=True):
+        distinct = np.unique(column)
+        if len(distinct) < LEAST:
+            return f"{len(distinct)} distinct {name}; the form has to be told from at least {LEAST}"
+        if not (distinct > 0).all():
+            return f"{name} has to be positive, got {distinct.min():g}"
+    if not (measured.value > 0).all():
+        return f"the loss has to be positive, got {measured.value.min():g}"
+    return _rising(measured)
+
+
+def _rising(measured: Measured) -> str:
+    """A loss that does not fall from the first position of an axis to the last, by more than seeds scatter."""
+    logs, noise = np.log(measured.value), np.nan_to_num(measured.noise())
+    for k, name in enumerate(measured.axes):
+        others = np.delete(measured.x, k, axis=1)
+        falls, errors = [], []
+        for rest in np.unique(others, axis=0):
+            line = (others == rest).all(1)
+            column = measured.x[line, k]
+            if len(np.unique(column)) < 2:
+                continue
+            first, last = column == column.min(), column == column.max()
+            falls.append(logs[line][first].mean() - logs[line][last].mean())
+            errors.append(math.hypot(*(noise[line][e].mean() / math.sqrt(e.sum()) for e in (first, last))))
+        fall, error = np.mean(falls), math.sqrt(np.sum(np.square(errors))) / len(errors)
+        if fall <= 2 * error:
+            return (
+                f"the loss does not fall with {name}: from its first to its last it changes by {-100 * fall:+.1f} %, "
+                f"with a standard error over seeds of {100 * error:.1f} %"
+            )
+    return ""
+
+
+def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> tuple[Coefficient, ...]:
+    """In units of x: A = A at the centre times exp(alpha centre)."""
+    def named(t: np.ndarray) -> dict[str, np.ndarray]:
+        found = {"E": np.exp(t[..., 0])}
+        for k, (scale, exponent) in enumerate(NAMES[: len(centre)]):
+            alpha = t[..., 1 + len(centre) + k]
+            found |= {scale: np.exp(t[..., 1 + k] + alpha * centre[k]), exponent: alpha}
+        return found
+
+    values, draws = named(theta), named(thetas)
+    return tuple(Coefficient(n, float(values[n]), *map(float, interval(draws[n]))) for n in values)
+
+
+def _verdict(measured: Measured, theta: np.ndarray, thetas: np.ndarray) -> tuple[str, tuple[str, ...]]:
+    """(why the form is not identified, or '', what is doubtful)."""
+    k, doubts = len(measured.axes), []
+    for i, (_, name) in enumerate(NAMES[:k]):
+        low, high = (np.isclose(thetas[:, 1 + k + i], bound, rtol=0, atol=1e-3) for bound in ALPHA)
+        if np.isclose(theta[1 + k + i], ALPHA, rtol=0, atol=1e-3).any():
+            bound = ALPHA[int(theta[1 + k + i] > 1)]
+            return f"{name} is at {bound:g}, the end of what was searched: these points do not tell the form", ()
+        part = float((low | high).mean())
+        if part > OFTEN:
+            ends = " and ".join(f"{b:g}" for b, at in zip(ALPHA, (low, high), strict=True) if at.any())
+            doubts.append(f"in {part:.0%} of the bootstraps {name} is at the end of what was searched ({ends})")
+    lowest = np.log(measured.value.min())
+    zero = float((thetas[:, 0] < lowest + np.log(10 * FLOOR)).mean())
+    if zero > OFTEN:
+        doubts.append(f"in {zero:.0%} of the bootstraps E is zero: the interval of E reaches down to it")
+    if measured.seeds_per_point() < 2:
+        doubts.append("a point has one seed: the intervals do not hold its noise")
+    elif measured.seeds_per_point() < 3:
+        doubts.append("a point has two seeds only")
+    return "", tuple(doubts)

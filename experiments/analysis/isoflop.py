@@ -1,0 +1,144 @@
+"""Which size is best for a budget of training FLOPs: minima of isoFLOP curves, and the power law through them.
+
+Each size's run gives its loss at several budgets, by its decay branches; between them the loss is interpolated in
+the logarithm (modified Akima, no further out than TOLERANCE). At one budget the loss over log N is fitted by a
+parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A parabola whose minimum lies at an end of the
+sizes, or that opens downwards, is refused: the best size may lie beyond.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import Akima1DInterpolator
+
+from experiments.analysis.fits import DRAWS, OFTEN, Coefficient, interval
+from experiments.analysis.measured import Measured
+
+TOLERANCE = 0.1
+"""How far off a budget a size's nearest measured FLOPs may lie beyond its ends, as a part of it."""
+
+LEAST_SIZES, LEAST_BUDGETS = 4, 3
+"""Sizes at one budget, so that a parabola has one to be wrong by; budgets with a minimum, for the power law."""
+
+BUDGETS = 4
+
+NEAR = 2
+"""Sizes on either side of the best one that the parabola is fitted to: further out the curve is none."""
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The sizes at one budget of training FLOPs."""
+
+    flops: float
+    sizes: np.ndarray  # [m]
+    loss: np.ndarray  # [m], mean over seeds
+    parabola: np.ndarray | None = None  # of log loss over log size - `centre`, highest power first
+    centre: float = 0.0
+    best: Coefficient | None = None  # N_opt
+    refused: str = ""
+    doubt: str = ""
+
+    def at(self, sizes: np.ndarray) -> np.ndarray:
+        """The parabola's loss."""
+        return np.exp(np.polyval(self.parabola, np.log(sizes) - self.centre))
+
+
+@dataclass(frozen=True)
+class IsoFlop:
+    budgets: tuple[Budget, ...] = ()
+    exponent: Coefficient | None = None  # a of N_opt = k C^a
+    scale: float = float("nan")  # k
+    refused: str = ""
+
+
+def fit_isoflop(
+    measured: Measured, budgets: np.ndarray | None = None, draws: int = DRAWS, seed: int = 0
+) -> IsoFlop:
+    """Of losses over (size N, training FLOPs C). Without `budgets`, BUDGETS of them, evenly spread in log C over
+    where at least LEAST_SIZES sizes were measured."""
+    sizes = np.unique(measured.x[:, 0])
+    if len(sizes) < LEAST_SIZES:
+        return IsoFlop(refused=f"{len(sizes)} sizes; a minimum over sizes needs at least {LEAST_SIZES}")
+    values = np.concatenate([measured.value[None], measured.draw(draws, np.random.default_rng(seed))])  # [1 + R, n]
+    lines = [_Line(measured, values, size) for size in sizes]
+    budgets = _common_budgets(lines) if budgets is None else np.asarray(budgets, float)
+    if not len(budgets):
+        return IsoFlop(refused=f"no budget that {LEAST_SIZES} sizes were trained for")
+    fitted = [_fit_budget(lines, flops) for flops in budgets]
+    found, minima = [b for b, _ in fitted], [(b.flops, m) for b, m in fitted if b.best]
+    if len(minima) < LEAST_BUDGETS:
+        why = f"{len(minima)} of {len(found)} budgets have a minimum; the exponent needs at least {LEAST_BUDGETS}"
+        return IsoFlop(tuple(found), refused=why)
+    flops, optima = np.log([f for f, _ in minima]), np.stack([m for _, m in minima])  # [b], [b, 1 + R]
+    slope, level = np.polyfit(flops - flops.mean(), optima, 1)
+    scale = float(np.exp(level[0] - slope[0] * flops.mean()))
+    exponent = Coefficient("a", float(slope[0]), *map(float, interval(slope[1:])))
+    return IsoFlop(tuple(found), exponent, scale)
+
+
+class _Line:
+    """log loss of one size over log C, of the values and of every draw, its seeds averaged."""
+
+    def __init__(self, measured: Measured, values: np.ndarray, size: float):
+        own = measured.x[:, 0] == size
+        self.size, flops = size, measured.x[own, 1]
+        self.flops, which = np.unique(flops, return_inverse=True)
+        means = np.stack([values[:, own][:, which == i].mean(1) for i in range(len(self.flops))])  # [c, 1 + R]
+        self.logs = np.log(means)
+
+    def covers(self, flops: float) -> bool:
+        return self.flops[0] * (1 - TOLERANCE) <= flops <= self.flops[-1] * (1 + TOLERANCE)
+
+    def at(self, flops: float) -> np.ndarray:
+        """[1 + R] log loss."""
+        inside = np.clip(flops, self.flops[0], self.flops[-1])
+        if len(self.flops) == 1 or inside in self.flops:
+            return self.logs[np.searchsorted(self.flops, inside)]
+        return Akima1DInterpolator(np.log(self.flops), self.logs, axis=0, method="makima")(np.log(inside))
+
+
+def _common_budgets(lines: list[_Line]) -> np.ndarray:
+    """Evenly spread in log C between the lowest and the highest that enough sizes cover."""
+    ends = np.unique(np.concatenate([line.flops for line in lines]))
+    covered = [f for f in ends if sum(line.covers(f) for line in lines) >= LEAST_SIZES]
+    if not covered:
+        return np.array([])
+    if covered[0] == covered[-1]:
+        return np.array(covered[:1])
+    budgets = np.geomspace(covered[0], covered[-1], BUDGETS)
+    return np.array([b for b in budgets if sum(line.covers(b) for line in lines) >= LEAST_SIZES])
+
+
+def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
+    """(the budget, log N_opt [1 + R])."""
+    covering = [line for line in lines if line.covers(flops)]
+    sizes = np.array([line.size for line in covering])
+    logs = np.stack([line.at(flops) for line in covering]) if covering else np.zeros((0, 1))
+    loss = np.exp(logs[:, 0])
+    if len(sizes) < LEAST_SIZES:
+        few = f"{len(sizes)} sizes; at least {LEAST_SIZES} are needed"
+        return Budget(flops, sizes, loss, refused=few), np.array([])
+    least = int(np.argmin(loss))
+    first = max(min(least - NEAR, len(sizes) - 2 * NEAR - 1), 0)
+    near = slice(first, first + 2 * NEAR + 1)
+    sizes, loss, logs = sizes[near], loss[near], logs[near]
+    x = np.log(sizes)
+    parabolas = np.polyfit(x - x.mean(), logs, 2)  # [3, 1 + R]
+    opens_up = parabolas[0] > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lowest = np.where(opens_up, -parabolas[1] / (2 * parabolas[0]), np.nan) + x.mean()
+    # A draw that opens downwards is lowest at the end to which it falls.
+    falling = np.where(logs[0] < logs[-1], x[0], x[-1])
+    lowest = np.where(opens_up, np.clip(lowest, x[0], x[-1]), falling)
+    common = dict(parabola=parabolas[:, 0], centre=float(x.mean()))
+    if not opens_up[0] or lowest[0] in (x[0], x[-1]):
+        end = "smallest" if lowest[0] == x[0] else "largest"
+        refused = f"the {end} size is best: the minimum may lie beyond"
+        return Budget(flops, sizes, loss, **common, refused=refused), lowest
+    part = float(np.isin(lowest[1:], (x[0], x[-1])).mean())
+    doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OFTEN else ""
+    best = Coefficient("N_opt", *(float(np.exp(v)) for v in (lowest[0], *interval(lowest[1:]))))
+    return Budget(flops, sizes, loss, **common, best=best, doubt=doubt), lowest

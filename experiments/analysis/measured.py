@@ -1,0 +1,137 @@
+"""The losses that a curve is fitted to, and how they would scatter with other seeds and other episodes.
+
+Episodes are drawn by `bootstrap`: all trials are judged on the same frozen windows, so that a draw takes the same ones
+for all of them, and what makes an episode hard moves the whole curve and not its shape. Seeds are drawn here, since a
+fit is made to every trial and not to the mean over seeds: an outlier among them then weighs little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from experiments.analysis.bootstrap import Panel, make_panel, resample
+from hma_jax.config import require
+from hma_jax.evaluation.windows import WindowTable
+
+PRIOR = 4.0
+"""Observations that the pooled variance over seeds counts as, beside those of a point: three seeds say little."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A loss in nats per token of n trials at positions `x` on K axes."""
+
+    axes: tuple[str, ...]  # K names, such as "trunk parameters"
+    x: np.ndarray  # [n, K]
+    run: np.ndarray  # [n], str: points of one run (a trial and its decay branches) share their seeds' luck
+    trial: tuple[str, ...]  # n ids
+    panel: Panel  # of their windows: each trial a point of its own, with one seed
+
+    def __post_init__(self):
+        lengths = {len(self.x), len(self.run), len(self.trial), len(self.panel.points)}
+        require(len(lengths) == 1, f"the columns of measured trials differ in length: {sorted(lengths)}")
+
+    @cached_property
+    def seed(self) -> np.ndarray:
+        """[n], int."""
+        return np.array([own for (own,) in self.panel.seeds])
+
+    @cached_property
+    def value(self) -> np.ndarray:
+        """[n]: mean over windows, then over robots."""
+        return resample(self.panel, 1, over_seeds=False, over_episodes=False).value
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """[n]: the number of the distinct position that each trial stands at."""
+        return np.unique(self.x, axis=0, return_inverse=True)[1].ravel()
+
+    def only(self, chosen: np.ndarray) -> Measured:
+        """The trials where `chosen` [n] holds."""
+        at = np.flatnonzero(chosen)
+        points, seeds = (tuple(column[i] for i in at) for column in (self.panel.points, self.panel.seeds))
+        panel = Panel(self.panel.robot, self.panel.episode, points, seeds)
+        return Measured(self.axes, self.x[at], self.run[at], tuple(self.trial[i] for i in at), panel)
+
+    def seeds_per_point(self) -> int:
+        """The least that any position has."""
+        return int(np.bincount(self.points).min())
+
+    def noise(self) -> np.ndarray:
+        """[n]: standard deviation over seeds of the logarithm of a trial's loss, at its position.
+
+        The variance of a position is joined with that of all, which counts as PRIOR more observations. nan where no
+        position has two seeds.
+        """
+        logs, points = np.log(self.value), self.points
+        count = np.bincount(points)
+        mean = np.bincount(points, logs) / count
+        squares = np.bincount(points, (logs - mean[points]) ** 2)
+        freedom = count - 1
+        if not freedom.sum():
+            return np.full(len(logs), np.nan)
+        pooled = squares.sum() / freedom.sum()
+        return np.sqrt((squares + PRIOR * pooled) / (freedom + PRIOR))[points]
+
+    def draw(self, draws: int, rng: np.random.Generator, episodes: bool = True) -> np.ndarray:
+        """[draws, n]: the losses with seeds, and unless told otherwise episodes, drawn with replacement.
+
+        Seeds are drawn per run, so that branches of a run move together. A seed's deviation from the mean of its
+        position is taken sqrt(m / (m - 1)) times for m seeds: otherwise the spread of few would come out too small.
+        With a single seed nothing is known of the spread, and the loss keeps it.
+        """
+        number = int(rng.integers(2**31))
+        means_Rn = resample(self.panel, draws, number, over_seeds=False, over_episodes=episodes).drawn
+        found = means_Rn.copy()
+        for run in np.unique(self.run):
+            own_run = self.run == run
+            seeds = np.unique(self.seed[own_run])
+            chosen_RS = rng.integers(0, len(seeds), (draws, len(seeds)))
+            for point in np.unique(self.points[own_run]):
+                at = np.flatnonzero(own_run & (self.points == point))
+                at = at[np.argsort(self.seed[at])]
+                m = len(at)
+                if m < 2:
+                    continue
+                # Where some seeds of the run are missing, those that there are are drawn on their own.
+                chosen = chosen_RS if m == len(seeds) else rng.integers(0, m, (draws, m))
+                own = means_Rn[:, at]
+                centre = own.mean(1, keepdims=True)
+                found[:, at] = centre + np.sqrt(m / (m - 1)) * (np.take_along_axis(own, chosen, 1) - centre)
+        return found
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a trial stands."""
+
+    trial: str
+    run: str
+    seed: int
+    x: tuple[float, ...]
+
+
+def measure(
+    axes: Sequence[str],
+    places: Sequence[Place],
+    tables: Mapping[str, WindowTable],
+    scope: Sequence[str],
+    metric: str = "cross_entropy",
+) -> Measured:
+    """The losses of trials at `places` from their `tables` of windows, over the datasets of `scope`.
+
+    Raises NotComparable unless all were judged on the same windows.
+    """
+    require(len(places) > 0, "no finished trial to measure")
+    panel = make_panel([{place.seed: tables[place.trial]} for place in places], metric, scope)
+    return Measured(
+        tuple(axes),
+        np.array([place.x for place in places], float).reshape(len(places), len(axes)),
+        np.array([place.run for place in places]),
+        tuple(place.trial for place in places),
+        panel,
+    )

@@ -1,0 +1,137 @@
+"""What a fit says of trials that have not run, written down before they do; and what came.
+
+A prediction is a small JSON file, sealed with a hash of itself: the fit, the hash of every result it was made from,
+which trials were finished then, and the loss that the trials of one position will have on the frozen windows, with an
+interval. The interval holds the bootstraps of the fit over seeds and the noise of the new trials' own seeds; not that
+of episodes, since the windows are the same, and not that of the form, which is what the prediction puts to the test.
+Its date is that of the commit that brings it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from experiments.analysis.fits import DRAWS, LEVEL, interval
+from experiments.analysis.measured import Place, measure
+from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_at
+from hma_jax.config import ConfigError, require
+from hma_jax.config.json import from_dict, stable_hash, to_dict
+from hma_jax.evaluation.windows import WindowTable
+
+FOLDER = "predictions"
+"""Where a study keeps them."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Of the mean loss, in nats per token, of `trials` at `x`."""
+
+    curve: str
+    axes: tuple[str, ...]
+    x: tuple[float, ...]
+    trials: tuple[str, ...]
+    mean: float
+    low: float
+    high: float
+    level: float
+    formula: str
+    coefficients: dict[str, tuple[float, float, float]]  # value and interval
+    inputs: dict[str, str]  # {trial id: hash of its result} of the fit
+    finished: tuple[str, ...]  # every trial of the study that had a result when this was written
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A prediction beside what came; `marks` say why it may count for less."""
+
+    prediction: Prediction
+    observed: float | None  # None: none of its trials is finished
+    seeds: int
+    marks: tuple[str, ...]
+
+    @property
+    def inside(self) -> bool | None:
+        if self.observed is None:
+            return None
+        return self.prediction.low <= self.observed <= self.prediction.high
+
+
+def predict(
+    curve: Curve,
+    held_out: Sequence[Place],
+    windows: Mapping[str, WindowTable],
+    hashes: Mapping[str, str],
+    draws: int = DRAWS,
+) -> Prediction:
+    """Of the trials at one position, from the other finished ones of the curve.
+
+    `windows` are those of all finished trials of the study, `hashes` of their results. Raises ConfigError if one of
+    the trials is finished already, or the others identify no power law.
+    """
+    ids = tuple(p.trial for p in held_out)
+    there = [id for id in ids if id in windows]
+    require(not there, f"{', '.join(there)} has a result already: a prediction is made before its trial is run")
+    others = Curve(curve.name, curve.axes, curve.scope, tuple(p for p in curve.places if p.trial not in ids))
+    fitted = fit_curve(others, windows, draws, episodes=False)
+    fit = fitted.fit
+    require(not fit.refused, f"{curve.name}: nothing can be predicted: {fit.refused}")
+    x = np.array([held_out[0].x])
+    noise = noise_at(fitted.measured) / np.sqrt(len(ids))
+    require(np.isfinite(noise), f"{curve.name}: one seed per point: the interval of a prediction needs their noise")
+    spread = np.exp(noise * np.random.default_rng(1).standard_normal(len(fit.thetas)))
+    low, high = interval(fit.all_at(x)[:, 0] * spread)
+    return Prediction(
+        curve.name, curve.axes, tuple(map(float, x[0])), ids, float(fit.at(x)[0]), float(low), float(high), LEVEL,
+        fit.formula(), {c.name: (c.value, c.low, c.high) for c in fit.coefficients},
+        {id: hashes[id] for id in fit.trials}, tuple(sorted(windows)),
+    )  # fmt: skip
+
+
+def compare(
+    prediction: Prediction, curves: Sequence[Curve], windows: Mapping[str, WindowTable], hashes: Mapping[str, str]
+) -> Outcome:
+    """What came of a prediction."""
+    curve = next((c for c in curves if c.name == prediction.curve), None)
+    finished = [p for p in curve.finished(windows) if p.trial in prediction.trials] if curve else []
+    marks = []
+    if early := [id for id in prediction.trials if id in prediction.finished or id in prediction.inputs]:
+        marks.append(f"made after {', '.join(early)} had run: no prediction")
+    if changed := [id for id, hash in prediction.inputs.items() if hashes.get(id) != hash]:
+        marks.append(f"{len(changed)} of the {len(prediction.inputs)} results it was made from changed or are missing")
+    if curve is None or not set(prediction.trials) <= {p.trial for p in curve.places}:
+        marks.append("the study does not plan its trials")
+    if finished and len(finished) < len(prediction.trials):
+        marks.append(f"{len(finished)} of its {len(prediction.trials)} trials finished")
+    observed = float(measure(curve.axes, finished, windows, curve.scope, LOSS).value.mean()) if finished else None
+    return Outcome(prediction, observed, len(finished), tuple(marks))
+
+
+def save_prediction(path: Path, prediction: Prediction) -> None:
+    """Raises ConfigError where there is one already: what was said is not said again."""
+    require(not path.exists(), f"{path} is a prediction that was made before; it stays. Give another --out")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = to_dict(prediction)
+    write_file(path, json.dumps({"hash": stable_hash(values), **values}, indent=1) + "\n")
+
+
+def load_predictions(folder: Path) -> dict[str, Prediction]:
+    """By file name. Raises ConfigError for one that was edited or cannot be read."""
+    return {path.name: _load(path) for path in sorted(folder.glob("*.json"))}
+
+
+def _load(path: Path) -> Prediction:
+    try:
+        values: dict[str, Any] = json.loads(path.read_text())
+        seal = values.pop("hash")
+        prediction = from_dict(Prediction, values)
+    except (OSError, ValueError, KeyError, TypeError) as error:  # ConfigError is a ValueError
+        raise ConfigError(f"{path}: no prediction can be read ({error}); restore it, or remove it") from error
+    require(seal == stable_hash(values), f"{path} was changed after it was written; restore it, or remove it")
+    return prediction

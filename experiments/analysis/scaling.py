@@ -1,0 +1,182 @@
+"""The curves of a study that a power law is fitted to, from its sweeps and every window's numbers.
+
+A sweep over one number is a curve, or one for each of its series. Where its trials differ in width, the axis is not
+the width but the parameters of the trunk: most of the others belong to single robots. Trials that differ in nothing
+but width and steps, wherever in the study they are, make one surface over parameters and windows seen, for the joint
+fit, and over parameters and training FLOPs, for the best size of a budget.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from experiments.analysis.fits import DRAWS, PowerFit, fit_power
+from experiments.analysis.isoflop import IsoFlop, fit_isoflop
+from experiments.analysis.measured import Measured, Place, measure
+from experiments.running.provenance import Provenance
+from experiments.running.trial import Trial, trial_id
+from experiments.sweeps.sweep import POINT, Point, Sweep
+from hma_jax.config import ModelConfig
+from hma_jax.config.json import stable_hash, to_dict
+from hma_jax.evaluation.windows import WindowTable
+
+LOSS = "cross_entropy"
+"""Nats per token: what is fitted. Its exponential, the perplexity, is no sum of powers."""
+
+TRUNK, WINDOWS, FLOPS = "trunk parameters", "windows seen", "training FLOPs"
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Trials on one axis, or two, judged on `scope`; `places` are those that the study plans."""
+
+    name: str  # such as "width", and "-<series>" after it
+    axes: tuple[str, ...]
+    scope: tuple[str, ...]
+    places: tuple[Place, ...]
+
+    def finished(self, windows: Mapping[str, WindowTable]) -> tuple[Place, ...]:
+        return tuple(p for p in self.places if p.trial in windows and LOSS in windows[p.trial].metrics)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A curve with what was measured on it and its fit."""
+
+    curve: Curve
+    measured: Measured | None  # None: nothing is finished
+    fit: PowerFit
+
+
+def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
+    """One for every sweep over a number and each of its series."""
+    found = []
+    for sweep in sweeps:
+        if not sweep.scaling:
+            continue
+        lines: dict[str, list[Point]] = defaultdict(list)
+        for point in sweep.points:
+            if point.role == POINT:
+                lines[point.series].append(point)
+        found += [_curve(sweep, series, points, provenance) for series, points in lines.items()]
+    return found
+
+
+def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tuple[Trial, Curve]]:
+    """{trial id: (trial, the curve over TRUNK and WINDOWS that all of them share)}; the largest such group of a study,
+    or {} where none has two widths and two numbers of steps."""
+    groups: dict[str, dict[str, Trial]] = defaultdict(dict)
+    for sweep in sweeps:
+        for point in sweep.points:
+            if point.role == POINT and sweep.scaling:
+                groups[_all_but_size(point.trial)][trial_id(point.trial, provenance)] = point.trial
+
+    def varies(group: dict[str, Trial], what: Callable[[Trial], float]) -> bool:
+        return len({what(trial) for trial in group.values()}) > 1
+
+    both = [g for g in groups.values() if varies(g, lambda t: t.model.width) and varies(g, _seen)]
+    if not both:
+        return {}
+    group = max(both, key=len)
+    places = tuple(
+        Place(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)))
+        for id, t in group.items()
+    )
+    curve = Curve("joint", (TRUNK, WINDOWS), next(iter(group.values())).evaluated, places)
+    return {id: (trial, curve) for id, trial in group.items()}
+
+
+def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRAWS, episodes: bool = True) -> Fitted:
+    """The power law of the finished trials of a curve. Raises ConfigError if they saw different windows."""
+    places = curve.finished(windows)
+    if not places:
+        return Fitted(curve, None, PowerFit(curve.axes, (), f"no finished trial has a {LOSS} of its windows"))
+    measured = measure(curve.axes, places, windows, curve.scope, LOSS)
+    return Fitted(curve, measured, fit_power(measured, draws, episodes=episodes))
+
+
+def fit_study(
+    sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable], draws: int = DRAWS
+) -> list[Fitted]:
+    """The fit of each curve, and the joint one where there is a surface."""
+    curves = curves_of(sweeps, provenance)
+    surface = surface_of(sweeps, provenance)
+    if surface:
+        curves.append(next(iter(surface.values()))[1])
+    return [fit_curve(curve, windows, draws) for curve in curves]
+
+
+def fit_budgets(
+    sweeps: Sequence[Sweep],
+    provenance: Provenance,
+    windows: Mapping[str, WindowTable],
+    flops: Mapping[str, float],
+    draws: int = DRAWS,
+) -> tuple[Measured | None, IsoFlop | None]:
+    """The best size for a budget, from the surface's trials and the training `flops` of each; (None, None) without."""
+    surface = surface_of(sweeps, provenance)
+    if not surface:
+        return None, None
+    curve = next(iter(surface.values()))[1]
+    places = [replace(p, x=(p.x[0], flops[p.trial])) for p in curve.finished(windows)]
+    if not places:
+        return None, None
+    measured = measure((TRUNK, FLOPS), places, windows, curve.scope, LOSS)
+    return measured, fit_isoflop(measured, draws=draws)
+
+
+def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Provenance) -> Curve:
+    """Over TRUNK where its trials differ in width."""
+    wider = len({p.trial.model.width for p in points}) > 1
+
+    def place(p: Point) -> Place:
+        x = float(trunk_parameters(p.trial.model)) if wider else float(p.x)
+        return Place(trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,))
+
+    name = "-".join(filter(None, (sweep.name, series)))
+    return Curve(name, (TRUNK if wider else sweep.axis,), sweep.scope, tuple(map(place, points)))
+
+
+@lru_cache
+def trunk_parameters(config: ModelConfig) -> int:
+    """Parameters of the trunk that all robots share, counted on the declared model; no array is made."""
+    from experiments.cost import ONE_ROBOT
+    from hma_jax.model.hma import declare_model
+
+    leaves = declare_model(config, ONE_ROBOT).leaves()
+    return sum(s.size for name, s in leaves.items() if name.startswith("trunk/") and s.embodiment_axis is None)
+
+
+def _seen(trial: Trial) -> float:
+    return float(trial.train.steps * trial.train.batch)
+
+
+def _run_of(trial: Trial) -> str:
+    """Equal for trials that differ in steps and seed alone: the branches of one run, for each of its seeds."""
+    return stable_hash(_without_steps(trial))
+
+
+def _all_but_size(trial: Trial) -> str:
+    """Equal for trials that differ in width, steps and seed alone."""
+    values = _without_steps(trial)
+    values["model"].pop("width")
+    return stable_hash(values)
+
+
+def _without_steps(trial: Trial) -> dict[str, Any]:
+    values: dict[str, Any] = to_dict(trial)
+    for name in ("steps", "seed"):
+        values["train"].pop(name)
+    values.pop("measure_untrained")
+    return values
+
+
+def noise_at(measured: Measured) -> float:
+    """Standard deviation over seeds of the logarithm of a trial's loss, over all positions."""
+    return float(np.sqrt(np.nanmean(measured.noise() ** 2)))

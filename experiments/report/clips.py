@@ -1,0 +1,92 @@
+"""Clips that play: what was recorded, what was predicted, and what was predicted under other actions.
+
+One animation per robot holds the three side by side, so that they cannot fall out of step, with a bar that fills as
+time passes: grey while frames are given, coloured while they are predicted. On paper, where nothing plays, frames
+stand in rows.
+"""
+
+from __future__ import annotations
+
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from experiments.report.pieces import data_uri, frames
+
+KINDS = {"true": "recorded", "predicted": "predicted", "random": "other actions"}
+"""Keys of samples.npz, with their captions."""
+
+SHOWN, ON_PAPER = 12, 4
+"""Robots whose clips are visible at once (the others unfold), and those whose frames are printed."""
+
+SHOW_MS, HOLD_MS = 260, 1100
+"""Milliseconds of a frame, and of the last one."""
+
+GIVEN, PREDICTED, REST = (150, 156, 163), (43, 92, 138), (228, 231, 234)
+BAR = 2
+"""Pixels of the bar's height; a line of white above it."""
+
+
+def describe_clips(path: Path, prompt: int, order: Sequence[str]) -> str:
+    """The first window of each dataset of samples.npz, in the given order. `prompt`: frames that are given."""
+    with np.load(path) as samples:
+        names = {key.split("/")[0] for key in samples.files}
+        chosen = [n for n in order if n in names]
+        clips = {n: {k: samples[f"{n}/{k}"][0] for k in KINDS if f"{n}/{k}" in samples.files} for n in chosen}
+    figures = [_figure(name, kinds, prompt) for name, kinds in clips.items()]
+    rest = "".join(figures[SHOWN:])
+    more = f"<details><summary>{len(figures) - SHOWN} more robots</summary><div class=trios>{rest}</div></details>"
+    paper = "".join(_strip(name, kinds, prompt) for name, kinds in list(clips.items())[:ON_PAPER])
+    return (
+        f"<p>The first validation window of each robot. Of its frames the first {prompt} are given (grey bar); the "
+        "rest is predicted from actions alone: once from those that were recorded, once from others, drawn at random. "
+        "Where the model listens, the right clip leaves the left one and the middle one stays with it.</p>"
+        f'<div class=trios>{"".join(figures[:SHOWN])}</div>{more if rest else ""}<div class=paper>{paper}</div>'
+    )
+
+
+def _figure(name: str, kinds: dict[str, np.ndarray], prompt: int) -> str:
+    captions = "".join(f"<span>{KINDS[k]}</span>" for k in kinds)
+    height, width = next(iter(kinds.values())).shape[1:3]
+    ratio = f"{len(kinds) * width + (len(kinds) - 1) * _gap(width)} / {height + BAR + 1}"
+    return (
+        f"<figure class=trio><figcaption>{html.escape(name)}</figcaption>"
+        f'<img alt="{html.escape(name)}: recorded and predicted frames" style="aspect-ratio: {ratio}" '
+        f'src="{data_uri(animate(list(kinds.values()), prompt), "webp")}"><div>{captions}</div></figure>'
+    )
+
+
+def _gap(width: int) -> int:
+    return max(width // 16, 1)
+
+
+def animate(clips: Sequence[np.ndarray], prompt: int) -> bytes:
+    """Clips uint8 [T, H, W, 3] side by side as an animated WebP, without loss: small pictures are shown enlarged."""
+    count, height, width, _ = clips[0].shape
+    gap = _gap(width)
+    whole = len(clips) * width + (len(clips) - 1) * gap
+    pictures = []
+    for t in range(count):
+        picture = np.full((height + BAR + 1, whole, 3), 255, np.uint8)
+        for i, clip in enumerate(clips):
+            picture[:height, i * (width + gap) : i * (width + gap) + width] = clip[t]
+        picture[-BAR:] = REST
+        past, given = (round(whole * n / count) for n in (t + 1, min(t + 1, prompt)))
+        picture[-BAR:, :past], picture[-BAR:, :given] = PREDICTED, GIVEN
+        pictures.append(Image.fromarray(picture))
+    buffer = io.BytesIO()
+    pictures[0].save(
+        buffer, "WEBP", save_all=True, append_images=pictures[1:], lossless=True, method=4, quality=80, loop=0,
+        duration=[SHOW_MS] * (count - 1) + [HOLD_MS],
+    )  # fmt: skip
+    return buffer.getvalue()
+
+
+def _strip(name: str, kinds: dict[str, np.ndarray], prompt: int) -> str:
+    """Rows of frames."""
+    rows = "".join(f"<div><span>{KINDS[k]}</span>{frames(clip, prompt)}</div>" for k, clip in kinds.items())
+    return f"<figure class=strip><figcaption>{html.escape(name)}</figcaption>{rows}</figure>"

@@ -1,0 +1,125 @@
+"""What the report says of scaling fits: coefficients with intervals, predictions and what came, best sizes."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from experiments.analysis.fits import DRAWS, LEVEL, Coefficient
+from experiments.analysis.isoflop import IsoFlop
+from experiments.analysis.predictions import Outcome
+from experiments.analysis.scaling import Fitted
+from experiments.report.pieces import table
+
+VERDICTS = {None: "", True: "<span class=finished>inside</span>", False: "<span class=failed>outside</span>"}
+
+DIGITS = 6
+"""Significant ones in the table of fits: it is the same bytes on machines that round the rest otherwise."""
+
+
+@dataclass(frozen=True)
+class FitRow:
+    """A line of fits.csv: one coefficient, or with none of them why there is no fit."""
+
+    curve: str
+    axes: str
+    trials: int
+    coefficient: str
+    value: str
+    low: str
+    high: str
+    refused: str
+    doubts: str
+
+
+def fit_rows(fits: Sequence[Fitted], isoflop: IsoFlop | None) -> list[FitRow]:
+    rows = []
+    for fitted in fits:
+        fit, said = fitted.fit, (fitted.curve.name, " x ".join(fitted.curve.axes), len(fitted.fit.trials))
+        rows += _rows(said, () if fit.refused else fit.coefficients, fit.refused, fit.doubts)
+    if isoflop is not None:
+        coefficients = (isoflop.exponent,) if isoflop.exponent else ()
+        best = [b for b in isoflop.budgets if b.best]
+        rows += _rows(("isoflop", "training FLOPs", len(best)), coefficients, isoflop.refused, ())
+        for b in best:
+            said = (f"isoflop {b.flops:.4g}", "trunk parameters", len(b.sizes))
+            rows += _rows(said, (b.best,), b.refused, (b.doubt,) if b.doubt else ())
+    return rows
+
+
+def _rows(
+    said: tuple[str, str, int], coefficients: Iterable[Coefficient], refused: str, doubts: Sequence[str]
+) -> list[FitRow]:
+    last = (refused, "; ".join(doubts))
+    numbers = [(c.name, *(f"{v:.{DIGITS}g}" for v in (c.value, c.low, c.high))) for c in coefficients]
+    return [FitRow(*said, *n, *last) for n in numbers or [("", "", "", "")]]
+
+
+def describe_fits(fits: Sequence[Fitted], isoflop: IsoFlop | None, outcomes: Sequence[Outcome], drawn: str) -> str:
+    """`drawn`: the figures."""
+    lines = []
+    for fitted in fits:
+        name, fit = html.escape(fitted.curve.name), fitted.fit
+        axes = html.escape(", ".join(fitted.curve.axes))
+        if fit.refused:
+            lines.append([name, axes, "–", "–", "–", f"No fit: {html.escape(fit.refused)}."])
+            continue
+        exponents = "; ".join(_with_interval(c) for c in fit.coefficients if c.name in ("alpha", "beta"))
+        remarks = html.escape(". ".join(d[0].upper() + d[1:] for d in fit.doubts))
+        lines.append([
+            name, axes, _as_html(fit.formula()), exponents, _with_interval(fit["E"]), f"{remarks}." if remarks else ""
+        ])  # fmt: skip
+    head = ["curve", "over", "L, nats per token", "exponent", "E", "remarks"]
+    return (
+        "<p>Fitted is L = E + A x<sup>\u2212\u03b1</sup>, the loss in nats per held-out token over the axis: Huber "
+        "loss in the logarithm, points weighted by the noise that seeds were measured to have. Brackets hold "
+        f"{LEVEL:.0%} of {DRAWS:,} bootstraps over seeds and episodes. A fit describes these robots, this "
+        "tokenizer and this range; beyond its last point it is a guess until a prediction has come true.</p>"
+        f"{drawn}{table(head, lines, text=6)}{_outcomes(outcomes)}{_isoflop(isoflop)}"
+    )
+
+
+def _as_html(formula: str) -> str:
+    """'x^-0.5' with a raised exponent."""
+    return re.sub(r"\^-([\d.e+-]+)", "<sup>\u2212\\1</sup>", html.escape(formula))
+
+
+def _with_interval(c: Coefficient) -> str:
+    name = {"alpha": "\u03b1 = ", "beta": "\u03b2 = "}.get(c.name, "")
+    return f"{name}{c.value:.3g} <span class=sem>[{c.low:.3g}, {c.high:.3g}]</span>"
+
+
+def _outcomes(outcomes: Sequence[Outcome]) -> str:
+    if not outcomes:
+        return ""
+    lines = []
+    for o in outcomes:
+        p = o.prediction
+        where = ", ".join(f"{x:,.0f} {axis}" for x, axis in zip(p.x, p.axes, strict=True))
+        came = "not run yet" if o.observed is None else f"{o.observed:.4f}"
+        said = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
+        lines.append([
+            html.escape(p.curve), where, said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
+            html.escape("; ".join(o.marks)),
+        ])  # fmt: skip
+    head = ["curve", "at", "predicted", "came", "", "seeds", "remarks"]
+    return f"<h3>Written down before</h3>{table(head, lines, text=7)}"
+
+
+def _isoflop(isoflop: IsoFlop | None) -> str:
+    if isoflop is None:
+        return ""
+    lines = []
+    for b in isoflop.budgets:
+        best = _with_interval(b.best) if b.best else "–"
+        lines.append([f"{b.flops:.3g}", str(len(b.sizes)), best, html.escape(b.refused or b.doubt)])
+    a = isoflop.exponent
+    said = (
+        f"The best size grows as C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>."
+        if a
+        else f"No power law: {html.escape(isoflop.refused)}."
+    )
+    head = ["training FLOPs", "sizes", "best trunk parameters", "remarks"]
+    return f"<h3>The best size for a budget</h3><p>{said}</p>{table(head, lines, text=4)}"

@@ -1,0 +1,65 @@
+"""All that a study's report is computed from: results and windows of its finished trials, and fits of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from experiments.analysis.fits import DRAWS
+from experiments.analysis.isoflop import IsoFlop
+from experiments.analysis.predictions import FOLDER, Outcome, compare, load_predictions
+from experiments.analysis.scaling import Fitted, curves_of, fit_budgets, fit_study
+from experiments.running.provenance import Provenance
+from experiments.running.sealed import RESULT, read_result
+from experiments.running.workspace import Workspace, load_record
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import Sweep, unique_trials
+from hma_jax.config import require
+from hma_jax.config.json import stable_hash
+from hma_jax.evaluation.windows import FILE, WindowTable
+
+
+@dataclass(frozen=True)
+class Numbers:
+    results: Mapping[str, dict[str, Any]]  # of finished trials, by id
+    windows: Mapping[str, WindowTable]  # of those that kept them
+    fits: Sequence[Fitted]
+    isoflop: IsoFlop | None
+    outcomes: Sequence[Outcome]
+
+
+def read_results(workspace: Workspace, ids: Iterable[str]) -> tuple[dict[str, dict[str, Any]], dict[str, WindowTable]]:
+    """Results and windows of the finished ones of trials `ids`. Raises ConfigError for one that was changed."""
+    finished = [id for id in ids if (workspace.trials / id / RESULT).exists()]
+    results = {id: read_result(workspace.trials / id) for id in finished}
+    windows = {
+        id: WindowTable.load(workspace.trials / id / FILE) for id in finished if (workspace.trials / id / FILE).exists()
+    }
+    return results, windows
+
+
+def result_hashes(results: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """What each result is sealed with."""
+    return {id: stable_hash(result) for id, result in results.items()}
+
+
+def compute_numbers(
+    workspace: Workspace, sweeps: Sequence[Sweep], provenance: Provenance, draws: int = DRAWS
+) -> Numbers:
+    """Raises ConfigError for a trial or a prediction that was changed."""
+    results, windows = read_results(workspace, unique_trials(sweeps, provenance))
+    flops = {id: float(result["train_flops"]) for id, result in results.items()}
+    _, isoflop = fit_budgets(sweeps, provenance, windows, flops, draws)
+    hashes, curves = result_hashes(results), curves_of(sweeps, provenance)
+    predictions = load_predictions(workspace.root / FOLDER).values()
+    outcomes = [compare(p, curves, windows, hashes) for p in predictions]
+    return Numbers(results, windows, fit_study(sweeps, provenance, windows, draws), isoflop, outcomes)
+
+
+def read_numbers(workspace: Workspace, draws: int = DRAWS) -> Numbers:
+    """Of the study that lives there. Raises ConfigError without any."""
+    record = load_record(workspace)
+    require(record.provenance is not None, f"the study in {workspace.root} has not run yet; run `{record.command}`")
+    sweeps = plan_sweeps(record.study, record.axes, workspace.root)
+    return compute_numbers(workspace, sweeps, record.provenance, draws)

@@ -1,0 +1,111 @@
+"""Figures of scaling fits: points of every seed, the fit with its band, residuals below; isoFLOP curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
+
+from experiments.analysis.fits import LEVEL
+from experiments.analysis.isoflop import IsoFlop
+from experiments.analysis.predictions import Outcome
+from experiments.analysis.scaling import FLOPS, TRUNK, Fitted
+from experiments.report.plot_style import COLOURS, DEFAULT, INK, MUTED, STYLE, count, plain_log, save
+
+LINE, BAND = COLOURS["perplexity"], 0.16
+POINTS = dict(marker="o", linestyle="none", markersize=4, alpha=0.6, markeredgewidth=0)
+
+
+def plot_fits(fits: Sequence[Fitted], outcomes: Sequence[Outcome], path: Path) -> None:
+    """A column per curve with a fit: loss above, residuals below. Without any, there is no file."""
+    path.unlink(missing_ok=True)
+    fits = [f for f in fits if f.measured is not None and len(f.curve.axes) == 1 and not f.fit.refused]
+    if not fits:
+        return
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(
+            2, len(fits), figsize=(4.3 * len(fits), 4.6), layout="constrained", squeeze=False, sharex="col",
+            height_ratios=(3, 1),
+        )  # fmt: skip
+        for column, fitted in zip(panels.T, fits, strict=True):
+            _draw_fit(column, fitted, [o for o in outcomes if o.prediction.curve == fitted.curve.name])
+        panels[0, 0].set_ylabel("loss, nats per token")
+        panels[1, 0].set_ylabel("residual, %")
+        save(figure, path)
+
+
+def _draw_fit(panels: Sequence[Axes], fitted: Fitted, outcomes: Sequence[Outcome]) -> None:
+    above, below = panels
+    measured, fit = fitted.measured, fitted.fit
+    x, loss = measured.x[:, 0], measured.value
+    above.plot(x, loss, color=LINE, label="seeds", zorder=3, **POINTS)
+    ends = [x.min(), *(o.prediction.x[0] for o in outcomes), x.max()]
+    line = np.geomspace(min(ends) / 1.15, max(ends) * 1.15, 120)[:, None]
+    band = f"{LEVEL:.0%} of bootstraps"
+    above.fill_between(line[:, 0], *fit.band(line), color=LINE, alpha=BAND, linewidth=0, label=band)
+    above.plot(line[:, 0], fit.at(line), color=LINE, linewidth=1.6, label="fit")
+    below.plot(x, 100 * fit.residuals, color=LINE, **POINTS)
+    for outcome in outcomes:
+        _draw_outcome(above, outcome)
+    below.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
+    above.set_xscale("log")
+    plain_log(above, above.yaxis)
+    plain_log(below, below.xaxis, count)
+    below.set_xlabel(fitted.curve.axes[0])
+    above.set_title(fitted.curve.name, loc="left", fontsize=10)
+    above.legend(loc="best")
+
+
+def _draw_outcome(panel: Axes, outcome: Outcome) -> None:
+    p = outcome.prediction
+    panel.errorbar(
+        p.x[0], p.mean, [[p.mean - p.low], [p.high - p.mean]], fmt="_", color=DEFAULT, capsize=4, markersize=9,
+        elinewidth=1.6, zorder=4, label="predicted before it ran",
+    )  # fmt: skip
+    if outcome.observed is not None:
+        panel.plot(p.x[0], outcome.observed, "*", color=INK, markersize=11, zorder=5, label="what came")
+
+
+def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
+    """Loss over size for each budget with its parabola and minimum, and the best size over budgets."""
+    path.unlink(missing_ok=True)
+    if isoflop is None or not isoflop.budgets:
+        return
+    with plt.rc_context(STYLE):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.8), layout="constrained")
+        for i, budget in enumerate(isoflop.budgets):
+            colour = plt.cm.viridis(0.85 * i / max(len(isoflop.budgets) - 1, 1))
+            label = f"{count(budget.flops)} FLOPs"
+            left.plot(budget.sizes, budget.loss, "o", color=colour, markersize=4.5, label=label)
+            if budget.parabola is not None:
+                line = np.geomspace(budget.sizes[0], budget.sizes[-1], 80)
+                left.plot(line, budget.at(line), color=colour, linewidth=1.4, linestyle="--" if budget.refused else "-")
+            if budget.best:
+                best = budget.best
+                left.plot(best.value, budget.at(np.array([best.value])), "*", color=colour, markersize=12)
+                right.errorbar(
+                    budget.flops, best.value, [[best.value - best.low], [best.high - best.value]], fmt="o",
+                    color=colour, capsize=3,
+                )  # fmt: skip
+        if isoflop.exponent:
+            flops = np.geomspace(isoflop.budgets[0].flops, isoflop.budgets[-1].flops, 50)
+            a = isoflop.exponent
+            words = f"$C^{{{a.value:.2f}}}$ ({a.low:.2f} to {a.high:.2f})"
+            right.plot(flops, isoflop.scale * flops**a.value, color=MUTED, linewidth=1.4, label=words)
+            right.legend(loc="best")
+        else:
+            right.text(0.5, 0.5, "no power law", transform=right.transAxes, ha="center", color=MUTED)
+        for panel, axis, label in ((left, left.xaxis, TRUNK), (right, right.xaxis, FLOPS)):
+            plain_log(panel, axis, count)
+            panel.set_xlabel(label)
+        plain_log(left, left.yaxis)
+        plain_log(right, right.yaxis, count)
+        left.set_ylabel("loss, nats per token")
+        right.set_ylabel(f"best {TRUNK}")
+        left.legend(loc="best")
+        left.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        save(figure, path)

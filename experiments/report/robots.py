@@ -1,0 +1,154 @@
+"""The reference trial robot by robot, the most controllable first."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.analysis.controllability import Controlled, beyond, controllability
+from experiments.report.pieces import pm, table
+from experiments.rows import OVERALL, CurvePoint, Row, curve
+from experiments.running.provenance import Provenance
+from experiments.running.trial import trial_id
+from experiments.sweeps.sweep import POINT, Sweep
+from hma_jax.evaluation.statistics import mean_and_sem
+from hma_jax.evaluation.windows import WindowTable
+
+COLUMNS = {
+    "perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)", "psnr_copy": "copying (dB)",
+    "ssim": "SSIM",
+}  # fmt: skip
+FOLLOWS = {
+    "action_nats": "action-nats", "retrieval": "retrieval", "delta_psnr": "ΔPSNR (dB)",
+    "counterfactual_gain": "counterfactual (dB)",
+}  # fmt: skip
+ORDER = ("action_nats", "delta_psnr")
+"""Controllability: by the first that was measured."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """What the reference trials, of all seeds, say of one robot."""
+
+    name: str
+    errors: float  # standard errors of ORDER from zero; nan if it was not measured
+    ahead: float  # dB of PSNR ahead of copying the last given frame
+    ahead_sem: float
+    follows: Mapping[str, Controlled]  # by metric; {} without per-window numbers
+
+
+def robots_of(
+    rows: Sequence[Row], sweep: Sweep, provenance: Provenance, windows: Mapping[str, WindowTable]
+) -> list[Robot]:
+    """Of the scope of the sweep that shows the reference trial, the most controllable first."""
+    tables = {}
+    for p in sweep.points:
+        id = trial_id(p.trial, provenance)
+        if p.role == POINT and p.x == sweep.reference_x and id in windows:
+            tables[p.trial.train.seed] = windows[id]
+    follows: dict[str, dict[str, Controlled]] = {name: {} for name in sweep.scope}
+    for line in controllability(tables) if tables else ():
+        follows.setdefault(line.robot, {})[line.metric] = line
+    found = []
+    for name in sweep.scope:
+        errors = next((follows[name][m].errors for m in ORDER if m in follows[name]), math.nan)
+        if not follows[name]:
+            errors = _errors_of_rows(rows, sweep, name)
+        found.append(Robot(name, errors, *_ahead(rows, sweep, name, list(tables.values())), follows[name]))
+    return sorted(found, key=lambda r: -r.errors if not math.isnan(r.errors) else math.inf)
+
+
+def _errors_of_rows(rows: Sequence[Row], sweep: Sweep, name: str) -> float:
+    """Of trials that kept no numbers of their windows."""
+    points = (_at_reference(rows, sweep, metric, name) for metric in ORDER)
+    return next((p.mean / p.sem for p in points if p and p.sem > 0), math.nan)
+
+
+def _ahead(rows: Sequence[Row], sweep: Sweep, name: str, tables: Sequence[WindowTable]) -> tuple[float, float]:
+    """dB ahead of copying, window by window, seeds averaged, clustered by episode; from means where there are no
+    windows, and then without an error."""
+    own = [t.of(name) for t in tables]
+    own = [t for t in own if len(t) and {"psnr", "psnr_copy"} <= t.metrics.keys()]
+    if own:
+        first = own[0]
+        differences = [t.matched_to(first).metrics["psnr"] - t.matched_to(first).metrics["psnr_copy"] for t in own]
+        stat = mean_and_sem(sum(differences) / len(differences), first.episode)
+        return stat.mean, stat.sem
+    psnr, copy = (_at_reference(rows, sweep, metric, name) for metric in ("psnr", "psnr_copy"))
+    return (psnr.mean - copy.mean if psnr and copy else math.nan), math.nan
+
+
+def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) -> CurvePoint | None:
+    return next((p for p in curve(rows, sweep.name, metric, scope=scope) if p.x == sweep.reference_x), None)
+
+
+def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:
+    """A line per robot, and the mean; data.json says how much there was of each."""
+    data = json.loads(data_summary.read_text()) if data_summary.exists() else {}
+    measured = {r.metric for r in rows if r.sweep == sweep.name}
+    metrics = [m for m in COLUMNS if m in measured]
+    follows = [m for m in FOLLOWS if any(m in r.follows for r in robots)]
+    shares = {r.name: line.explained for r in robots for line in r.follows.values() if not math.isnan(line.explained)}
+
+    def cell(name: str, metric: str) -> str:
+        at = _at_reference(rows, sweep, metric, name)
+        return pm(at.mean, at.sem) if at else "–"
+
+    def followed(robot: Robot, metric: str) -> str:
+        line = robot.follows.get(metric)
+        return pm(line.mean, line.sem) if line else "–"
+
+    lines = []
+    for robot in robots:
+        facts = data.get(robot.name, {})
+        share = [f"{shares[robot.name]:.0%}" if robot.name in shares else "–"] if shares else []
+        lines.append([
+            html.escape(robot.name), *share, _errors(robot.errors), *(followed(robot, m) for m in follows),
+            _ahead_words(robot), *(cell(robot.name, m) for m in metrics),
+            *(str(facts.get(k, "–")) for k in ("episodes", "windows")),
+        ])  # fmt: skip
+    blank = [""] * (1 + bool(shares))
+    means = [cell(OVERALL, m) for m in follows]
+    lines.append(["<b>all</b>", *blank, *means, "", *(cell(OVERALL, m) for m in metrics), "", ""])
+    head = ["robot", *["decided by actions"] * bool(shares), "s.e. above zero", *(FOLLOWS[m] for m in follows)]
+    head += ["ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"]
+    return f"<p>{_words(robots, follows, bool(shares))}</p>" + table(head, lines)
+
+
+def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool) -> str:
+    lines = [line for robot in robots for line in robot.follows.values()]
+    counted = {m: beyond(lines, m) for m in follows}
+    parts = [f"{FOLLOWS[m].split(' (')[0]} of {more} among {of}" for m, (more, of) in counted.items()]
+    order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
+    said = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
+    said += f"Beyond two standard errors lie the {', the '.join(parts)} robots. " if parts else ""
+    if shares:
+        said += "<em>Decided by actions</em>: the share of the change of its pixels that actions explain in truth. "
+    if "retrieval" in follows:
+        said += "<em>Retrieval</em>: how often the true actions are found among all that were tried. "
+    if "counterfactual_gain" in follows:
+        said += (
+            "<em>Counterfactual</em>: dB that frames under other actions are nearer to the simulator's under these "
+            "than frames under the recorded ones. "
+        )
+    return said + (
+        "PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of repeating the "
+        "last given frame. Errors are standard errors over episodes and seeds."
+    )
+
+
+def _errors(value: float) -> str:
+    if math.isnan(value):
+        return "–"
+    return f'<span class="{"finished" if value > 2 else "missing"}">{value:.1f}</span>'.replace("-", "\u2212")
+
+
+def _ahead_words(robot: Robot) -> str:
+    if math.isnan(robot.ahead):
+        return "–"
+    words = ("+" if robot.ahead > 0 else "") + pm(robot.ahead, robot.ahead_sem)
+    return words if robot.ahead > 0 else f'<span class="failed">{words}</span>'

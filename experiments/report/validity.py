@@ -1,0 +1,245 @@
+"""The checks by which a reader can tell whether a study's numbers may be believed, at the top of its page.
+
+Each is a sentence with a verdict. What cannot be checked says so and counts as open, never as passed.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from experiments.analysis.predictions import Outcome
+from experiments.optima import Optimum
+from experiments.report.pieces import section
+from experiments.report.robots import Robot
+from experiments.rows import LOSS, OVERALL, UNTRAINED, Row
+from experiments.running.attempts import State
+from experiments.running.ledger import FINISHED
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep
+from hma_jax.evaluation.summary import Summary, summarise
+from hma_jax.evaluation.windows import WindowTable
+
+Verdict = Literal["good", "bad", "open"]
+MARKS = {"good": "\u2713", "bad": "\u2717", "open": "?"}
+
+SEEDS = 3
+"""Per point, at least: below, an error over seeds is a guess."""
+
+EACH, MEAN = 3.0, 2.0
+"""Standard errors that each control, and their mean, may be from zero."""
+
+CONTROLLED = {"delta_psnr": "ΔPSNR", "action_nats": "action-nats"}
+"""What has to vanish for a model trained on shuffled actions."""
+
+HELD_OUT = "cross_entropy"
+"""Nats per held-out token; models of latents have none."""
+
+EXACT = 1e-6
+"""Relative difference that recomputing a mean may make: windows are kept in float32."""
+
+
+@dataclass(frozen=True)
+class Check:
+    name: str
+    verdict: Verdict
+    text: str
+
+
+def draw_box(checks: Sequence[Check]) -> str:
+    bad = sum(c.verdict == "bad" for c in checks)
+    unknown = sum(c.verdict == "open" for c in checks)
+    counted = [f"{len(checks) - bad - unknown} of {len(checks)} hold"]
+    counted += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad)
+    counted += [f"{unknown} cannot be checked"] * bool(unknown)
+    lines = "".join(
+        f'<li class={c.verdict}><span class=mark>{MARKS[c.verdict]}</span><div><b>{html.escape(c.name)}</b> '
+        f"{html.escape(c.text)}</div></li>"
+        for c in checks
+    )
+    return section("Can these numbers be believed?", f"<p>{', '.join(counted)}.</p><ul class=checks>{lines}</ul>")
+
+
+def check_study(
+    sweeps: Sequence[Sweep],
+    rows: Sequence[Row],
+    optima: Sequence[Optimum],
+    states: Mapping[str, State],
+    robots: Sequence[Robot],
+    outcomes: Sequence[Outcome],
+    numbers: Check,
+    vocabulary: int | None,
+) -> list[Check]:
+    """`numbers` is what `check_numbers` found; `vocabulary` V of a discrete model."""
+    checks = [_trials(states), _seeds(sweeps, states, rows), numbers]
+    checks += _untrained(rows, vocabulary)
+    checks += [_controls(rows, metric) for metric in CONTROLLED if any(r.metric == metric for r in rows)]
+    checks.append(_copying(robots))
+    checks += _optima(optima) + [_prediction(o) for o in outcomes]
+    return checks
+
+
+def check_numbers(
+    written: Sequence[Row],
+    rows: Sequence[Row],
+    results: Mapping[str, Mapping[str, Any]],
+    windows: Mapping[str, WindowTable],
+    group: int,
+) -> Check:
+    """Whether the table as it was found (`written`) says of finished trials what their results do (`rows`), and these
+    what follows from their windows. `group` is the evaluation's perplexity_group."""
+    name = "Every number follows from per-window numbers."
+    known, drawn = {_key(r): r for r in rows}, {(r.sweep, r.trial) for r in rows}
+    written = [r for r in written if r.metric and r.trial in results and (r.sweep, r.trial) in drawn]
+    before = {(r.sweep, r.trial) for r in written}
+    edited = [r for r in written if not _same_row(r, known.get(_key(r)))]
+    lost = {_key(r) for r in rows if (r.sweep, r.trial) in before} - {_key(r) for r in written}
+    if edited or lost:
+        example = _key(edited[0]) if edited else min(lost, key=str)
+        where, count = ", ".join(str(part) for part in example if part != ""), len(edited) + len(lost)
+        differ = "1 line of the table differs" if count == 1 else f"{count} lines of the table differ"
+        return Check(name, "bad", f"{differ} from the trials' results, such as {where}; it was drawn again from them.")
+    wrong = [id for id in results if id in windows and not _follows(results[id], windows[id], group)]
+    if wrong:
+        return Check(name, "bad", f"The results of {len(wrong)} trials do not follow from their windows: {wrong[0]}.")
+    missing = [id for id in results if id not in windows]
+    if missing or not results:
+        what = f"{len(missing)} of {len(results)} finished trials kept no numbers of their windows."
+        return Check(name, "open", what if results else "No trial is finished.")
+    count = sum(len(w) for w in windows.values())
+    text = f"Table and results of {len(results)} trials were computed again from {count:,} windows."
+    return Check(name, "good", text)
+
+
+def _key(row: Row) -> tuple[Any, ...]:
+    return row.sweep, row.x, row.series, row.role, row.seed, row.trial, row.scope, row.metric
+
+
+def _same_row(a: Row, b: Row | None) -> bool:
+    return b is not None and all(_same(getattr(a, f), getattr(b, f)) for f in ("mean", "sem", "n", "episodes"))
+
+
+def _same(a: float, b: float) -> bool:
+    return a == b or math.isnan(a) and math.isnan(b)
+
+
+def _follows(result: Mapping[str, Any], windows: WindowTable, group: int) -> bool:
+    """Whether the means of a result are those of the windows."""
+    said, found = Summary.from_dict(result["evaluation"]).datasets, summarise(windows, group).datasets
+    return said.keys() == found.keys() and all(
+        metric in found[robot] and math.isclose(stat.mean, found[robot][metric].mean, rel_tol=EXACT, abs_tol=EXACT)
+        for robot, stats in said.items()
+        for metric, stat in stats.items()
+    )
+
+
+def _trials(states: Mapping[str, State]) -> Check:
+    without: dict[str, int] = {}
+    for state in states.values():
+        if state.event != FINISHED:
+            without[state.event] = without.get(state.event, 0) + 1
+    done = len(states) - sum(without.values())
+    rest = "".join(f", {n} {event}" for event, n in sorted(without.items()))
+    text = f"{done} of {len(states)} finished{rest}."
+    return Check("Every planned trial is here.", "bad" if without else "good", text)
+
+
+def _seeds(sweeps: Sequence[Sweep], states: Mapping[str, State], rows: Sequence[Row]) -> Check:
+    """Distinct seeds with a result, at each point of each curve."""
+    planned = {(s.name, p.x, p.series, p.role) for s in sweeps for p in s.points if p.role != CONTROL}
+    seeds: dict[tuple[Any, ...], set[int]] = {point: set() for point in planned}
+    for r in rows:
+        if r.metric and (point := (r.sweep, r.x, r.series, r.role)) in seeds:
+            seeds[point].add(r.seed)
+    counts = [len(s) for s in seeds.values()]
+    few = [point for point, s in seeds.items() if len(s) < SEEDS]
+    least, most = min(counts, default=0), max(counts, default=0)
+    counted = f"{least}" if least == most else f"{least} to {most}"
+    text = f"{counted} per point"
+    if few:
+        text += (
+            f"; {len(few)} of {len(seeds)} points have fewer than {SEEDS}, so that their errors hold little or nothing "
+            "of what another seed would change"
+        )
+    return Check(f"At least {SEEDS} seeds.", "bad" if few else "good", f"{text}.")
+
+
+def _untrained(rows: Sequence[Row], vocabulary: int | None) -> list[Check]:
+    """At its first step a model has learnt nothing: log V per token, to the rounding of its own numbers."""
+    if vocabulary is None:
+        return []
+    name, expected = "An untrained model knows nothing.", math.log(vocabulary)
+    found = [r.mean for r in rows if (r.role, r.scope, r.metric) == (UNTRAINED, OVERALL, HELD_OUT)]
+    if not found:
+        return [Check(name, "open", "No trial was judged before its first step.")]
+    off = max(found, key=lambda v: abs(v - expected))
+    text = f"{off:.4f} nats per token before the first step; log {vocabulary:,} is {expected:.4f}."
+    return [Check(name, "good" if abs(off - expected) < 1e-3 * expected else "bad", text)]
+
+
+def _controls(rows: Sequence[Row], metric: str) -> Check:
+    """Trials on shuffled actions, each once: their mean has the error of independent ones."""
+    label = CONTROLLED[metric]
+    name = f"Without true actions, {label} vanishes."
+    controls = {r.trial: r for r in rows if (r.role, r.scope, r.metric) == (CONTROL, OVERALL, metric)}
+    if not controls:
+        return Check(name, "open", "No control, trained on shuffled actions, is finished.")
+    far = max(abs(_errors(r.mean, r.sem)) for r in controls.values())
+    mean = sum(r.mean for r in controls.values()) / len(controls)
+    sem = math.sqrt(sum(r.sem**2 for r in controls.values())) / len(controls)
+    fine = far <= EACH and abs(_errors(mean, sem)) <= MEAN  # nan: not fine
+    off = f"{_errors(mean, sem):+.1f}"
+    text = f"{len(controls)} controls: at most {far:.1f} standard errors from zero, their mean {off}"
+    if len(controls) == 1:
+        text = f"One control: {off} standard errors from zero"
+    text = f"{text} (allowed: {EACH:g} each, {MEAN:g} for the mean).".replace("-", "\u2212")
+    return Check(name, "good" if fine else "bad", text)
+
+
+def _errors(mean: float, sem: float) -> float:
+    return 0.0 if mean == 0 else mean / sem if sem else math.inf
+
+
+def _copying(robots: Sequence[Robot]) -> Check:
+    """The reference trials against repeating the last frame that was given."""
+    name = "Predicting beats copying the last frame."
+    judged = [r for r in robots if not math.isnan(r.ahead)]
+    if not judged:
+        return Check(name, "open", "The reference trial is not finished.")
+    better = [r for r in judged if r.ahead > 0]
+    sure = [r for r in judged if r.ahead > 2 * r.ahead_sem]
+    behind = ", ".join(r.name for r in judged if not r.ahead > 0)
+    text = f"On {len(better)} of {len(judged)} robots, on {len(sure)} by more than two standard errors"
+    return Check(name, "bad" if behind else "good", text + (f". Not on {behind}." if behind else "."))
+
+
+def _held_out(optima: Sequence[Optimum]) -> bool:
+    return any(o.metric == HELD_OUT for o in optima)
+
+
+def _optima(optima: Sequence[Optimum]) -> list[Check]:
+    """Of muP's curves, on held-out data where there is a likelihood. Where the standard parametrisation is best is a
+    finding, not a condition."""
+    mup = [o for o in optima if o.role == POINT and o.metric == (HELD_OUT if _held_out(optima) else LOSS)]
+    if not mup:
+        return []
+    edge = [o.series for o in mup if o.edge]
+    text = f"At the end of what was tried for {', '.join(edge)}." if edge else f"On all {len(mup)} curves with muP."
+    return [Check("The best learning rate lies inside the grid.", "bad" if edge else "good", text)]
+
+
+def _prediction(outcome: Outcome) -> Check:
+    p = outcome.prediction
+    where = f"{p.curve} at {', '.join(f'{x:,.0f} {a}' for a, x in zip(p.axes, p.x, strict=True))}"
+    text = f"{where}: {p.mean:.3f} nats, {p.low:.3f} to {p.high:.3f} with {p.level:.0%}"
+    if outcome.observed is None:
+        verdict: Verdict = "open"
+        text += "; its trials have not run."
+    else:
+        verdict = "bad" if outcome.marks or not outcome.inside else "good"
+        text += f"; came: {outcome.observed:.3f} ({outcome.seeds} seeds), {'inside' if outcome.inside else 'outside'}."
+    if outcome.marks:
+        verdict, text = "bad", f"{text} But: {'; '.join(outcome.marks)}."
+    return Check("A prediction written down before.", verdict, text)

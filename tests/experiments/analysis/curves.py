@@ -1,0 +1,40 @@
+"""Losses on curves whose coefficients are known, with the noise of seeds and of episodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from experiments.analysis.bootstrap import Panel
+from experiments.analysis.measured import Measured
+
+DATASETS, EPISODES = 10, 8
+
+
+def measured(
+    x: np.ndarray, loss: np.ndarray, noise: float, seeds: int, rng: np.random.Generator, episode_noise: float = 0.3
+) -> Measured:
+    """`seeds` trials at each of `x` [m, K] with the expected `loss` [m]; each seed is off by `noise` in the logarithm.
+
+    Episodes are harder and easier by `episode_noise`, the same ones for every trial.
+    """
+    x, loss = np.repeat(x, seeds, 0), np.repeat(loss, seeds)
+    loss = loss * np.exp(noise * rng.standard_normal(len(loss)))
+    hard = np.exp(episode_noise * rng.standard_normal(DATASETS * EPISODES))
+    values = loss[:, None] * (hard / hard.mean() + 0.01 * rng.standard_normal((len(loss), len(hard))))
+    robot, episode = np.repeat([f"robot{d}" for d in range(DATASETS)], EPISODES), np.tile(np.arange(EPISODES), DATASETS)
+    names = tuple((i % seeds,) for i in range(len(x)))
+    return Measured(
+        ("trunk parameters", "windows")[: x.shape[1]], x,
+        run=np.array([f"{row[0]:.0f}" for row in x]), trial=tuple(f"t{i}" for i in range(len(x))),
+        panel=Panel(robot, episode, tuple(row[None] for row in values), names),
+    )  # fmt: skip
+
+
+def sizes(count: int, span: float = 30.0) -> np.ndarray:
+    """[count, 1] from 1e4 on."""
+    return np.geomspace(1e4, span * 1e4, count)[:, None]
+
+
+def power(x: np.ndarray, e: float, *terms: tuple[float, float]) -> np.ndarray:
+    """e + sum of a (x_k / 1e4)^-alpha for (a, alpha) of `terms`."""
+    return e + sum(a * (column / 1e4) ** -alpha for (a, alpha), column in zip(terms, x.T, strict=True))

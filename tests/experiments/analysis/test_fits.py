@@ -1,0 +1,149 @@
+"""Scaling fits on curves with known coefficients: values, intervals, outliers, and what cannot be fitted."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from experiments.analysis import powerlaw
+from experiments.analysis.fits import fit_power
+from tests.experiments.analysis.curves import measured, power, sizes
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(3)
+
+
+def test_known_coefficients_come_back(rng):
+    x = sizes(6)
+    fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 1e-4, 3, rng), draws=50)
+    assert not fit.refused and not fit.doubts
+    assert fit["alpha"].value == pytest.approx(0.5, abs=0.02)
+    assert fit["E"].value == pytest.approx(1.5, abs=0.02)
+    assert fit["A"].value == pytest.approx(1e4**0.5, rel=0.2)
+    assert fit.at(np.array([[1e6]]))[0] == pytest.approx(1.6, abs=0.01)
+    assert np.abs(fit.residuals).max() < 1e-2
+
+
+def test_both_axes_at_once(rng):
+    x = np.array([(n, d) for n in np.geomspace(1e4, 3e5, 5) for d in np.geomspace(1e3, 1e5, 5)])
+    loss = power(x, 1.2, (0.8, 0.6), (0.4, 0.35))
+    fit = fit_power(measured(x, loss, 5e-4, 3, rng), draws=50)
+    assert not fit.refused
+    assert (fit["alpha"].value, fit["beta"].value) == (pytest.approx(0.6, abs=0.05), pytest.approx(0.35, abs=0.03))
+    assert all(c.low <= c.value <= c.high for c in fit.coefficients)
+
+
+def test_about_nine_of_ten_intervals_hold_the_truth():
+    """Of exponent, smallest loss, and the curve where there is no point, in forty studies of one law. Three seeds
+    per point know their own noise badly: over 450 studies the shares are 0.90, 0.85 and 0.83."""
+    x, beyond, held, rng = sizes(6), np.array([[1e6]]), [], np.random.default_rng(5)
+    for _ in range(40):
+        fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 0.01, 3, rng), draws=50, episodes=False)
+        low, high = fit.band(beyond)
+        curve = low[0] <= power(beyond, 1.5, (1.0, 0.5))[0] <= high[0]
+        held.append([*(fit[n].low <= truth <= fit[n].high for n, truth in (("alpha", 0.5), ("E", 1.5))), curve])
+    share = np.mean(held, axis=0)
+    assert (share >= 0.7).all(), share  # these, less two standard deviations of 40 tries
+    assert (share < 1).any(), share  # intervals that hold everything say nothing
+
+
+def test_episodes_widen_the_interval_of_the_level(rng):
+    x = sizes(5)
+    points = measured(x, power(x, 1.5, (1.0, 0.5)), 0.002, 3, rng)
+    all_of_it, seeds_alone = fit_power(points, 100), fit_power(points, 100, episodes=False)
+    width = [np.subtract(*f.band(x[-1:]))[0] for f in (all_of_it, seeds_alone)]
+    assert width[0] < 3 * width[1] < 0  # more negative: wider
+
+
+def test_one_run_that_went_wrong_does_not_bend_the_curve(rng):
+    x = sizes(6)
+    points = measured(x, power(x, 1.5, (1.0, 0.5)), 2e-3, 3, rng)
+    points.panel.points[4][:] *= 1.2  # far beyond the noise
+    assert fit_power(points, 20)["alpha"].value == pytest.approx(0.5, abs=0.06)
+
+
+def test_a_noisy_point_weighs_less(rng):
+    x = sizes(5)
+    points = measured(x, power(x, 1.5, (1.0, 0.5)), 1e-3, 4, rng)
+    last = np.flatnonzero(points.x[:, 0] == points.x[:, 0].max())
+    for i, factor in zip(last, (0.9, 0.95, 0.98, 1.04), strict=True):
+        points.panel.points[i][:] *= factor
+    noise = points.noise()
+    assert noise[last[0]] > 2 * noise[0]
+    assert fit_power(points, 20)["alpha"].value == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "x, loss, reason",
+    [
+        (sizes(3), (1.0, 0.5), "3 distinct trunk parameters"),
+        (sizes(5), (-0.3, 0.5), "does not fall"),
+        (sizes(5), (0.0, 0.5), "does not fall"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(rng, x, loss, reason):
+    fit = fit_power(measured(x, power(x, 1.5, loss), 0.003, 3, rng), draws=20)
+    assert reason in fit.refused and not fit.coefficients
+
+
+def test_a_step_is_no_power_law(rng):
+    x = sizes(6)
+    step = np.where(x[:, 0] > 1.1e4, 1.5, 2.0)
+    assert "end of what was searched" in fit_power(measured(x, step, 1e-3, 3, rng), draws=20).refused
+
+
+def test_points_too_close_together_are_doubtful(rng):
+    x = sizes(4, span=2.0)
+    fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 0.01, 3, rng), draws=100)
+    assert any("anything between" in doubt for doubt in fit.doubts)
+
+
+def test_dropping_seeds_is_said(rng):
+    x = sizes(5)
+    points = measured(x, power(x, 1.5, (1.0, 0.5)), 2e-3, 3, rng)
+    assert not fit_power(points, 20).doubts
+    for left, words in ((2, "two seeds"), (1, "one seed")):
+        fewer = points.only((points.seed < left) | (points.x[:, 0] > 2e4))
+        assert any(words in doubt for doubt in fit_power(fewer, 20).doubts), left
+
+
+def test_branches_of_a_run_share_their_seed(rng):
+    """What a seed does to a run it does to all of its branches; drawn apart, the slope over them would look noisy."""
+    x = np.array([(n, d) for n in np.geomspace(1e4, 3e5, 4) for d in (1e3, 1e4)])
+    points = measured(x, power(x, 1.0, (1.0, 0.5), (1.0, 0.5)), 0.0, 3, rng, episode_noise=0.0)
+    for (seed,), values in zip(points.panel.seeds, points.panel.points, strict=True):
+        values *= np.exp(0.05 * (seed - 1))
+    draws = points.draw(50, rng, episodes=False)
+    first = points.run == points.run[0]
+    short, long = (first & (points.x[:, 1] == d) for d in (1e3, 1e4))
+    ratio = draws[:, short] / draws[:, long]
+    assert np.ptp(draws[:, short]) > 0.1 and np.std(ratio) < 0.02
+
+
+@pytest.mark.parametrize("terms", [1, 2])
+def test_minima_are_those_of_a_general_optimiser(rng, terms):
+    """L-BFGS from the five best points of the same grid, on the same objective."""
+    if terms == 1:
+        x = np.repeat(sizes(5), 3, 0)
+        loss = power(x, 1.5, (1.0, 0.5))
+    else:
+        x = np.array([(n, d) for n in np.geomspace(1e4, 3e5, 4) for d in np.geomspace(1e3, 1e5, 4)])
+        loss = power(x, 1.2, (0.8, 0.5), (0.9, 0.35))
+    z = np.log(x) - np.log(x).mean(0)
+    draws = loss * np.exp(0.01 * rng.standard_normal((6, len(loss))))
+    weight = np.exp(0.3 * rng.standard_normal(len(loss)))
+    _, thetas = powerlaw.fit_draws(z, draws[0], draws, weight)
+    bounds = powerlaw.bounds_of(np.log(draws), terms)
+    for theta, values in zip(thetas, np.log(draws), strict=True):
+        grid = np.clip(powerlaw.starts(values, z), bounds.low, bounds.high)
+        first = np.argsort(powerlaw.objective(grid, z, values, weight))[:5]
+        scale = 1 / powerlaw.DELTA**2
+        found = [
+            minimize(
+                lambda t, v=values: scale * powerlaw.objective(t, z, v, weight), grid[i], method="L-BFGS-B",
+                bounds=list(zip(bounds.low, bounds.high, strict=True)), options={"maxiter": 500},
+            ).fun / scale
+            for i in first
+        ]  # fmt: skip
+        assert powerlaw.objective(theta, z, values, weight) <= min(found) * (1 + 1e-6)

@@ -1,0 +1,130 @@
+"""Predictions are made before their trials run, stay as they were written, and are held against what came."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from experiments.analysis.predictions import load_predictions, save_prediction
+from experiments.cli.main import main
+from experiments.report.draw import draw
+from experiments.report.numbers import read_numbers
+from experiments.running.sealed import RESULT, write_result
+from experiments.running.workspace import Workspace, load_record
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import unique_trials
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.judged import WIDE, finish, judged_study
+
+HELD = 64
+WHOLE = replace(WIDE, widths=(*WIDE.widths, HELD))
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    """A study whose largest width is planned and has not run."""
+    return judged_study(tmp_path_factory.mktemp("fits") / "study")[0].root
+
+
+@pytest.fixture
+def root(before, tmp_path):
+    shutil.copytree(before, tmp_path / "study")
+    return tmp_path / "study"
+
+
+def command(root, *words):
+    return main(["fit", str(root), *words])
+
+
+def predict(root, *words):
+    return command(root, "--predict", f"width={HELD}", "--set", f"widths=8,16,24,32,48,{HELD}", *words)
+
+
+def run_the_rest(root, study=WHOLE):
+    """The trials of the whole study that are not there yet."""
+    workspace = Workspace(root)
+    for id, trial in unique_trials(plan_sweeps(study, ("width",)), PROVENANCE).items():
+        if not (workspace.trials / id).exists():
+            finish(workspace, id, trial)
+    values = json.loads(workspace.record.read_text())
+    values["study"]["widths"] = list(study.widths)
+    workspace.record.write_text(json.dumps(values))
+
+
+def test_the_command_shows_the_fit(before, capsys):
+    assert command(before) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "trunk parameters" in shown and ("alpha 0.4" in shown or "alpha 0.5" in shown)
+
+
+def test_a_prediction_comes_true(root, capsys):
+    assert predict(root) == 0
+    assert "git commit" in capsys.readouterr().out
+    [prediction] = load_predictions(root / "predictions").values()
+    assert len(prediction.inputs) == 15 and len(prediction.trials) == 3
+    [waiting] = read_numbers(Workspace(root), draws=20).outcomes
+    assert waiting.observed is None and waiting.inside is None
+    run_the_rest(root)
+    [outcome] = read_numbers(Workspace(root), draws=20).outcomes
+    assert outcome.inside and outcome.seeds == 3 and not outcome.marks
+    width = prediction.high - prediction.low
+    assert width < 0.1 * prediction.mean and abs(outcome.observed - prediction.mean) < width
+    draw(Workspace(root), load_record(Workspace(root)))
+    page = (root / "report.html").read_text()
+    assert "A prediction written down before." in page and "Written down before" in page
+
+
+def test_nothing_is_predicted_of_a_trial_that_exists(root, capsys):
+    assert command(root, "--predict", "width=48") == 2
+    assert "exists already (finished)" in capsys.readouterr().err
+    assert not (root / "predictions").exists()
+
+
+def test_a_prediction_is_not_made_twice(root, capsys):
+    assert predict(root) == 0 and predict(root) == 2
+    assert "was made before; it stays" in capsys.readouterr().err
+
+
+def test_a_prediction_that_was_edited_is_refused(root, capsys):
+    predict(root)
+    [path] = (root / "predictions").glob("*.json")
+    values = json.loads(path.read_text())
+    path.write_text(json.dumps(values | {"high": values["high"] * 1.001}))
+    assert command(root) == 2
+    assert "was changed after it was written" in capsys.readouterr().err
+
+
+def test_what_was_made_from_other_results_is_marked(root):
+    predict(root)
+    [prediction] = load_predictions(root / "predictions").values()
+    directory = root / "trials" / next(iter(prediction.inputs))
+    result = json.loads((directory / RESULT).read_text())
+    result.pop("hash")
+    write_result(directory, result | {"parameters": 1})
+    [outcome] = read_numbers(Workspace(root), draws=20).outcomes
+    assert any("1 of the 15 results" in mark for mark in outcome.marks)
+
+
+def test_a_prediction_after_the_fact_is_marked(root):
+    predict(root)
+    [prediction] = load_predictions(root / "predictions").values()
+    run_the_rest(root)
+    late = replace(prediction, finished=(*prediction.finished, prediction.trials[0]))
+    save_prediction(root / "predictions" / "late.json", late)
+    marks = {o.prediction.finished: o.marks for o in read_numbers(Workspace(root), draws=20).outcomes}
+    assert any("no prediction" in mark for mark in marks[late.finished]) and not marks[prediction.finished]
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (("--predict", "width"), "write it as AXIS=X"),
+        (("--predict", "width=50"), "plans no trial there"),
+        (("--predict", "lr=0.1"), "no axis over a number"),
+        (("--out", "x.json"), "give --predict"),
+    ],
+)
+def test_what_cannot_be_predicted_says_why(before, words, says, capsys):
+    assert command(before, *words) == 2
+    assert says in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,107 @@
+"""Which trials of a study make a curve, over what, and how the page shows it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.analysis.scaling import (
+    FLOPS,
+    TRUNK,
+    WINDOWS,
+    curves_of,
+    fit_budgets,
+    fit_study,
+    surface_of,
+    trunk_parameters,
+)
+from experiments.report.fits import describe_fits, fit_rows
+from experiments.report.plot_fits import plot_fits, plot_isoflop
+from experiments.running.trial import trial_id
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import Point, Sweep, reference_trial
+from hma_jax.config import ModelConfig
+from hma_jax.evaluation.windows import WindowTable
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.judged import WIDE
+
+STEPS = (100, 300, 1000, 3000, 10000)
+ROBOTS = WIDE.dataset_names()
+
+
+@pytest.fixture(scope="module")
+def branches():
+    """Runs of six widths that were judged at five numbers of steps each, for three seeds."""
+    points, windows, flops = [], {}, {}
+    rng = np.random.default_rng(0)
+    for width in (8, 16, 24, 32, 48, 64):
+        for seed in range(3):
+            luck = 1e-3 * rng.standard_normal()
+            for steps in STEPS:
+                base = reference_trial(WIDE, seed)
+                trial = replace(
+                    base, model=replace(base.model, width=width), train=replace(base.train, steps=steps, seed=seed),
+                    measure_untrained=False,
+                )  # fmt: skip
+                id, n, d = trial_id(trial, PROVENANCE), trunk_parameters(trial.model), steps * trial.train.batch
+                loss = (1 + (n / 1e3) ** -0.4 + (d / 50) ** -0.4) * np.exp(luck)
+                count = 4 * len(ROBOTS)
+                windows[id] = WindowTable(
+                    np.repeat(ROBOTS, 4), np.tile(np.arange(4), len(ROBOTS)), np.zeros(count, int),
+                    np.full(count, 4), {"cross_entropy": np.full(count, loss)},
+                )  # fmt: skip
+                flops[id] = 6.0 * n * d
+                points.append(Point(steps, trial, series=f"width {width}"))
+    return [Sweep("steps", "steps", ROBOTS, tuple(points))], windows, flops
+
+
+def test_only_the_parameters_that_robots_share_count():
+    one = ModelConfig(width=32, layers=2, heads=2, tokens=16)
+    assert trunk_parameters(replace(one, layers=4)) == pytest.approx(2 * trunk_parameters(one), rel=0.05)
+    assert trunk_parameters(replace(one, width=64)) == pytest.approx(4 * trunk_parameters(one), rel=0.1)
+
+
+def test_a_width_sweep_is_a_curve_over_the_trunk():
+    [curve] = curves_of(plan_sweeps(WIDE, ("width",)), PROVENANCE)
+    assert curve.axes == (TRUNK,) and len(curve.places) == 15  # five widths, three seeds; the control is none of it
+    assert len({p.x for p in curve.places}) == 5
+
+
+def test_other_sweeps_keep_their_own_axis():
+    curves = curves_of(plan_sweeps(WIDE, ("trajectories", "lr")), PROVENANCE)
+    assert [c.name for c in curves] == ["trajectories"]  # a learning rate is no scale
+    assert {p.x[0] for p in curves[0].places} == set(WIDE.trajectory_counts)
+
+
+def test_branches_of_widths_make_a_surface(branches):
+    sweeps, windows, flops = branches
+    surface = surface_of(sweeps, PROVENANCE)
+    assert len(surface) == len(windows) == 90
+    curve = next(iter(surface.values()))[1]
+    assert curve.axes == (TRUNK, WINDOWS) and len({p.run for p in curve.places}) == 6
+    first, *_, joint = fit_study(sweeps, PROVENANCE, windows, draws=30)
+    assert first.curve.axes == ("steps",) and first.fit["alpha"].value == pytest.approx(0.4, abs=0.05)
+    assert len(set(first.measured.run)) == 1  # one run, of which every step is a branch
+    assert (joint.fit["alpha"].value, joint.fit["beta"].value) == (pytest.approx(0.4, abs=0.05),) * 2
+    measured, isoflop = fit_budgets(sweeps, PROVENANCE, windows, flops, draws=30)
+    assert measured.axes == (TRUNK, FLOPS)
+    assert isoflop.exponent.value == pytest.approx(0.5, abs=0.15)
+
+
+def test_a_study_without_branches_has_no_surface():
+    assert surface_of(plan_sweeps(WIDE, ("width", "trajectories")), PROVENANCE) == {}
+
+
+def test_the_page_shows_fits_and_what_was_refused(branches, tmp_path):
+    sweeps, windows, flops = branches
+    fits = fit_study(sweeps, PROVENANCE, windows, draws=30)
+    _, isoflop = fit_budgets(sweeps, PROVENANCE, windows, flops, draws=30)
+    words = describe_fits(fits, isoflop, [], "")
+    assert "N<sup>\u22120." in words and "D<sup>\u22120." in words and "The best size grows as C<sup>0." in words
+    plot_fits(fits, [], tmp_path / "fits.png")
+    plot_isoflop(isoflop, tmp_path / "isoflop.png")
+    assert all((tmp_path / f"{n}.png").read_bytes().startswith(b"\x89PNG") for n in ("fits", "isoflop"))
+    few = {id: table for id, table in windows.items() if flops[id] < 1e7}
+    refused = fit_study(sweeps, PROVENANCE, few, draws=30)
+    assert any(r.refused and not r.coefficient for r in fit_rows(refused, None))
+    assert "No fit: " in describe_fits(refused, None, [], "")

@@ -1,0 +1,197 @@
+"""What makes a study's numbers unbelievable shows at the top of its page."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.report.draw import draw
+from experiments.running.sealed import RESULT, write_result
+from experiments.running.trial import trial_id
+from experiments.running.workspace import Workspace
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import CONTROL
+from hma_jax.evaluation.windows import FILE, WindowTable
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.judged import WIDE, judged_study
+
+SMALL = replace(WIDE, widths=(8, 16))
+ITEMS = ("trial", "seeds", "numbers", "untrained", "controls", "copying")
+NAMES = dict(zip(ITEMS, (
+    "Every planned trial is here", "At least 3 seeds", "Every number follows", "An untrained model knows nothing",
+    "Without true actions, ΔPSNR vanishes", "Predicting beats copying",
+), strict=True))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """A small study that all checks pass, drawn."""
+    root = tmp_path_factory.mktemp("valid")
+    workspace, record = judged_study(root / "study", SMALL)
+    draw(workspace, record)
+    return workspace, record
+
+
+@pytest.fixture
+def copied(study, tmp_path, monkeypatch):
+    """Another to spoil; drawn without figures, which take longer than all the rest."""
+    monkeypatch.setattr("experiments.report.draw.draw_figures", lambda *_: None)
+    shutil.copytree(study[0].root, tmp_path / "copy")
+    return Workspace(tmp_path / "copy"), study[1]
+
+
+def verdicts(workspace):
+    """{item: (verdict, text)} of the page's box."""
+    page = workspace.report.read_text()
+    found = {}
+    for item, name in NAMES.items():
+        before, _, after = page.partition(f"<b>{name}")
+        found[item] = before.rpartition("<li class=")[2].partition(">")[0], after.partition("</div>")[0]
+    return found
+
+
+def trials_of(record, **wanted):
+    """Ids of the study's trials at a width, a seed or a role."""
+    found = []
+    for point in plan_sweeps(record.study, record.axes)[0].points:
+        facts = {"width": point.x, "seed": point.trial.train.seed, "role": point.role}
+        if all(facts[k] == v for k, v in wanted.items()):
+            found.append(trial_id(point.trial, PROVENANCE))
+    return found
+
+
+def rejudge(workspace, id, change):
+    """Windows of a trial changed, and all that follows from them made again: nothing but the numbers can tell."""
+    from hma_jax.evaluation.summary import summarise
+
+    directory = workspace.trials / id
+    windows = WindowTable.load(directory / FILE)
+    metrics = change(dict(windows.metrics))
+    windows = replace(windows, metrics={k: v.astype(np.float32).astype(np.float64) for k, v in metrics.items()})
+    windows.save(directory / FILE, id)
+    result = json.loads((directory / RESULT).read_text())
+    result.pop("hash")
+    write_result(directory, result | {"evaluation": summarise(windows, 1).to_dict()})
+
+
+def test_a_good_study_passes_everything(study):
+    found = verdicts(study[0])
+    assert {v for v, _ in found.values()} == {"good"}, found
+    assert "6 of 6 hold" in study[0].report.read_text()
+    assert "from 252 windows" in found["numbers"][1]  # seven trials of three robots, six episodes, two windows each
+
+
+def test_drawing_again_changes_no_byte_of_the_tables(copied):
+    workspace, record = copied
+    tables = [workspace.results, workspace.fits]
+    before = [path.read_bytes() for path in tables]
+    for path in tables:
+        path.unlink()
+    draw(workspace, record)
+    assert [path.read_bytes() for path in tables] == before
+
+
+def test_a_deleted_trial_is_missed(copied):
+    workspace, record = copied
+    shutil.rmtree(workspace.trials / trials_of(record, width=8, seed=1)[0])
+    draw(workspace, record)
+    found = verdicts(workspace)
+    assert found["trial"] == ("bad", ".</b> 6 of 7 finished, 1 missing.")
+    assert found["seeds"][0] == "bad" and "2 to 3 per point" in found["seeds"][1]
+
+
+def test_a_seed_that_was_dropped_from_the_study_is_missed(copied):
+    workspace, record = copied
+    draw(workspace, replace(record, study=replace(SMALL, seeds=(0, 1))))
+    found = verdicts(workspace)
+    assert found["trial"][0] == "good"  # all that is planned
+    assert found["seeds"][0] == "bad" and "2 per point" in found["seeds"][1]
+
+
+@pytest.mark.parametrize("column", ["mean", "sem", "n"])
+def test_one_digit_of_the_table_is_noticed_and_put_right(copied, column):
+    workspace, record = copied
+    whole = workspace.results.read_text()
+    head, *lines = whole.splitlines()
+    at = next(i for i, line in enumerate(lines) if ",overall,psnr," in line)
+    cells = lines[at].split(",")
+    k = head.split(",").index(column)
+    digit = str((int(cells[k][-2]) + 1) % 10)  # the last of seventeen may be none of the number
+    cells[k] = cells[k][:-2] + digit + cells[k][-1]
+    workspace.results.write_text("\n".join([head, *lines[:at], ",".join(cells), *lines[at + 1 :], ""]))
+    draw(workspace, record)
+    verdict, text = verdicts(workspace)["numbers"]
+    assert verdict == "bad" and "1 line of the table differs" in text and "overall, psnr" in text
+    assert workspace.results.read_text() == whole
+    draw(workspace, record)
+    assert verdicts(workspace)["numbers"][0] == "good"
+
+
+def test_a_line_taken_out_of_the_table_is_noticed(copied):
+    workspace, record = copied
+    lines = workspace.results.read_text().splitlines(keepends=True)
+    del lines[5]
+    workspace.results.write_text("".join(lines))
+    draw(workspace, record)
+    assert verdicts(workspace)["numbers"][0] == "bad"
+
+
+def test_results_that_do_not_follow_from_their_windows_are_noticed(copied):
+    """Though sealed again, as somebody who edits numbers would not do by accident."""
+    workspace, record = copied
+    directory = workspace.trials / trials_of(record, width=8, seed=0)[0]
+    result = json.loads((directory / RESULT).read_text())
+    result.pop("hash")
+    result["evaluation"][SMALL.datasets[1]]["psnr"]["mean"] += 1e-4
+    write_result(directory, result)
+    workspace.results.unlink()
+    draw(workspace, record)
+    verdict, text = verdicts(workspace)["numbers"]
+    assert verdict == "bad" and directory.name in text
+
+
+def test_trials_that_kept_no_windows_leave_the_question_open(copied):
+    workspace, record = copied
+    directory = workspace.trials / trials_of(record, width=8, seed=0)[0]
+    (directory / FILE).unlink()
+    result = json.loads((directory / RESULT).read_text())
+    result.pop("hash")
+    write_result(directory, result)
+    draw(workspace, record)
+    verdict, text = verdicts(workspace)["numbers"]
+    assert verdict == "open" and "1 of 7" in text and "1 cannot be checked" in workspace.report.read_text()
+
+
+def test_a_control_that_follows_actions_is_bad(copied):
+    workspace, record = copied
+    [control] = trials_of(record, role=CONTROL)
+    rejudge(workspace, control, lambda m: m | {"delta_psnr": m["delta_psnr"] + 0.5})
+    workspace.results.unlink()
+    draw(workspace, record)
+    assert verdicts(workspace)["controls"][0] == "bad"
+
+
+def test_robots_worse_than_copying_are_named(copied):
+    workspace, record = copied
+    for id in trials_of(record, width=16):
+        last = np.arange(36) >= 24
+        rejudge(workspace, id, lambda m, last=last: m | {"psnr": m["psnr"] - 5 * last})
+    workspace.results.unlink()
+    draw(workspace, record)
+    verdict, text = verdicts(workspace)["copying"]
+    assert verdict == "bad" and "On 2 of 3 robots, on 2 by more" in text and f"Not on {SMALL.datasets[2]}" in text
+
+
+def test_an_untrained_model_that_knows_something_is_bad(copied):
+    workspace, record = copied
+    [directory] = [workspace.trials / id for id in trials_of(record, width=16, seed=0)[:1]]
+    result = json.loads((directory / RESULT).read_text())
+    result.pop("hash")
+    for stats in result["untrained"].values():
+        stats["cross_entropy"]["mean"] -= 0.1
+    write_result(directory, result)
+    workspace.results.unlink()
+    draw(workspace, record)
+    assert verdicts(workspace)["untrained"][0] == "bad"
