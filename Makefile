@@ -1,5 +1,5 @@
-# Two commands: `make study` runs the scaling study, `make test` the tests. Both first create
-# .venv and install into it. PYTHON=python3.12 chooses the interpreter.
+# `make study` runs the scaling study, `make play` serves a page on which a trained model is driven, `make test`
+# runs the tests. All first create .venv and install into it. PYTHON=python3.12 chooses the interpreter.
 
 PYTHON ?= python3
 VENV := .venv
@@ -7,17 +7,22 @@ BIN := $(VENV)/bin
 OUT ?= runs/study
 PRESET ?= cpu
 WORKERS ?= 2
+PORT ?= 8765
 
-.PHONY: help study test test-slow clean
+.PHONY: help study play test test-slow clean
 
 help:
 	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS))"
+	@echo "make play       drive a trained model in the browser (PORT=$(PORT))"
 	@echo "make test       run the tests that take less than about 20 s each"
 	@echo "make test-slow  run the others too"
 	@echo "make clean      remove the environment and caches; results under runs/ stay"
 
 study: $(VENV)/installed
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
+
+play: $(VENV)/installed-play
+	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play --port $(PORT)
 
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8
@@ -41,6 +46,11 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing into $(VENV) (about a minute)"
 	@$(INSTALL) -e .
 	@touch $@
+
+$(VENV)/installed-play: pyproject.toml constraints.txt | $(BIN)/python
+	@echo "installing into $(VENV) (about a minute)"
+	@$(INSTALL) -e '.[play]'
+	@touch $@ $(VENV)/installed
 
 $(VENV)/installed-test: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing into $(VENV) (about a minute)"

@@ -21,7 +21,7 @@ from experiments.study import Study, on_tokenizer, on_user_data, override
 from hma_jax.config import ConfigError
 from hma_jax.training.claim import is_address
 
-Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous"]
+Preset = Literal["smoke", "cpu", "accelerator", "paper", "smoke-continuous", "cpu-continuous", "play"]
 
 UNSET = arg(help_behavior_hint="")
 """For an option whose text says what happens without it."""
@@ -33,7 +33,7 @@ class StudyArguments:
 
     preset: Preset = "cpu"
     """Named study: smoke (seconds), cpu (minutes), accelerator (one GPU), paper (as published).
-    With -continuous: on latents instead of ids."""
+    With -continuous: on latents instead of ids. play: the model of `make play`."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/PRESET)")] = None
     """Directory for everything that is written."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]", help_behavior_hint="(default: the simulated suite)")] = ()

@@ -29,6 +29,7 @@ PUBLIC = {
     "rollout": "hma_jax.generation",
     "start": "hma_jax.generation",
     "advance": "hma_jax.generation",
+    "Simulator": "hma_jax.simulator",
 }
 """Names that this package offers, and where they live. Each is imported when it is first asked for: a program that
 only reads configurations does not wait for JAX."""

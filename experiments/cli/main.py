@@ -15,11 +15,13 @@ from tyro.extras import SubcommandApp
 
 from experiments.cli import convert, study, tokenizer
 from experiments.cli.bench import app as bench
+from experiments.cli.check import check
 from experiments.cli.compare import compare
 from experiments.cli.data import app as data
 from experiments.cli.evaluate import evaluate
 from experiments.cli.fit import fit
 from experiments.cli.plan import plan
+from experiments.cli.play import play
 from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
@@ -43,6 +45,8 @@ app.command(tokenizer.tokenizer_app, name="tokenizer", help=tokenizer.HELP)
 app.command(convert.convert_app, name="convert", help=convert.HELP)
 app.command(bench.bench_app, name="bench", help=bench.HELP)
 app.command(name="plan")(plan)
+app.command(name="play")(play)
+app.command(name="check")(check)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -7,7 +7,7 @@ A session's arrays keep their shapes, so one compiled `advance` serves an episod
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,9 @@ from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
 from hma_jax.model.hma import HMA
+
+Phase = Literal["filling", "sliding"]
+"""Whether the next frame still fits in the window with all before it, or the oldest leaves."""
 
 
 class Session(NamedTuple):
@@ -64,12 +67,14 @@ def advance(
     *,
     next_chunk_BU: jax.Array | None = None,
     hidden_B: jax.Array | None = None,
+    phase: Phase | None = None,
 ) -> tuple[Session, jax.Array]:
     """(session, frame [B, S (, C)]) after `chunk_BU`, raw, was executed.
 
     Frame t is drawn from fold_in(key, t), as in `rollout`. With released alignment a frame is also
     shown the chunk that comes after it: `next_chunk_BU`, or the same again where nobody knows it
-    (as the release's simulator does). `hidden_B` marks chunks the model is not shown.
+    (as the release's simulator does). `hidden_B` marks chunks the model is not shown. A caller who knows
+    which `phase` the session is in saves the program of the other.
     """
     room, t = model.config.frames - 1, session.count
     hidden_B = jnp.zeros(len(chunk_BU), bool) if hidden_B is None else hidden_B
@@ -89,7 +94,10 @@ def advance(
             return steps.stream(window, session.cache, newest, t, keys, decode)
         return session.cache, steps.slide(window, session.frames, keys, decode)
 
-    cache, frame = jax.lax.cond(t <= room, within_the_window, past_the_window)
+    if phase is None:
+        cache, frame = jax.lax.cond(t <= room, within_the_window, past_the_window)
+    else:
+        cache, frame = within_the_window() if phase == "filling" else past_the_window()
     full = t >= room  # then the oldest frame makes place
     frames, chunks, hidden = (
         jnp.where(full, jnp.roll(x, -1, axis=1), x) for x in (session.frames, chunks, hidden)

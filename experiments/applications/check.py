@@ -1,0 +1,90 @@
+"""Whether a model listens to each action dimension of a robot's recordings, and with the sign and scale they have."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from data_pipelines.tokens.store import TokenStore
+from data_pipelines.windows.evalset import EvalManifest, eval_batches
+from experiments.running.workspace import Workspace
+from hma_jax.config import require
+from hma_jax.evaluation.effects import Effect, find_effects, make_loss
+from hma_jax.simulator.folder import find_robots
+from hma_jax.simulator.robots import Robot
+from hma_jax.training.runs import Model, load_model
+
+BATCH = 16
+
+Spoil = Callable[[np.ndarray], np.ndarray]
+"""Changes recorded actions [n, T, stride, A]: for tests of the check itself."""
+
+
+def check_run(
+    run: Path, workspace: Workspace, robots: Sequence[str], windows: int, spoil: Spoil = lambda actions: actions
+) -> dict[str, list[Effect]]:
+    """Effects of each robot's dimensions, on so many held-out windows of the workspace.
+
+    Raises ConfigError where the run or the workspace is not there, or does not know a robot.
+    """
+    missing = [str(path) for path in (workspace.store, workspace.manifest) if not path.exists()]
+    require(not missing, f"{', '.join(missing)}: not made yet; give the --out of the study that has the robots' tokens")
+    model, store = load_model(run), TokenStore(workspace.store)
+    manifest = EvalManifest.load(workspace.manifest)
+    known = {r.name: r for r in find_robots(run, model.table)}
+    there = [name for name in known if name in manifest.names]
+    names = list(robots) or there
+    unknown = [name for name in names if name not in there]
+    require(bool(names) and not unknown, f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}")
+    loss = jax.jit(make_loss(model.config, model.table, model.execution))
+    return {name: _check(model, loss, store, manifest, known[name], windows, spoil) for name in names}
+
+
+def _check(
+    model: Model, loss: Callable[..., jax.Array], store: TokenStore, manifest: EvalManifest, robot: Robot, windows: int, spoil: Spoil
+) -> list[Effect]:
+    batches = list(eval_batches(store, model.table, manifest, BATCH, (robot.name,), first=windows))
+    valid = np.concatenate([batch["valid"] for batch in batches])
+    width, chunk = model.table.action_width, robot.stride * robot.action_dim
+    flat = np.concatenate([batch["actions"] for batch in batches])[..., :chunk]
+    actions = spoil(flat.reshape(*flat.shape[:2], robot.stride, robot.action_dim))
+    kept = [{key: batch[key] for key in ("tokens", "embodiment", "real") if key in batch} for batch in batches]
+
+    def judge(changed: np.ndarray) -> np.ndarray:
+        rows = np.zeros((*changed.shape[:2], width), np.float32)
+        rows[..., :chunk] = changed.reshape(*changed.shape[:2], chunk)
+        parts = [loss(model.params, batch, rows[i * BATCH : (i + 1) * BATCH]) for i, batch in enumerate(kept)]
+        return np.concatenate([np.asarray(part) for part in parts])[valid]
+
+    episode = np.concatenate([batch["episode"] for batch in batches])[valid]
+    entry = model.table.entries[model.table.index(robot.name)]
+    return find_effects(judge, actions, np.array(entry.mean, np.float32), episode.tolist())
+
+
+def verdict(effect: Effect, names: Sequence[str]) -> str:
+    """In words."""
+    change = effect.better
+    if change is None:
+        return "ignored" if effect.ignored else "as recorded"
+    if change.kind == "negated":
+        return "negated"
+    if change.kind == "swapped":
+        return f"swapped with {names[change.other if change.dimension == effect.dimension else change.dimension]}"
+    times, size = (1 / change.factor, "large") if change.factor < 1 else (change.factor, "small")
+    return f"about {times:g} times too {size}"
+
+
+def write_effects(path: Path, found: dict[str, list[Effect]], names: dict[str, Sequence[str]]) -> None:
+    """As JSON: per robot and dimension the verdict and the numbers behind it."""
+    rows: dict[str, list[dict[str, Any]]] = {
+        robot: [{"name": names[robot][e.dimension], "verdict": verdict(e, names[robot]), **dataclasses.asdict(e)} for e in effects]
+        for robot, effects in found.items()
+    }
+    write_file(path, json.dumps(rows, indent=1))

@@ -1,0 +1,190 @@
+"""Who is there: visitors, their seats in the simulator, what they wait for and what waits for them.
+
+Everything here runs in the event loop's thread but `turn.answer`, of which one runs at a time in another. Queues are
+bounded on both ends: of a visitor who asks faster than frames are made no more is read, one who does not read is let go.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import secrets
+import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from aiohttp import web
+
+from experiments.applications.play.turn import CHANGES, Message, Seat, Truth, Wish, answer
+from hma_jax.simulator.simulator import Simulator
+
+log = logging.getLogger(__name__)
+
+WISHES = 4
+"""Of one visitor that may wait to be answered."""
+
+REPLIES = 16
+"""To one visitor that may wait to be sent."""
+
+SEND_SECONDS = 10.0
+"""That a message may take until the visitor's computer has it."""
+
+LINGER_SECONDS = 120.0
+"""That a seat is kept for a visitor whose connection was lost."""
+
+IDLE_SECONDS = 900.0
+"""Without a wish, after which a connected visitor's seat is free for others who want it."""
+
+FAULTS = 20
+"""Messages of one connection that make no sense, until it is closed."""
+
+
+class Full(Exception):
+    """There is no free seat."""
+
+
+@dataclass(eq=False)
+class Visitor:
+    """Somebody with a seat, connected or for a while not."""
+
+    token: str
+    seat: Seat
+    wishes: deque[Wish] = field(default_factory=deque)
+    answered: asyncio.Event = field(default_factory=asyncio.Event)
+    replies: asyncio.Queue[str] | None = None  # None while not connected
+    socket: web.WebSocketResponse | None = None
+    transport: asyncio.Transport | None = None  # of the socket
+    active: float = field(default_factory=time.monotonic)
+
+    def tell(self, message: Message) -> None:
+        """Leaves a message to be sent. One who lets so many wait that there is no room is disconnected."""
+        if self.replies is None:
+            return
+        try:
+            self.replies.put_nowait(json.dumps(message))
+        except asyncio.QueueFull:
+            log.info("a visitor does not read; disconnected")
+            self.abort()
+            self.replies = None
+
+    def abort(self) -> None:
+        """Ends the connection at once: whoever does not read does not say goodbye either."""
+        if self.transport is not None:
+            self.transport.abort()
+        self.socket = self.transport = None
+
+
+class Crowd:
+    """The visitors of one simulator."""
+
+    def __init__(self, simulator: Simulator, truth: Truth):
+        self.simulator, self.truth = simulator, truth
+        self.visitors: dict[str, Visitor] = {}
+        self._free = list(range(len(simulator)))
+        self._wanted = asyncio.Event()
+        self._thread = ThreadPoolExecutor(1, "simulator")
+
+    # --- Coming and going --------------------------------------------------------------------------
+
+    def enter(self, token: str | None) -> Visitor:
+        """The visitor with this token, if there still is one, or a new one. Raises Full."""
+        now = time.monotonic()
+        if token in self.visitors:
+            visitor = self.visitors[token]
+            visitor.abort()  # the same page in a second window takes over
+            visitor.active = now
+            return visitor
+        if not self._free:
+            self._make_room(now)
+        visitor = Visitor(secrets.token_urlsafe(16), Seat(self._free.pop(0)))
+        self.visitors[visitor.token] = visitor
+        return visitor
+
+    def _make_room(self, now: float) -> None:
+        """Frees the seat of whoever is away for the longest, if anybody is."""
+        away = [v for v in self.visitors.values() if v.socket is None or now - v.active > IDLE_SECONDS]
+        if not away:
+            raise Full
+        gone = min(away, key=lambda v: (v.socket is not None, v.active))
+        gone.tell({"type": "gone", "message": "your seat was given to another visitor; reload the page"})
+        self.dismiss(gone)
+
+    def leave(self, visitor: Visitor, socket: web.WebSocketResponse) -> None:
+        """The connection ended. The seat stays for a while."""
+        if visitor.socket is socket:
+            visitor.socket = visitor.replies = visitor.transport = None
+            visitor.wishes.clear()
+            visitor.active = time.monotonic()
+
+    def dismiss(self, visitor: Visitor) -> None:
+        if self.visitors.pop(visitor.token, None) is not None:
+            self._free.append(visitor.seat.episode)
+            visitor.wishes.clear()
+            visitor.answered.set()
+
+    def tidy(self) -> None:
+        """Frees the seats of those who were away for too long."""
+        now = time.monotonic()
+        for visitor in list(self.visitors.values()):
+            if visitor.socket is None and now - visitor.active > LINGER_SECONDS:
+                self.dismiss(visitor)
+
+    # --- Wishes ------------------------------------------------------------------------------------
+
+    def wish(self, visitor: Visitor, message: Message) -> bool:
+        """Takes a message as a wish. False if it makes no sense."""
+        kind = message.get("type")
+        if not isinstance(kind, str) or (kind != "act" and kind not in CHANGES):
+            return False
+        visitor.active = time.monotonic()
+        visitor.wishes.append(Wish(kind, message))
+        self._wanted.set()
+        return True
+
+    async def room_for(self, visitor: Visitor) -> None:
+        """Until few enough of a visitor's wishes wait. Meanwhile nothing of that visitor is read."""
+        while len(visitor.wishes) >= WISHES:
+            visitor.answered.clear()
+            await visitor.answered.wait()
+
+    async def serve(self) -> None:
+        """Answers wishes, a round of all visitors' oldest ones at a time, until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await self._wanted.wait()
+            self._wanted.clear()
+            asking = [v for v in self.visitors.values() if v.wishes]
+            if not asking:
+                continue
+            wishes = {i: (v.seat, v.wishes.popleft()) for i, v in enumerate(asking)}
+            try:
+                replies = await loop.run_in_executor(self._thread, answer, self.simulator, self.truth, wishes)
+            except Exception:  # a fault of ours: this round's wishes are lost, the server is not
+                log.exception("a round of wishes could not be answered")
+                replies = {i: [{"type": "error", "message": "the simulator failed; see the server's log"}] for i in wishes}
+            for i, messages in replies.items():
+                asking[i].answered.set()
+                for message in messages:
+                    asking[i].tell(message)
+            if any(v.wishes for v in self.visitors.values()):
+                self._wanted.set()
+            self.tidy()
+
+    async def send(self, visitor: Visitor, socket: web.WebSocketResponse, replies: asyncio.Queue[str]) -> None:
+        """Sends a connection's messages until it is cancelled or takes too long."""
+        with contextlib.suppress(ConnectionError, RuntimeError):  # it was closed meanwhile
+            while True:
+                text = await replies.get()
+                try:
+                    await asyncio.wait_for(socket.send_str(text), SEND_SECONDS)
+                except TimeoutError:
+                    log.info("a visitor does not read; disconnected")
+                    if visitor.socket is socket:
+                        visitor.abort()
+                    return
+
+    def close(self) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)

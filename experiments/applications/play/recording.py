@@ -1,0 +1,121 @@
+"""What a visitor recorded, as a video and as an RLDS dataset."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.sources.rlds.example import encode_example
+from data_pipelines.sources.rlds.tfrecord import write_shard
+from data_pipelines.sources.rlds.writer import (
+    STEP_FIELDS,
+    TEXT,
+    Field,
+    build_features,
+    encode_jpeg,
+    image_field,
+    shard_name,
+    step_features,
+    vector_field,
+    write_info,
+)
+from data_pipelines.sources.units import require_module
+from hma_jax.simulator.robots import Robot
+
+MOST_FRAMES = 3000
+"""Of a recording, which is kept in memory: it ends there."""
+
+ENLARGED = 4
+"""Times that a frame's sides are longer in the video."""
+
+
+class Recording:
+    """Frames of one episode and the chunks between them, newest last."""
+
+    def __init__(self, robot: Robot):
+        self.robot = robot
+        self._images: list[np.ndarray] = []
+        self._chunks: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def add(self, before: np.ndarray, chunk: np.ndarray, after: np.ndarray) -> bool:
+        """Adds the frame after `chunk` [stride, A], the first time also the one `before`. False: that was the last."""
+        if not self._images:
+            self._images.append(np.array(before))
+        self._images.append(np.array(after))
+        self._chunks.append(np.array(chunk, np.float32))
+        return len(self) < MOST_FRAMES
+
+    def copy(self) -> Recording:
+        """As it is now, for another thread to read."""
+        other = Recording(self.robot)
+        other._images, other._chunks = self._images[:], self._chunks[:]
+        return other
+
+    def drop(self, frames: int) -> None:
+        """Takes the newest frames back; all of them, if it has no more."""
+        keep = len(self._images) - frames
+        del self._images[max(keep, 0) :], self._chunks[max(keep - 1, 0) :]
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of the robot's own time; 2 where it is not known."""
+        return self.robot.hz / self.robot.stride or 2.0
+
+    def video(self) -> bytes:
+        """MP4, enlarged, in the robot's own time."""
+        av = require_module("av")
+        file = io.BytesIO()
+        with av.open(file, "w", format="mp4") as container:
+            stream = container.add_stream("libx264", rate=max(round(self.rate), 1))
+            height, width = (ENLARGED * side for side in self._images[0].shape[:2])
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            stream.options = {"crf": "16"}
+            for image in self._images:
+                large = image.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(large, format="rgb24")))
+            container.mux(stream.encode())
+        return file.getvalue()
+
+    def dataset(self) -> bytes:
+        """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it."""
+        name = f"{self.robot.name}_played"
+        height, width = self._images[0].shape[:2]
+        chunk = self.robot.stride * self.robot.action_dim
+        step = {"observation/image": image_field(height, width), "action": vector_field(chunk)} | STEP_FIELDS
+        features = build_features(step, {"file_path": Field(TEXT)})
+        steps = len(self._images)
+        actions = np.zeros((steps, chunk), np.float32)
+        actions[: steps - 1] = [c.ravel() for c in self._chunks]
+        record = encode_example({
+            **step_features(np.zeros(steps), [""] * steps),
+            "steps/observation/image": [encode_jpeg(image) for image in self._images],
+            "steps/action": actions.ravel(),
+            "episode_metadata/file_path": [f"played/{self.robot.name}".encode()],
+        })  # fmt: skip
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(folder) / name / "1.0.0"
+            place.mkdir(parents=True)
+            write_shard(place / shard_name(name, 0, 1), [record])
+            write_info(
+                place, name=name, features=features, lengths=[1], size=len(record),
+                description=f"One episode of {self.robot.name}, played by hand in a learned simulator.",
+                metadata={"hz": self.rate, "stride": self.robot.stride, "generated": True},
+                module="experiments.applications.play",
+            )  # fmt: skip
+            return _zipped(Path(folder))
+
+
+def _zipped(folder: Path) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for path in sorted(folder.rglob("*")):
+            if path.is_file():
+                archive.write(path, path.relative_to(folder))
+    return file.getvalue()

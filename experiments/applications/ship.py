@@ -1,0 +1,161 @@
+"""The model of `make play`, small enough for the repository, and what it is worth.
+
+Command: hma train --preset play --out runs/play
+         python -m experiments.applications.ship runs/play/model [--out experiments/results/simulator]
+Cost: the first hours of two cores, resumed where it was stopped; the second minutes.
+Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
+          actions of other episodes.
+
+Writes weights (their average, where the run keeps one), tokenizer, the robots' commands, starts of held-out episodes,
+and report.json: PSNR against the true simulator by frame, of the model, of a still picture and of shuffled actions,
+over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from data_pipelines.publishing.files import publish, write_file
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_starts
+from experiments.applications.simulators import load_simulator, true_simulator
+from experiments.running.machine import describe_machine
+from hma_jax.config import require
+from hma_jax.evaluation.metrics import psnr
+from hma_jax.model.params import Params
+from hma_jax.simulator.folder import ROBOTS, TOKENIZER, save_robots
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.simulator.starts import FILE as STARTS
+from hma_jax.simulator.starts import Start, save_starts
+from hma_jax.tokenizers.io import save_tokenizer
+from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.runs import describe_run, load_run
+
+OUT = Path("experiments/results/simulator")
+REPORT = "report.json"
+LARGEST = 10 * 2**20
+"""Bytes of everything that is shipped."""
+
+EPISODES = 8
+FRAMES = 14
+"""Frames after the start that are compared."""
+
+FIRST = 3
+
+
+class Shipped(NamedTuple):
+    """What a checkpoint for inference holds."""
+
+    params: Params
+
+
+def ship(source: Path, out: Path) -> None:
+    """Replaces `out`, whole or not at all. Raises ConfigError if it would be too large."""
+    run = load_run(source, "auto")
+    simulator = load_simulator(source)
+    aside = out.with_name(f".{out.name}.making")
+    shutil.rmtree(aside, ignore_errors=True)
+    aside.mkdir(parents=True)
+    try:
+        described = describe_run(run.model, run.train, run.table, run.provenance)
+        with Checkpoints(aside / "checkpoints", described) as checkpoints:
+            checkpoints.save(run.step, Shipped(run.params))
+        save_tokenizer(simulator.tokenizer, aside / TOKENIZER)
+        save_robots(tuple(simulator.robots.values()), aside / ROBOTS)
+        save_starts(simulator.starts, aside / STARTS)
+        size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())
+        require(size <= LARGEST, f"{size:,} bytes are more than the {LARGEST:,} that a repository should carry")
+        publish(aside, out)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def measure(run: Path) -> dict[str, Any]:
+    """What report.json says."""
+    simulator = load_simulator(run, episodes=EPISODES)
+    robots = {name: compare(simulator, robot) for name, robot in simulator.robots.items()}
+    return {
+        "step": simulator.model.step,
+        "parameters": simulator.model.declared.count(),
+        "pixels": simulator.tokenizer.image_size,
+        "episodes": EPISODES,
+        "robots": robots,
+        "frames_per_second": frames_per_second(run),
+        "machine": describe_machine(jax.devices()),
+    }
+
+
+def compare(simulator: Simulator, robot: Robot) -> dict[str, list[float]]:
+    """Mean PSNR in dB by frame after the start, against the true simulator under the same held-out actions."""
+    starts, futures = held_out(robot, simulator.tokenizer.image_size)
+    true = np.stack(list(rolled(true_simulator(simulator, [robot], len(starts)), starts, futures)))
+    made = np.stack(list(rolled(simulator, starts, futures)))
+    others = np.stack(list(rolled(simulator, starts, np.roll(futures, 1, axis=0))))
+    still = np.broadcast_to(made[:1], made.shape)
+
+    def against_truth(images: np.ndarray) -> list[float]:
+        return [round(float(np.mean(psnr(a, b))), 2) for a, b in zip(images[1:], true[1:], strict=True)]
+
+    return {"model": against_truth(made), "still": against_truth(still), "shuffled": against_truth(others)}
+
+
+def held_out(robot: Robot, size: int) -> tuple[list[Start], np.ndarray]:
+    """`EPISODES` starts, and what was done after them: chunks [EPISODES, FRAMES, stride, A]."""
+    whole = suite_starts(robot.name, 16 * EPISODES, FIRST + FRAMES, seed=1)[:EPISODES]
+    longest = SPECS[robot.name].seconds[1]
+    require(len(whole) == EPISODES, f"{robot.name}: too few of its episodes (at most {longest:g} s) are long enough")
+    given = (FIRST - 1) * robot.stride
+    starts = [
+        Start(s.robot, np.stack([fit_image(i, size) for i in s.images[:FIRST]]), s.actions[:given], s.seed) for s in whole
+    ]
+    futures = np.stack([s.actions[given : given + FRAMES * robot.stride] for s in whole])
+    return starts, futures.reshape(EPISODES, FRAMES, robot.stride, robot.action_dim)
+
+
+def rolled(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futures: np.ndarray):
+    """The frames of all episodes [B, H, W, 3], the first ones and those after each chunk."""
+    yield simulator.reset(starts)
+    for t in range(futures.shape[1]):
+        yield simulator.step(list(futures[:, t]))
+
+
+def frames_per_second(run: Path, frames: int = 60) -> float:
+    """At batch 1, past the window, tokenizer included."""
+    simulator = load_simulator(run)
+    robot = next(iter(simulator.robots.values()))
+    simulator.reset(next(s for s in simulator.starts if s.robot == robot.name))
+    action = np.array(robot.rest, np.float32)
+    for _ in range(simulator.model.config.frames + 1):
+        simulator.step([action])
+    started = time.perf_counter()
+    for _ in range(frames):
+        simulator.step([action])
+    return round(frames / (time.perf_counter() - started), 1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=OUT)
+    arguments = parser.parse_args()
+    ship(arguments.run, arguments.out)
+    report = measure(arguments.out)
+    write_file(arguments.out / REPORT, json.dumps(report, indent=1) + "\n")
+    for name, by in report["robots"].items():
+        means = ", ".join(f"{kind} {np.mean(values):.2f}" for kind, values in by.items())
+        print(f"{name:16s} PSNR over {FRAMES} frames: {means} dB")
+    print(f"{report['frames_per_second']} frames/s at batch 1; step {report['step']:,}")
+
+
+if __name__ == "__main__":
+    main()

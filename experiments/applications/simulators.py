@@ -1,0 +1,126 @@
+"""A run's robots in its learned simulator or in their true one, exchangeable by one word."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
+from data_pipelines.tokens.store import TokenStore
+from experiments.running.workspace import Workspace
+from hma_jax.config import require
+from hma_jax.simulator.folder import ROBOTS
+from hma_jax.simulator.interface import AnySimulator
+from hma_jax.simulator.robots import Robot, rest_of
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.simulator.starts import FILE as STARTS
+from hma_jax.simulator.starts import Start
+
+if TYPE_CHECKING:
+    from hma_jax.model.embodiments import Embodiment
+
+World = Literal["learned", "true"]
+
+STARTS_PER_ROBOT = 6
+START_FRAMES = 3
+"""Frames that an episode begins with: enough to see what moves."""
+
+
+def load_simulator(run: Path, **options: Any) -> Simulator:
+    """The learned simulator of a run, with robots and starts: those that lie beside it (`simulator.folder`), otherwise
+    those of the study's directory that the run is in.
+
+    Raises ConfigError where there is no run, or nothing to start from.
+    """
+    simulator = Simulator.load(run, **options)
+    if not (run / ROBOTS).exists():
+        described = describe_robots(simulator, Workspace(run.absolute().parent))
+        simulator.describe(described)
+    if not (run / STARTS).exists():
+        simulator.starts = find_starts(simulator, Workspace(run.absolute().parent))
+    require(
+        bool(simulator.starts),
+        f"{run}: there is no {STARTS} beside the run, and neither a robot of the suite nor held-out frames in "
+        f"{run.absolute().parent / 'tokens'} to start from",
+    )
+    return simulator
+
+
+def make_simulator(run: Path, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
+    """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
+
+    Raises ConfigError; for "true" if a robot is not of the suite.
+    """
+    learned = load_simulator(run, episodes=episodes, **options)
+    return learned if world == "learned" else true_simulator(learned, tuple(learned.robots.values()), episodes)
+
+
+def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 1) -> SuiteSimulator:
+    """The true simulator of some robots of a learned one, which sees what that sees."""
+    size = learned.tokenizer.image_size
+    true = SuiteSimulator(robots, episodes=episodes, image_size=size, outside=learned.outside)
+    true.starts = learned.starts
+    return true
+
+
+def has_truth(robot: Robot) -> bool:
+    """Whether the suite has this robot."""
+    return robot.name in SPECS and SPECS[robot.name].action_dim == robot.action_dim
+
+
+def describe_robots(simulator: Simulator, workspace: Workspace) -> list[Robot]:
+    """The robots of a simulator with the ranges that were recorded, where the study's tokens are at hand."""
+    store = TokenStore(workspace.store) if workspace.store.is_dir() else None
+    described = []
+    for entry in simulator.model.table.entries:
+        if entry.action_dim:
+            described.append(_describe(entry, store))
+    return described
+
+
+def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:
+    known = Robot.of(entry)
+    manifest = store.manifest(entry.name) if store is not None and entry.name in store.names else None
+    recorded = manifest is not None and len(manifest.action_min) == entry.action_dim
+    low, high = (manifest.action_min, manifest.action_max) if recorded else (known.low, known.high)
+    if entry.name in SPECS:
+        return suite_robot(entry.name, low, high, entry.mean, entry.stride, recorded=recorded)
+    hz = manifest.spec.hz if manifest is not None else 0.0
+    return Robot(entry.name, entry.stride, low, high, rest_of(low, high, entry.mean), hz=hz, recorded=recorded)
+
+
+def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_PER_ROBOT) -> tuple[Start, ...]:
+    """Starts of every robot: of held-out episodes of the suite, otherwise those whose frames the token store kept."""
+    store = TokenStore(workspace.store) if workspace.store.is_dir() else None
+    starts: list[Start] = []
+    for robot in simulator.robots.values():
+        if has_truth(robot):
+            made = suite_starts(robot.name, count, START_FRAMES)
+            starts += [_fitted(start, simulator.tokenizer.image_size) for start in made]
+        elif store is not None and robot.name in store.names:
+            starts += _stored_starts(store, robot, simulator.tokenizer.image_shape, count)
+    return tuple(starts)
+
+
+def _fitted(start: Start, size: int) -> Start:
+    return Start(start.robot, np.stack([fit_image(image, size) for image in start.images]), start.actions, start.seed)
+
+
+def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int], count: int) -> list[Start]:
+    manifest, starts = store.manifest(robot.name), []
+    every = robot.stride // manifest.frame_step
+    if not every or robot.stride % manifest.frame_step:
+        return []
+    for i in range(len(manifest.val.episodes)):
+        episode = store.episode(robot.name, "val", i)
+        frames = None if episode.frames is None else episode.frames[: START_FRAMES * every : every]
+        if frames is None or len(frames) < START_FRAMES or frames.shape[1:3] != shape:
+            continue
+        starts.append(Start(robot.name, np.array(frames), np.array(episode.actions[: (START_FRAMES - 1) * robot.stride])))
+        if len(starts) == count:
+            break
+    return starts

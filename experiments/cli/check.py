@@ -1,0 +1,51 @@
+"""`hma check`: does a model listen to its actions?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from experiments.progress import console, step, tidy_table
+from experiments.running.workspace import Workspace
+from experiments.setting import UNSET, require_local
+from hma_jax.config import require
+
+
+def check(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the directory that RUN is in)")] = None,
+    robots: Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET] = (),
+    windows: int = 64,
+) -> None:
+    """Say which action dimensions a model ignores, or has with another sign, scale or place than the recordings.
+
+    Held-out windows are judged under the recorded actions and with one dimension held still, negated, scaled or
+    exchanged with another. The table gives what a dimension is worth: nats per token that are lost when it is held still.
+    Writes RUN/check.json.
+
+    Args:
+        run: Directory of a training run.
+        out: Directory of a study with tokens and windows of the robots: your own recordings, or those it was trained on.
+        robots: Only these. Otherwise all that have windows there.
+        windows: Of each robot.
+    """
+    from experiments.applications.check import check_run, verdict, write_effects
+    from hma_jax.simulator.folder import find_robots
+    from hma_jax.training.runs import load_run
+
+    require_local("--out", out)
+    require(windows >= 2, f"--windows must be at least 2, got {windows}")
+    workspace = Workspace(out or run.absolute().parent)
+    with step(f"check {run}"):
+        found = check_run(run, workspace, robots, windows)
+    names = {robot.name: robot.dimensions for robot in find_robots(run, load_run(run).table)}
+    for robot, effects in found.items():
+        table = tidy_table(robot, "dimension", "worth", "verdict")
+        for effect in effects:
+            worth = f"{effect.worth.mean:.4f} ± {effect.worth.sem:.4f}"
+            table.add_row(names[robot][effect.dimension], worth, verdict(effect, names[robot]))
+        console.print(table)
+    write_effects(run / "check.json", found, names)
+    console.print(f"wrote {run / 'check.json'}", soft_wrap=True)

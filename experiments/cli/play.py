@@ -1,0 +1,85 @@
+"""`hma play`: a page on which a trained model is driven."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from experiments.progress import console
+from experiments.setting import UNSET
+from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, require
+
+if TYPE_CHECKING:
+    from data_pipelines.suite.simulator import SuiteSimulator
+    from hma_jax.simulator.robots import Robot
+
+SHIPPED = Path("experiments/results/simulator")
+"""The model that comes with the repository."""
+
+
+def play(
+    run: Annotated[Positional[Path], arg(metavar="RUN")] = SHIPPED,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    visitors: int = 4,
+    window: Literal["exact", "streaming"] = "exact",
+    unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2,
+    temperature: float = 0.0,
+    tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
+) -> None:
+    """Serve a page on which a trained model is driven with keys, gamepad or sliders.
+
+    Needs the extra `play`. Runs until it is interrupted. docs/simulator.md describes the page.
+
+    Args:
+        run: Directory of a training run; without it the model that comes with the repository.
+        host: Address to listen at. 127.0.0.1 is this computer alone; 0.0.0.0 lets everybody in who can reach it.
+        port: Of the address; 0 takes a free one.
+        visitors: Who can drive at once, in one batch.
+        window: Past the model's window of frames, exact computes it again for each, streaming is faster and near.
+        unmask_steps: Looks at a frame until it is finished; more are slower.
+        temperature: Of drawing tokens; 0 takes the likeliest.
+        tokenizer: That the model was trained with, if it is not beside the run.
+    """
+    try:
+        from experiments.applications.play.server import make_app, serve
+    except ModuleNotFoundError as error:
+        if error.name != "aiohttp":
+            raise
+        raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
+    from experiments.applications.simulators import has_truth, load_simulator, true_simulator
+    from hma_jax.simulator.simulator import SAMPLER
+    from hma_jax.simulator.warm_up import warm_up
+
+    require(
+        run != SHIPPED or run.is_dir(),
+        f"there is no model at {SHIPPED}: say which run to serve, or make one with `hma train --preset play --out runs/play` "
+        "and `hma play runs/play/model`",
+    )
+    require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
+    require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
+    decode = DecodeConfig(unmask_steps, temperature, sampler=SAMPLER, slide=window)
+    simulator = load_simulator(
+        run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
+    )
+    console.print(f"{run}: {len(simulator.robots)} robots; compiling")
+    warm_up(simulator)
+
+    def truth(robot: Robot) -> SuiteSimulator | None:
+        return true_simulator(simulator, [robot]) if has_truth(robot) else None
+
+    app = make_app(simulator, truth)
+
+    def say(actual: int) -> None:
+        shown = "localhost" if host == "127.0.0.1" else host
+        console.print(f"drive it at http://{shown}:{actual} (end with Ctrl-C)", soft_wrap=True)
+
+    try:
+        asyncio.run(serve(app, host, port, say))
+    except KeyboardInterrupt:
+        console.print("stopped")
+    except OSError as error:
+        raise ConfigError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error

@@ -1,0 +1,170 @@
+"""What each action dimension does to a model's frames, and whether that is what it did when they were recorded.
+
+Recorded frames are judged under the recorded actions and under changed ones: one dimension held still, negated,
+scaled, or exchanged with another. A dimension that the model listens to makes the recorded frames less likely when it
+is held still; one whose sign, scale or place differs from what the model learnt makes them *more* likely when it is
+changed back. No simulator and no other recording is needed: the frames themselves say what the action did.
+
+Changes are of raw values, as a robot's driver would get them wrong. Differences are paired by window and their errors
+clustered by episode.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Container, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import ExecutionConfig, ModelConfig
+from hma_jax.evaluation.metrics import factored_cross_entropy, mean_over_frames
+from hma_jax.generation import next_frame_outputs
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Params
+from hma_jax.objective.losses import frame_diffusion_loss
+
+Kind = Literal["still", "negated", "scaled", "swapped"]
+
+FACTORS = (1 / 50, 1 / 10, 1 / 3, 3.0, 10.0, 50.0)
+"""By which a dimension is scaled to see whether the frames fit better then."""
+
+PAIRS = 45
+"""Exchanges of two dimensions that are tried at most: all of up to ten; of more dimensions, those between the ones that
+make the frames no likelier as they are."""
+
+LISTENS, DIFFERS = 2.0, 3.0
+"""Standard errors from which on a difference counts: of holding a dimension still, and (of many changes the best one) of
+a change back."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Of one dimension's raw values."""
+
+    dimension: int
+    kind: Kind
+    factor: float = 1.0  # of `scaled`
+    other: int = -1  # of `swapped`
+
+    @property
+    def concerns(self) -> tuple[int, ...]:
+        """The dimensions whose values it changes."""
+        return (self.dimension, self.other) if self.kind == "swapped" else (self.dimension,)
+
+    def __call__(self, actions: np.ndarray, mean: np.ndarray) -> np.ndarray:
+        """Actions [..., A] so changed; held still, a value is its mean [A]."""
+        changed, d = actions.copy(), self.dimension
+        if self.kind == "still":
+            changed[..., d] = mean[d]
+        elif self.kind == "swapped":
+            changed[..., [d, self.other]] = actions[..., [self.other, d]]
+        else:
+            changed[..., d] *= -1.0 if self.kind == "negated" else self.factor
+        return changed
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean loss under a change less the loss as recorded, with its standard error."""
+
+    mean: float
+    sem: float
+
+    @property
+    def errors(self) -> float:
+        """In standard errors."""
+        return self.mean / self.sem if self.sem > 0 else float(np.sign(self.mean)) * np.inf if self.mean else 0.0
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What was found of one dimension. `worth` is what holding it still costs, in nats per token (continuous: in units of
+    the diffusion loss), all that was found wrong being changed back."""
+
+    dimension: int
+    worth: Difference
+    better: Change | None  # under which the recorded frames are likelier than as recorded, and by how much
+    gain: Difference | None
+
+    @property
+    def ignored(self) -> bool:
+        """Nothing is lost without it."""
+        return self.worth.errors < LISTENS
+
+
+Judge = Callable[[np.ndarray], np.ndarray]
+"""Losses [n] of recorded windows under actions [n, T, stride, A]."""
+
+
+def find_effects(judge: Judge, actions: np.ndarray, mean: np.ndarray, episode: Sequence[int]) -> list[Effect]:
+    """One per dimension of `actions` [n, T, stride, A], whose windows are of `episode` [n].
+
+    What helps most is changed back first, and the rest is judged again: a wrong dimension makes others look wrong.
+    """
+    count, losses = actions.shape[-1], judge(actions)
+    found: dict[int, tuple[Change, Difference]] = {}
+    while len(found) < count:
+        still = [judge(Change(d, "still")(actions, mean)) for d in range(count)]
+        tried: dict[Change, np.ndarray] = {}
+        for change in _changes(count, found, still, losses, episode):
+            after = judge(change(actions, mean))
+            helps = _clustered(after - losses, episode).errors < -DIFFERS
+            # A value that is merely harmful is best left out, whatever else is done to it.
+            if helps and all(_clustered(after - still[d], episode).errors < -LISTENS for d in change.concerns):
+                tried[change] = after
+        if not tried:
+            break
+        best = min(tried, key=lambda change: float(tried[change].mean()))
+        gain = _clustered(tried[best] - losses, episode)
+        found |= {d: (best, gain) for d in best.concerns}
+        actions, losses = best(actions, mean), tried[best]
+    worth = [_clustered(judge(Change(d, "still")(actions, mean)) - losses, episode) for d in range(count)]
+    return [Effect(d, worth[d], *found.get(d, (None, None))) for d in range(count)]
+
+
+def _changes(
+    count: int, found: Container[int], still: Sequence[np.ndarray], losses: np.ndarray, episode: Sequence[int]
+) -> Iterator[Change]:
+    """Of dimensions with which nothing was found wrong yet."""
+    left = [d for d in range(count) if d not in found]
+    for d in left:
+        yield Change(d, "negated")
+        yield from (Change(d, "scaled", factor) for factor in FACTORS)
+    pairs = list(itertools.combinations(left, 2))
+    if len(pairs) > PAIRS:
+        doubtful = [d for d in left if _clustered(still[d] - losses, episode).errors < LISTENS]
+        pairs = list(itertools.combinations(doubtful, 2))[:PAIRS]
+    yield from (Change(d, "swapped", other=other) for d, other in pairs)
+
+
+def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
+    """Mean over windows; deviations are added up by episode before they are squared."""
+    x, of = np.asarray(differences, np.float64), np.unique(np.asarray(episode), return_inverse=True)[1]
+    sums = np.bincount(of, x - x.mean())
+    groups = len(sums)
+    spread = np.sqrt((sums**2).sum() * groups / max(groups - 1, 1)) / len(x)
+    return Difference(float(x.mean()), float(spread) if groups > 1 else float("nan"))
+
+
+def make_loss(
+    model: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+) -> Callable[[Params, dict[str, jax.Array], jax.Array], jax.Array]:
+    """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted; the batch
+    is as `protocol.Batch` says."""
+    declared = declare_model(model, table, execution)
+
+    def loss(params: Params, batch: dict[str, jax.Array], actions: jax.Array) -> jax.Array:
+        hma, tokens, real = declared.merge(params), batch["tokens"][:, : model.frames], batch.get("real")
+        followed = None if real is None else real[:, 1 : model.frames]
+        said = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"])
+        if model.diffusion:
+            keys = jax.vmap(jax.random.key)(jnp.arange(len(tokens)))  # common noise under all changes
+            return mean_over_frames(frame_diffusion_loss(hma, said, tokens[:, 1:], keys), followed)
+        return mean_over_frames(factored_cross_entropy(said, tokens[:, 1:]), followed)
+
+    return loss

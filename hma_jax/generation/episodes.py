@@ -1,0 +1,90 @@
+"""Many simulated episodes at once, each of its own length: sessions of one example side by side.
+
+Every array of `Episodes` has a leading axis B of its own, so an episode may begin, wait, be copied or go back
+while the others stay where they are. What is computed is `session`'s, for one example at a time; XLA makes one
+program of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from hma_jax.config import DecodeConfig
+from hma_jax.generation.session import Phase, Session, advance, start
+from hma_jax.model.hma import HMA
+
+T = TypeVar("T")
+
+Episodes = Session
+"""A `Session` of batch 1 per episode, with the episodes along a leading axis of every array: `count` is [B]."""
+
+
+def start_each(
+    model: HMA,
+    frames: jax.Array,
+    chunks_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    given_B: jax.Array,
+    count_B: jax.Array,
+) -> Episodes:
+    """Episodes that have seen the first `given_B` of `frames` [B, T - 1, S (, C)], with at least one each.
+
+    `chunks_BTU` [B, T - 2, U] are those executed between them; what stands after the given ones is arbitrary.
+    `count_B` are the frames of each episode so far: as many as given, or more where `given_B` is T - 1 and older
+    ones have left the window.
+    """
+
+    def one(frames: jax.Array, chunks: jax.Array, robot: jax.Array, given: jax.Array, count: jax.Array) -> Session:
+        session = start(model, frames[None], chunks[None], robot[None])
+        room = session.cache.room
+        # Attention is causal: what is arbitrary was seen by nothing that is kept.
+        cache = session.cache._replace(valid=jnp.arange(room) < given - 1)
+        # Past the window frame j stands in slot j mod (T - 1), as `steps.stream` leaves it.
+        turned = [jnp.roll(x, count - given, axis=axis) for x, axis in _slots(cache)]
+        cache = jax.tree.unflatten(jax.tree.structure(cache), turned)
+        return session._replace(cache=cache, count=count)
+
+    return jax.vmap(one)(frames, chunks_BTU, embodiment_B, given_B, count_B)
+
+
+def _slots(cache: object) -> Sequence[tuple[jax.Array, int]]:
+    """Every array of a cache and its axis of slots: `valid` is [room], the others are [N, B, room, ...]."""
+    return [(x, 0 if x.ndim == 1 else 2) for x in jax.tree.leaves(cache)]
+
+
+def advance_each(
+    model: HMA, episodes: Episodes, chunk_BU: jax.Array, key_B: jax.Array, decode: DecodeConfig
+) -> tuple[Episodes, jax.Array]:
+    """(episodes, frames [B, S (, C)]): `session.advance` for every episode, wherever in its window it stands.
+
+    Frame t of an episode is drawn from fold_in(key, t), t being its own count.
+    """
+
+    def each(phase: Phase) -> tuple[Episodes, jax.Array]:
+        def one(session: Session, chunk: jax.Array, key: jax.Array) -> tuple[Session, jax.Array]:
+            session, frame = advance(model, session, chunk[None], key[None], decode, phase=phase)
+            return session, frame[0]
+
+        return jax.vmap(one)(episodes, chunk_BU, key_B)
+
+    def unless_none(which_B: jax.Array, phase: Phase) -> tuple[Episodes, jax.Array]:
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: each(phase)[1]))
+        return jax.lax.cond(which_B.any(), lambda: each(phase), lambda: (episodes, nothing))
+
+    filling_B = episodes.count <= model.config.frames - 1
+    filled, slid = unless_none(filling_B, "filling"), unless_none(~filling_B, "sliding")
+    return choose(filling_B, filled, slid)
+
+
+def choose(which_B: jax.Array, new: T, old: T) -> T:
+    """`new` where `which_B`, else `old`; both are trees of arrays with a leading axis B."""
+    return jax.tree.map(lambda a, b: jnp.where(which_B.reshape(-1, *(1,) * (a.ndim - 1)), a, b), new, old)
+
+
+def take(episodes: Episodes, rows_B: jax.Array) -> Episodes:
+    """Episode b goes on as a copy of episode `rows_B[b]`."""
+    return jax.tree.map(lambda x: jnp.take(x, rows_B, axis=0), episodes)

@@ -1,0 +1,187 @@
+"""Simulators as Gymnasium knows them (extra `simulator`): one robot, images in, its raw actions out.
+
+Importing this module registers `HMA/Robot-v0`, alone and as a vector environment:
+
+    gymnasium.make("hma_jax.simulator.environment:HMA/Robot-v0", run="RUN", robot="pusher_sand")
+    gymnasium.make_vec("hma_jax.simulator.environment:HMA/Robot-v0", num_envs=8, run="RUN", robot="pusher_sand")
+
+Instead of `run`, `simulator` takes anything with the interface of `interface.AnySimulator`, true simulators too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from hma_jax.config import require
+from hma_jax.simulator.interface import AnySimulator, Judge, no_judge
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.simulator.starts import Start
+
+ID = "HMA/Robot-v0"
+MAX_STEPS = 200
+"""Frames after which an episode is truncated, unless told otherwise."""
+
+
+def action_space(robot: Robot) -> gymnasium.spaces.Box:
+    """Raw actions [A], between the least and greatest that the robot was ever given."""
+    return gymnasium.spaces.Box(np.array(robot.low, np.float32), np.array(robot.high, np.float32), dtype=np.float32)
+
+
+def observation_space(simulator: AnySimulator) -> gymnasium.spaces.Box:
+    """Frames uint8 [H, W, 3]."""
+    return gymnasium.spaces.Box(0, 255, simulator.images.shape[1:], np.uint8)
+
+
+class _Task:
+    """What both environments need: a simulator, one of its robots, where its episodes start and how they end."""
+
+    def __init__(
+        self,
+        episodes: int,
+        run: str | Path | None,
+        robot: str | None,
+        simulator: AnySimulator | None,
+        starts: Sequence[Start] | None,
+        judge: Judge,
+        max_steps: int,
+        options: dict[str, Any],
+    ):
+        require((run is None) != (simulator is None), "an environment needs either `run` or `simulator`")
+        require(max_steps >= 1, f"an episode has at least 1 step, got max_steps={max_steps}")
+        if simulator is None:
+            simulator = Simulator.load(run, episodes=episodes, **options)
+        require(len(simulator) == episodes, f"a simulator of {episodes} episodes is needed, not of {len(simulator)}")
+        if starts is None:
+            starts = getattr(simulator, "starts", ())
+        names = [name for name in simulator.robots if any(s.robot == name for s in starts)]
+        require(bool(names), "there is no start to begin at: give `starts`, or a run that has some beside it")
+        robot = names[0] if robot is None else robot
+        self.simulator, self.judge, self.max_steps = simulator, judge, max_steps
+        require(robot in names, f"no start of robot {robot!r}; there are starts of {', '.join(names)}")
+        self.robot = simulator.robots[robot]
+        self.starts = [start for start in starts if start.robot == robot]
+
+    def begin(self, rng: np.random.Generator, episodes: Sequence[int], options: dict[str, Any] | None) -> np.ndarray:
+        """Starts and seeds drawn from `rng`, one pair for each of `episodes`; `options` may name the start."""
+        chosen, seeds = [], []
+        for _ in episodes:
+            drawn = int(rng.integers(len(self.starts)))
+            number = int((options or {}).get("start", drawn))
+            require(0 <= number < len(self.starts), f"there are {len(self.starts)} starts, no {number}")
+            chosen.append(self.starts[number])
+            seeds.append(int(rng.integers(2**32)))
+        return self.simulator.reset(chosen, seeds=seeds, episodes=episodes)
+
+
+class RobotEnv(gymnasium.Env):
+    """One episode of one robot. A step is a frame of the model: the action is held for it.
+
+    `reset(options={"start": i})` begins at that start, otherwise at a drawn one. Rewards and ends are the `judge`'s.
+    `info["clipped"]` names action dimensions whose value lay outside the range.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
+
+    def __init__(
+        self,
+        run: str | Path | None = None,
+        robot: str | None = None,
+        *,
+        simulator: AnySimulator | None = None,
+        starts: Sequence[Start] | None = None,
+        judge: Judge = no_judge,
+        max_steps: int = MAX_STEPS,
+        render_mode: str | None = None,
+        **options: Any,
+    ):
+        """`options` are those of `Simulator.load`. Raises ConfigError."""
+        self._task = _Task(1, run, robot, simulator, starts, judge, max_steps, options)
+        self.render_mode = render_mode
+        self.action_space = action_space(self._task.robot)
+        self.observation_space = observation_space(self._task.simulator)
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps = 0
+        return self._task.begin(self.np_random, [0], options)[0].copy(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        simulator = self._task.simulator
+        image = simulator.step([action])[0].copy()
+        self._steps += 1
+        rewards, done = self._task.judge(simulator)
+        info = {"clipped": simulator.clipped[0]}
+        return image, float(rewards[0]), bool(done[0]), self._steps >= self._task.max_steps, info
+
+    def render(self) -> np.ndarray | None:
+        return self._task.simulator.images[0].copy() if self.render_mode == "rgb_array" else None
+
+
+class RobotVectorEnv(VectorEnv):
+    """Many episodes of one robot in one batch. An episode that has ended begins anew with the next step, whose action
+    for it is ignored (Gymnasium's NEXT_STEP)."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4, "autoreset_mode": AutoresetMode.NEXT_STEP}
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        run: str | Path | None = None,
+        robot: str | None = None,
+        *,
+        simulator: AnySimulator | None = None,
+        starts: Sequence[Start] | None = None,
+        judge: Judge = no_judge,
+        max_steps: int = MAX_STEPS,
+        render_mode: str | None = None,
+        **options: Any,
+    ):
+        self._task = _Task(num_envs, run, robot, simulator, starts, judge, max_steps, options)
+        self.num_envs, self.render_mode = num_envs, render_mode
+        self.single_action_space = action_space(self._task.robot)
+        self.single_observation_space = observation_space(self._task.simulator)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self._steps = np.zeros(num_envs, int)
+        self._over = np.zeros(num_envs, bool)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._steps[:], self._over[:] = 0, False
+        return self._task.begin(self.np_random, range(self.num_envs), options).copy(), {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        simulator, again = self._task.simulator, self._over.copy()
+        simulator.step([None if over else action for action, over in zip(actions, again, strict=True)])
+        clipped = np.array([bool(names) for names in simulator.clipped])
+        if again.any():
+            self._task.begin(self.np_random, np.flatnonzero(again).tolist(), None)
+        self._steps = np.where(again, 0, self._steps + 1)
+        rewards, done = self._task.judge(simulator)
+        terminated = done & ~again
+        truncated = ~again & (self._steps >= self._task.max_steps)
+        self._over = terminated | truncated
+        return simulator.images.copy(), np.where(again, 0.0, rewards), terminated, truncated, {"clipped": clipped}
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        return tuple(self._task.simulator.images.copy()) if self.render_mode == "rgb_array" else None
+
+
+gymnasium.register(
+    ID,
+    entry_point="hma_jax.simulator.environment:RobotEnv",
+    vector_entry_point="hma_jax.simulator.environment:RobotVectorEnv",
+)

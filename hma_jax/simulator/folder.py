@@ -1,0 +1,77 @@
+"""What of a simulator lies on disk: a run, and beside it its tokenizer, its robots' commands and starts of episodes.
+
+    RUN/checkpoints   the model (`hma_jax.training.runs`)
+    RUN/tokenizer     or RUN/../tokenizer, where a study has it
+    RUN/robots.json   optional: ranges and names of the robots' commands, as recorded
+    RUN/starts.npz    optional: beginnings of recorded episodes
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from hma_jax.config import ConfigError, require
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import FILE as STARTS
+from hma_jax.simulator.starts import Start, load_starts
+from hma_jax.tokenizers.io import load_tokenizer
+from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.training.runs import Run
+
+ROBOTS = "robots.json"
+TOKENIZER = "tokenizer"
+
+
+def find_tokenizer(directory: Path, run: Run, given: Path | None) -> BaseTokenizer:
+    """The tokenizer whose tokens the run was trained on. Raises ConfigError if it is not there, or another one is."""
+    places = [Path(given)] if given else [directory / TOKENIZER, directory.absolute().parent / TOKENIZER]
+    found = [place for place in places if place.is_dir()]
+    require(
+        bool(found),
+        f"no tokenizer at {' or '.join(map(str, places))}; say where the one is that {directory} was trained with",
+    )
+    tokenizer, wanted = load_tokenizer(found[0]), run.provenance.get("tokenizer")
+    require(
+        wanted in (None, tokenizer.identity),
+        f"{directory} was trained on tokens of tokenizer {wanted}, but {found[0]} is {tokenizer.identity}; say where "
+        "the other one is",
+    )
+    return tokenizer
+
+
+def find_robots(directory: Path, table: EmbodimentTable) -> tuple[Robot, ...]:
+    """The robots of the table that have actions: as robots.json describes them, otherwise by their statistics."""
+    described = {robot.name: robot for robot in load_robots(directory / ROBOTS)}
+    return tuple(described.get(e.name) or Robot.of(e) for e in table.entries if e.action_dim)
+
+
+def find_starts(directory: Path) -> tuple[Start, ...]:
+    """Of starts.npz; none where there is no such file."""
+    path = directory / STARTS
+    return load_starts(path) if path.exists() else ()
+
+
+def load_robots(path: Path) -> tuple[Robot, ...]:
+    """None where there is no such file. Raises ConfigError for one that is damaged."""
+    if not path.exists():
+        return ()
+    try:
+        rows = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); make it again") from error
+    require(isinstance(rows, list), f"{path} is no list of robots; make it again")
+    return tuple(from_dict(Robot, row, f"{path}: robot {i}") for i, row in enumerate(rows))
+
+
+def save_robots(robots: Sequence[Robot], path: Path) -> None:
+    aside = path.with_name(f".{path.name}.tmp")
+    with open(aside, "w") as file:
+        file.write(json.dumps([to_dict(robot) for robot in robots], indent=1) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, path)

@@ -1,0 +1,42 @@
+"""What a learned simulator and a true one have in common: whoever steps the one can step the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import Start
+
+
+class AnySimulator(Protocol):
+    """B episodes that begin at recorded starts and advance frame by frame; `Simulator` says what each means."""
+
+    robots: Mapping[str, Robot]
+    clipped: list[tuple[str, ...]]
+
+    def __len__(self) -> int: ...
+
+    @property
+    def images(self) -> np.ndarray:
+        """uint8 [B, H, W, 3]."""
+        ...
+
+    def reset(
+        self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
+    ) -> np.ndarray: ...
+
+    def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray: ...
+
+    def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray: ...
+
+
+Judge = Callable[[AnySimulator], tuple[np.ndarray, np.ndarray]]
+"""What the present frames are worth: (rewards float [B], bool [B]: the task is done and the episode over)."""
+
+
+def no_judge(simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:
+    """Nothing is worth anything, and nothing ends an episode but its length."""
+    return np.zeros(len(simulator)), np.zeros(len(simulator), bool)

@@ -1,0 +1,114 @@
+"""What a simulator compiles: from pixels and raw actions to pixels in one call each, of fixed shapes.
+
+Begin from images, begin again from tokens, advance, copy: each takes and gives back the state of all episodes, and
+all but the last use its memory again. `advance` is compiled once for every power of two of episodes that advance
+together (`padded`), so that those that wait cost nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import DecodeConfig
+from hma_jax.generation.episodes import Episodes, advance_each, choose, start_each, take
+from hma_jax.model.params import Params
+from hma_jax.simulator.episode import Episode
+from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.training.runs import Model
+
+
+class Beginning(NamedTuple):
+    """Where episodes begin, or begin again; padded to the room of T - 1 frames."""
+
+    frames: np.ndarray  # uint8 [B, T - 1, H, W, 3], or tokens [B, T - 1, S (, C)]
+    chunks: np.ndarray  # float32 [B, T - 2, U]
+    robots: np.ndarray  # int32 [B]
+    given: np.ndarray  # int32 [B]: how many of the frames are real
+    counts: np.ndarray  # int32 [B]: frames so far
+    which: np.ndarray  # bool [B]: the others stay where they are
+
+    @classmethod
+    def blank(cls, episodes: int, room: int, width: int, shape: tuple[int, ...], dtype: Any) -> Beginning:
+        """Of none of so many episodes, with frames of `shape`."""
+        frames = np.zeros((episodes, room, *shape), dtype)
+        chunks = np.zeros((episodes, room - 1, width), np.float32)
+        one, none = np.ones(episodes, np.int32), np.zeros(episodes, np.int32)
+        return cls(frames, chunks, none, one, one.copy(), np.zeros(episodes, bool))
+
+    def place(self, b: int, episode: Episode, frames: np.ndarray) -> None:
+        """Episode b begins as `episode` after the newest `frames` of its window."""
+        given = len(frames)
+        self.frames[b, :given] = frames
+        if given > 1:
+            self.chunks[b, : given - 1] = list(episode.chunks)[-(given - 1) :]
+        self.robots[b], self.given[b], self.counts[b], self.which[b] = episode.index, given, episode.count, True
+
+
+class Weights(NamedTuple):
+    """What all programs compute with."""
+
+    model: Params
+    tokenizer: Params
+
+
+def padded(rows: list[int], episodes: int) -> list[int]:
+    """`rows` and the first of them again, up to a power of two or `episodes`."""
+    size = min(1 << (len(rows) - 1).bit_length(), episodes)
+    return rows + rows[:1] * (size - len(rows))
+
+
+class Programs:
+    """The compiled programs of a simulator of `episodes` episodes."""
+
+    def __init__(self, model: Model, tokenizer: BaseTokenizer, episodes: int, decode: DecodeConfig):
+        self.weights = Weights(model.params, tokenizer.params)
+        declared, room = model.declared, model.config.frames - 1
+        decoded: Callable[[Weights, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(w.tokenizer, x)
+
+        def fresh(weights: Weights, tokens: jax.Array, at: Beginning) -> Episodes:
+            chunks, robots = jnp.asarray(at.chunks), jnp.asarray(at.robots)
+            given, counts = jnp.asarray(at.given), jnp.asarray(at.counts)
+            return start_each(declared.merge(weights.model), tokens, chunks, robots, given, counts)
+
+        def again(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array]:
+            tokens = jnp.asarray(at.frames)
+            newest = jnp.take_along_axis(tokens, at.given.reshape(-1, *(1,) * (tokens.ndim - 1)) - 1, axis=1)[:, 0]
+            state = choose(at.which, fresh(weights, tokens, at), state)
+            return state, decoded(weights, newest)
+
+        def begin(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array, jax.Array]:
+            images = jnp.asarray(at.frames)
+            tokens = tokenizer.encode_fn(weights.tokenizer, images.reshape(-1, *images.shape[2:]))
+            tokens = tokens.reshape(*images.shape[:2], *tokens.shape[1:])
+            state, seen = again(weights, state, at._replace(frames=tokens))
+            return state, tokens, seen
+
+        def advance(
+            weights: Weights, state: Episodes, rows_n: jax.Array, chunk_nU: jax.Array, seed_n: jax.Array
+        ) -> tuple[Episodes, jax.Array, jax.Array]:
+            keys = jax.vmap(jax.random.key)(seed_n)
+            new, frames = advance_each(declared.merge(weights.model), take(state, rows_n), chunk_nU, keys, decode)
+            state = jax.tree.map(lambda whole, part: whole.at[rows_n].set(part), state, new)
+            return state, frames, decoded(weights, frames)
+
+        self.begin = jax.jit(begin, donate_argnums=1)
+        self.again = jax.jit(again, donate_argnums=1)
+        self.advance = jax.jit(advance, donate_argnums=1)
+        self.take = jax.jit(take)  # with its rows in order, a copy
+        self.token_shape = (tokenizer.tokens, tokenizer.channels) if tokenizer.channels else (tokenizer.tokens,)
+        described = jax.ShapeDtypeStruct
+        empty = Beginning(
+            described((episodes, room, *self.token_shape), jnp.float32 if tokenizer.channels else jnp.int32),
+            described((episodes, room - 1, model.table.action_width), jnp.float32),
+            *(described((episodes,), kind) for kind in (jnp.int32, jnp.int32, jnp.int32, jnp.bool)),
+        )
+        self._shapes = jax.eval_shape(lambda weights, at: fresh(weights, at.frames, at), self.weights, empty)
+
+    def empty(self) -> Episodes:
+        """The state of episodes of which none has begun."""
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes)

@@ -1,0 +1,126 @@
+"""What may be asked of a robot: its action dimensions, their ranges, and what becomes of what lies outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hma_jax.config import ConfigError, require
+from hma_jax.model.embodiments import DEAD_STD, Embodiment
+
+Outside = Literal["clip", "refuse"]
+"""What becomes of a value that lies outside what the robot ever did: it is moved to the nearest that does not,
+and said so, or an error."""
+
+KEYS = 4
+"""Directions that a page's keys have: right, up, D, W."""
+
+SPREAD = 3.0
+"""Standard deviations on both sides of the mean that are taken for a range where none is known."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot's commands, in its raw units, as recorded.
+
+    `low` and `high` are the least and greatest values that it was ever given in training (`recorded`), or, where
+    only statistics are known, quantiles or `SPREAD` standard deviations around the mean.
+    """
+
+    name: str
+    stride: int  # native actions per frame of the model
+    low: tuple[float, ...]  # [A]
+    high: tuple[float, ...]
+    rest: tuple[float, ...]  # an action to begin with: 0 where the range has it, otherwise the mean
+    dimensions: tuple[str, ...] = ()  # what each value is called
+    unit: str = ""  # of the values, for people
+    keeps: bool = False  # an action is a place to go to: keys move it; otherwise letting go of them is `rest`
+    # What the keys right, up, D and W do to each value, in shares of half its range; left, down, A and S do the opposite.
+    keys: tuple[tuple[float, ...], ...] = ()
+    hz: float = 0.0  # native actions per second; 0: not known
+    recorded: bool = True
+
+    def __post_init__(self):
+        require(self.stride >= 1, f"robot {self.name!r}: stride must be at least 1, got {self.stride}")
+        require(
+            len(self.low) == len(self.high) == len(self.rest),
+            f"robot {self.name!r}: low, high and rest must be of one length",
+        )
+        require(
+            bool(np.isfinite([*self.low, *self.high, *self.rest]).all())
+            and all(a <= b for a, b in zip(self.low, self.high, strict=True)),
+            f"robot {self.name!r}: the range of every action dimension must be finite, low to high",
+        )
+        if not self.dimensions:
+            object.__setattr__(self, "dimensions", tuple(f"action {i}" for i in range(self.action_dim)))
+        if not self.keys:  # two values: both pairs of keys move them; more: each key one
+            moved = [key % 2 if self.action_dim <= 2 else key for key in range(KEYS)]
+            rows = tuple(tuple(float(d == at) for d in range(self.action_dim)) for at in moved)
+            object.__setattr__(self, "keys", rows)
+        require(
+            len(self.keys) == KEYS and all(len(row) == self.action_dim for row in self.keys),
+            f"robot {self.name!r}: keys must be {KEYS} rows of {self.action_dim} values",
+        )
+        require(
+            len(self.dimensions) == self.action_dim,
+            f"robot {self.name!r}: {self.action_dim} action values but {len(self.dimensions)} names of them",
+        )
+
+    @property
+    def action_dim(self) -> int:
+        """A."""
+        return len(self.low)
+
+    @classmethod
+    def of(cls, entry: Embodiment) -> Robot:
+        """As far as a model's table knows it."""
+        if entry.low:
+            low, high = entry.low, entry.high
+        else:
+            spread = [SPREAD * s for s in entry.std]
+            low = tuple(m - s for m, s in zip(entry.mean, spread, strict=True))
+            high = tuple(m + s for m, s in zip(entry.mean, spread, strict=True))
+        alive = [s > DEAD_STD for s in entry.std]
+        low = tuple(a if on else m for a, on, m in zip(low, alive, entry.mean, strict=True))
+        high = tuple(b if on else m for b, on, m in zip(high, alive, entry.mean, strict=True))
+        return cls(entry.name, entry.stride, low, high, rest_of(low, high, entry.mean), recorded=False)
+
+    def chunk(self, action: np.ndarray) -> np.ndarray:
+        """float32 [stride, A] of one action [A], held for a whole frame, or of a chunk [stride, A].
+
+        Raises ConfigError for another shape or a value that is not finite.
+        """
+        action = np.asarray(action, np.float32)
+        shapes = (self.action_dim,), (self.stride, self.action_dim)
+        require(
+            action.shape in shapes,
+            f"{self.name}: an action is of shape {shapes[0]}, a frame's chunk of {shapes[1]}; got {action.shape}",
+        )
+        require(bool(np.isfinite(action).all()), f"{self.name}: the action is not finite: {action.tolist()}")
+        return np.broadcast_to(action, shapes[1])
+
+    def confine(self, actions: np.ndarray, outside: Outside) -> tuple[np.ndarray, np.ndarray]:
+        """(`actions` [..., A] within range, bool [A]: dimensions that were not). ConfigError where that is refused."""
+        low, high = np.asarray(self.low, np.float32), np.asarray(self.high, np.float32)
+        beyond = ((actions < low) | (actions > high)).reshape(-1, self.action_dim).any(0)
+        if outside == "refuse" and beyond.any():
+            raise ConfigError(f"{self.name}: {self.describe(beyond, actions)}; give actions in range, or have them clipped")
+        return np.clip(actions, low, high), beyond
+
+    def describe(self, beyond: np.ndarray, actions: np.ndarray) -> str:
+        """In words, what of `actions` [..., A] lies outside."""
+        values = actions.reshape(-1, self.action_dim)
+        known = "it was ever given" if self.recorded else "its statistics allow"
+        return "; ".join(
+            f"{self.dimensions[d]} of {values[:, d].min():g} to {values[:, d].max():g} is outside what {known}, "
+            f"{self.low[d]:g} to {self.high[d]:g}"
+            for d in np.flatnonzero(beyond)
+        )
+
+
+def rest_of(low: Sequence[float], high: Sequence[float], mean: Sequence[float]) -> tuple[float, ...]:
+    """0 where the range has it, otherwise the mean, within the range."""
+    return tuple(0.0 if a <= 0 <= b else min(max(m, a), b) for a, b, m in zip(low, high, mean, strict=True))

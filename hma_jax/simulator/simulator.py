@@ -1,0 +1,300 @@
+"""A trained model that is driven: episodes that begin, advance under raw actions, are kept, copied and taken back.
+
+Owns what is known of each episode on the host; arrays and their arithmetic are `programs`'.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, SamplerConfig, Weights, require
+from hma_jax.generation.episodes import Episodes
+from hma_jax.simulator.episode import Episode, begin_episode
+from hma_jax.simulator.folder import find_robots, find_starts, find_tokenizer
+from hma_jax.simulator.programs import Beginning, Programs, padded
+from hma_jax.simulator.robots import Outside, Robot
+from hma_jax.simulator.starts import Start
+from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.training.runs import Model, load_model
+
+Rate = Literal["model", "native"]
+"""Whether a step is a frame of the model, or one native action: then a frame comes with every stride-th."""
+
+HISTORY = 600
+"""Frames that an episode can be taken back by, unless told otherwise."""
+
+SAMPLER = SamplerConfig("dpm++", 12)
+"""Of latents, unless told otherwise: fewer evaluations of the denoiser than frames are judged with."""
+
+log = logging.getLogger(__name__)
+
+
+class Snapshot(NamedTuple):
+    """Where all episodes of a simulator stood."""
+
+    state: Episodes
+    images: np.ndarray
+    episodes: tuple[Episode | None, ...]
+
+
+class Simulator:
+    """B episodes at once, each with its own robot, beginning and end.
+
+    An episode must begin (`reset`) before it advances (`step`). Frames are uint8 [B, H, W, 3], as the tokenizer
+    decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
+    frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
+    says. ConfigError is raised for whatever cannot be done; nothing has changed then.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        tokenizer: BaseTokenizer,
+        *,
+        robots: Sequence[Robot] = (),
+        starts: Sequence[Start] = (),
+        episodes: int = 1,
+        decode: DecodeConfig | None = None,
+        outside: Outside = "clip",
+        rate: Rate = "model",
+        history: int = HISTORY,
+    ):
+        """`robots` describe commands better than the model's table does. Actions `outside` their range are clipped
+        (`clipped` says which, and the log once) or refused."""
+        config = model.config
+        require(episodes >= 1, f"a simulator has at least 1 episode, got {episodes}")
+        require(config.frames >= 3, f"a simulator needs a model of at least 3 frames, this one sees {config.frames}")
+        taken = config.tokens, config.diffusion.token_channels if config.diffusion else 0
+        made = tokenizer.tokens, tokenizer.channels
+        require(taken == made, f"the model takes (tokens, channels) {taken} per frame, the tokenizer makes {made}")
+        decode = decode or DecodeConfig(sampler=SAMPLER)
+        self.model, self.tokenizer, self.decode = model, tokenizer, decode
+        self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
+        self.describe(robots)
+        self.starts, self.outside, self.rate = tuple(starts), outside, rate
+        self.room, self.history = config.frames - 1, history
+        self._programs = Programs(model, tokenizer, episodes, decode)
+        self._state = self._programs.empty()
+        self._images = np.zeros((episodes, *tokenizer.image_shape, 3), np.uint8)
+        self._episodes: list[Episode | None] = [None] * episodes
+        self._said: set[str] = set()
+        self.clipped: list[tuple[str, ...]] = [()] * episodes
+
+    @classmethod
+    def load(
+        cls,
+        run: str | Path,
+        tokenizer: str | Path | None = None,
+        *,
+        execution: ExecutionConfig = ExecutionConfig(),
+        weights: Weights = "auto",
+        **options: Any,
+    ) -> Simulator:
+        """Of a training run, with what lies beside it (`folder`); `options` are the constructor's.
+
+        Raises ConfigError where there is no run, or not the tokenizer that it was trained with.
+        """
+        run = Path(run)
+        model = load_model(run, execution, weights)
+        found = {"robots": find_robots(run, model.table), "starts": find_starts(run)}
+        return cls(model, find_tokenizer(run, model.run, tokenizer and Path(tokenizer)), **(found | options))
+
+    # --- What there is -----------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        """B."""
+        return len(self._episodes)
+
+    @property
+    def images(self) -> np.ndarray:
+        """The present frames, uint8 [B, H, W, 3]; black where none has begun. Read-only."""
+        view = self._images.view()
+        view.flags.writeable = False
+        return view
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Frames of each episode so far, those that it began with included; 0: it has not begun."""
+        return tuple(0 if e is None else e.count for e in self._episodes)
+
+    def describe(self, robots: Sequence[Robot]) -> None:
+        """Takes better descriptions of robots, for episodes that begin from now on. ConfigError if one does not fit."""
+        for robot in robots:
+            known = self.robot(robot.name)
+            require(
+                (robot.action_dim, robot.stride) == (known.action_dim, known.stride),
+                f"{robot.name} is described with {robot.action_dim} action values and {robot.stride} actions per frame; "
+                f"the model knows it with {known.action_dim} and {known.stride}",
+            )
+        self.robots = {**self.robots, **{robot.name: robot for robot in robots}}
+
+    def robot(self, name: str) -> Robot:
+        """Raises ConfigError for one that the model does not know or that has no actions."""
+        require(name in self.robots, f"no robot {name!r} to drive; this model has {', '.join(self.robots)}")
+        return self.robots[name]
+
+    # --- Beginning ---------------------------------------------------------------------------------
+
+    def reset(
+        self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
+    ) -> np.ndarray:
+        """Begins `episodes` (default: all) at `starts`, one each or one for all; returns all frames.
+
+        Of a start's frames the last T - 1 are seen. An int for `seeds` gives the b-th of these episodes seed + b.
+        """
+        which = self._which(episodes)
+        each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
+        numbers = [seeds + i for i in range(len(which))] if isinstance(seeds, (int, np.integer)) else list(seeds)
+        asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"
+        require(len(each) == len(numbers) == len(which), asked)
+        require(all(0 <= s < 2**32 for s in numbers), "seeds must lie in [0, 2^32)")
+        new = {b: self._episode(start, int(seed)) for b, start, seed in zip(which, each, numbers, strict=True)}
+        at = self._blank((*self.tokenizer.image_shape, 3), np.uint8)
+        for b, start in zip(which, each, strict=True):
+            at.place(b, new[b], start.images[-self.room :])
+        self._state, tokens, seen = self._programs.begin(self._programs.weights, self._state, at)
+        tokens = np.asarray(tokens)
+        for b, episode in new.items():
+            episode.frames.extend(tokens[b, : at.given[b]])
+            self._episodes[b] = episode
+        return self._show(which, np.asarray(seen)[which])
+
+    def _episode(self, start: Start, seed: int) -> Episode:
+        robot, table = self.robot(start.robot), self.model.table
+        size, given = (*self.tokenizer.image_shape, 3), start.images.shape[1:]
+        require(given == size, f"a start of {robot.name}: frames must be {size}, got {given}")
+        return begin_episode(robot, table.index(robot.name), start, seed, self.room, self.history, table.action_width)
+
+    def _blank(self, shape: tuple[int, ...], dtype: Any) -> Beginning:
+        return Beginning.blank(len(self), self.room, self.model.table.action_width, shape, dtype)
+
+    def _which(self, episodes: Sequence[int] | None) -> list[int]:
+        which = list(range(len(self))) if episodes is None else [int(b) for b in episodes]
+        require(
+            all(0 <= b < len(self) for b in which) and len(set(which)) == len(which),
+            f"episodes must be different numbers below {len(self)}, got {which}",
+        )
+        return which
+
+    def _begun(self, b: int) -> Episode:
+        episode = self._episodes[b]
+        if episode is None:
+            raise ConfigError(f"episode {b} has not begun; reset it first")
+        return episode
+
+    def _show(self, which: Sequence[int], seen: np.ndarray) -> np.ndarray:
+        images = self._images.copy()  # callers keep the frames they were given
+        images[list(which)] = seen
+        self._images = images
+        return self.images
+
+    # --- Advancing ---------------------------------------------------------------------------------
+
+    def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray:
+        """The frames after `actions`, one entry per episode: an action [A], held for a frame, a chunk [stride, A], or
+        None for an episode that waits. At the native rate every entry is one action [A].
+
+        `clipped` then names the dimensions of each episode whose value lay outside the range.
+        """
+        require(len(actions) == len(self), f"{len(self)} episodes need as many actions, got {len(actions)}")
+        asked: dict[int, np.ndarray] = {}
+        clipped: list[tuple[str, ...]] = [()] * len(self)
+        for b, action in enumerate(actions):
+            if action is None:
+                continue
+            robot = self._begun(b).robot
+            native = self.rate == "native"
+            require(not native or np.ndim(action) == 1, f"at the native rate an action is [A], got {np.shape(action)}")
+            asked[b], beyond = robot.confine(robot.chunk(action), self.outside)
+            if beyond.any():
+                clipped[b] = tuple(np.array(robot.dimensions)[beyond].tolist())
+                self._say_once(robot, beyond, np.asarray(action, np.float32))
+        self.clipped = clipped
+        chunks = {b: chunk for b, asked_b in asked.items() if (chunk := self._whole(b, asked_b)) is not None}
+        return self._advance(chunks) if chunks else self.images
+
+    def _whole(self, b: int, chunk: np.ndarray) -> np.ndarray | None:
+        """The chunk [stride, A] to execute, or None while native actions of it are missing."""
+        episode = self._begun(b)
+        if self.rate == "model":
+            return chunk
+        episode.pending.append(chunk[0])
+        if len(episode.pending) < episode.robot.stride:
+            return None
+        whole, episode.pending = np.stack(episode.pending), []
+        return whole
+
+    def _say_once(self, robot: Robot, beyond: np.ndarray, actions: np.ndarray) -> None:
+        if robot.name not in self._said:
+            self._said.add(robot.name)
+            log.warning("%s: %s; clipped, here and from now on", robot.name, robot.describe(beyond, actions))
+
+    def _advance(self, chunks: Mapping[int, np.ndarray]) -> np.ndarray:
+        rows = padded(list(chunks), len(self))
+        chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
+        for i, b in enumerate(rows):
+            chunk_nU[i, : chunks[b].size] = chunks[b].ravel()
+        seeds = np.array([self._begun(b).seed for b in rows], np.uint32)
+        called = (self._programs.weights, self._state, np.array(rows, np.int32), chunk_nU, seeds)
+        self._state, tokens, seen = self._programs.advance(*called)
+        for b, frame, chunk in zip(chunks, np.asarray(tokens), chunk_nU, strict=False):
+            episode = self._begun(b)
+            episode.frames.append(frame)
+            episode.chunks.append(chunk)
+            episode.count += 1
+        return self._show(list(chunks), np.asarray(seen)[: len(chunks)])
+
+    # --- Going back, and apart ---------------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """Where all episodes stand now."""
+        return Snapshot(self._copied(self._state), self._images, copy.deepcopy(tuple(self._episodes)))
+
+    def restore(self, snapshot: Snapshot) -> np.ndarray:
+        """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same frames."""
+        require(len(snapshot.episodes) == len(self), f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}")
+        self._state, self._images = self._copied(snapshot.state), snapshot.images
+        self._episodes = list(copy.deepcopy(snapshot.episodes))
+        return self.images
+
+    def branch(self, sources: Sequence[int]) -> np.ndarray:
+        """Episode b goes on as a copy of episode sources[b], with its seed: what differs then, actions have done."""
+        fits = len(sources) == len(self) and all(0 <= s < len(self) for s in sources)
+        require(fits, f"branches need {len(self)} episodes below {len(self)} to copy, got {list(sources)}")
+        rows = np.asarray(sources, np.int32)
+        self._state, self._images = self._programs.take(self._state, rows), self._images[rows]
+        self._episodes = [copy.deepcopy(self._episodes[s]) for s in sources]
+        return self.images
+
+    def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
+        """Takes `episodes` (default: all) back by so many frames.
+
+        What followed is forgotten, and comes again under the same actions: exactly with `decode.slide` "exact";
+        with "streaming" the window is computed anew, which is nearer to exact than what had been there.
+        """
+        require(frames >= 0, f"an episode is taken back by 0 frames or more, got {frames}")
+        which = self._which(episodes)
+        at = self._blank(self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
+        new: dict[int, Episode] = {}
+        for b in which:
+            reach = self.reach(b)
+            require(frames <= reach, f"episode {b} can be taken back by {reach} frames, not by {frames}")
+            episode = new[b] = self._begun(b).earlier(frames)
+            at.place(b, episode, np.stack(list(episode.frames)[-min(episode.count, self.room) :]))
+        self._state, seen = self._programs.again(self._programs.weights, self._state, at)
+        for b, episode in new.items():
+            self._episodes[b] = episode
+        return self._show(which, np.asarray(seen)[which])
+
+    def reach(self, b: int) -> int:
+        """By how many frames episode b can be taken back."""
+        return self._begun(b).reach(self.room)
+
+    def _copied(self, state: Episodes) -> Episodes:
+        return self._programs.take(state, np.arange(len(self), dtype=np.int32))

@@ -1,0 +1,66 @@
+"""Recorded beginnings of episodes, from which a simulator may go on, and the file that keeps them."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hma_jax.config import ConfigError, require
+
+FILE = "starts.npz"
+
+
+@dataclass(frozen=True)
+class Start:
+    """The first n frames of an episode at the model's rate, and all native actions between them."""
+
+    robot: str
+    images: np.ndarray  # uint8 [n, H, W, 3]
+    actions: np.ndarray  # float32 [(n - 1) stride, A], raw
+    seed: int | None = None  # with which the robot's true simulator begins the same episode
+
+    def __post_init__(self):
+        require(
+            self.images.dtype == np.uint8 and self.images.ndim == 4 and len(self.images) >= 1,
+            f"a start of {self.robot} needs images uint8 [n, H, W, 3], got {self.images.dtype} {self.images.shape}",
+        )
+        require(
+            self.actions.ndim == 2 and bool(np.isfinite(self.actions).all()),
+            f"a start of {self.robot} needs finite actions [(n - 1) stride, A], got {self.actions.shape}",
+        )
+
+
+def save_starts(starts: Sequence[Start], path: Path) -> None:
+    """Writes all of them, compressed, or nothing."""
+    arrays: dict[str, np.ndarray] = {}
+    for i, start in enumerate(starts):
+        seed = [] if start.seed is None else [start.seed]
+        for name, value in (("images", start.images), ("actions", start.actions), ("seed", np.array(seed, np.int64))):
+            arrays[f"{i:04d}/{start.robot}/{name}"] = value
+    aside = path.with_name(f".{path.name}.tmp")
+    with open(aside, "wb") as file:
+        np.savez_compressed(file, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(aside, path)
+
+
+def load_starts(path: Path) -> tuple[Start, ...]:
+    """What `save_starts` wrote. Raises ConfigError for a file that is damaged or something else."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        names = sorted({name.rsplit("/", 1)[0] for name in arrays})
+        starts = []
+        for name in names:
+            seed = arrays[f"{name}/seed"]
+            images, actions = arrays[f"{name}/images"], arrays[f"{name}/actions"]
+            starts.append(Start(name.split("/")[1], images, actions, int(seed[0]) if len(seed) else None))
+        return tuple(starts)
+    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path} cannot be read as starts of episodes ({error}); make it again") from error

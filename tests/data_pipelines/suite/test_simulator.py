@@ -1,0 +1,79 @@
+"""The suite's true robots under the interface of the learned simulator."""
+
+import numpy as np
+import pytest
+
+from data_pipelines.suite.environment import Environment
+from data_pipelines.suite.simulator import SuiteSimulator, judge_by_state, suite_robot, suite_starts
+from hma_jax.config import ConfigError
+
+
+def robot(name: str, dim: int, stride: int, most: float = 1.0):
+    return suite_robot(name, (-most,) * dim, (most,) * dim, (0.0,) * dim, stride)
+
+
+PUSHER, ARM = robot("pusher_sand", 2, 2), robot("arm_chalk", 3, 2)
+
+
+def test_a_start_goes_on_as_the_recorded_episode_did():
+    start = suite_starts("pusher_sand", 8, 4)[0]
+    begun = SuiteSimulator([robot("pusher_sand", 2, 2, 1e9)])
+    seen = begun.reset(type(start)(start.robot, start.images[:2], start.actions[:2], start.seed))
+    np.testing.assert_array_equal(seen[0], start.images[1])
+    np.testing.assert_array_equal(begun.step([start.actions[2:4]])[0], start.images[2])
+
+
+def test_episodes_are_apart_clipped_and_taken_back():
+    sim = SuiteSimulator([PUSHER, ARM], episodes=2)
+    starts = [suite_starts("pusher_sand", 8, 1)[0], suite_starts("arm_chalk", 8, 1)[0]]
+    first = sim.reset(starts)
+    images = sim.step([np.array([5.0, 0.0]), None])
+    assert sim.clipped == [("xy x",), ()] and (images[0] != first[0]).any()
+    np.testing.assert_array_equal(images[1], first[1])
+    true = Environment("pusher_sand")
+    true.reset(starts[0].seed)
+    for _ in range(2):
+        true.step(np.array([1.0, 0.0]))
+    np.testing.assert_array_equal(images[0], true.render())
+    assert sim.reach(0) == 1
+    np.testing.assert_array_equal(sim.rewind(1, [0])[0], first[0])
+
+
+def test_up_moves_the_pusher_up_and_right_to_the_right():
+    for key, (column, row) in ((0, (1, 0)), (1, (0, -1))):
+        true = Environment("pusher_sand")
+        true.reset(suite_starts("pusher_sand", 8, 1)[0].seed)
+        before = true.positions()[0]
+        true.step(4 * np.array(PUSHER.keys[key], np.float32))
+        assert np.sign(np.round(true.positions()[0] - before, 2)).tolist() == [column, row]
+
+
+@pytest.mark.parametrize("name", ["rover_road", "arm_chalk", "gripper_wood", "humanoid_sand"])
+def test_every_dimension_has_a_name_and_some_keys(name: str):
+    dim = Environment(name).spec.action_dim
+    described = robot(name, dim, 2)
+    assert len(set(described.dimensions)) == dim and np.abs(described.keys).sum() >= 2
+    assert described.keeps == (Environment(name).spec.convention == "absolute")
+
+
+def test_the_judge_says_when_the_goal_is_reached():
+    sim = SuiteSimulator([PUSHER], episodes=2)
+    sim.reset(suite_starts("pusher_sand", 8, 1)[0], episodes=[0])
+    world, _ = sim._worlds[0]
+    state = world.get_state()
+    assert judge_by_state(sim)[1].tolist() == [False, False]
+    state.objects[0, 0] = state.goals[0, 0]
+    world.set_state(state)
+    rewards, done = judge_by_state(sim)
+    assert rewards.tolist() == [1.0, 0.0] and done.tolist() == [True, False]
+
+
+def test_what_the_suite_has_not_is_said():
+    other = type(PUSHER)("walker", 1, (0.0,), (1.0,), (0.0,))
+    with pytest.raises(ConfigError, match="no robot 'walker'"):
+        SuiteSimulator([other])
+    with pytest.raises(ConfigError, match="2 action values in the suite, not 3"):
+        SuiteSimulator([type(PUSHER)("pusher_sand", 2, (0.0,) * 3, (1.0,) * 3, (0.0,) * 3)])
+    start = suite_starts("pusher_sand", 8, 1)[0]
+    with pytest.raises(ConfigError, match="with which seed"):
+        SuiteSimulator([PUSHER]).reset(type(start)(start.robot, start.images, start.actions))

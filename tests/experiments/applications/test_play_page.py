@@ -1,0 +1,172 @@
+"""The page in a real Chromium: what a visitor sees and does."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+pytest.importorskip("aiohttp", reason="needs the extra `play`")
+playwright = pytest.importorskip("playwright.async_api", reason="needs the extra `test-browser`")
+
+from PIL import Image  # noqa: E402
+
+from tests.experiments.applications.serving import serving  # noqa: E402
+from tests.experiments.applications.test_play_server import shared_programs  # noqa: E402, F401
+
+CHROMIUM = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+PATIENCE = 60_000
+"""Milliseconds that anything may take on a busy machine."""
+
+
+async def launched(play):
+    """A browser: the one that is installed, or playwright's own. Skips the test where there is neither."""
+    try:
+        return await play.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    except playwright.Error as error:
+        pytest.skip(f"no Chromium: install it, or name it in PLAYWRIGHT_CHROMIUM ({str(error).splitlines()[0]})")
+
+
+def browsing(test, **options) -> None:
+    """Runs `test(browser, address, client)` against a server of this process."""
+
+    async def with_browser(client) -> None:
+        async with playwright.async_playwright() as play:
+            browser = await launched(play)
+            try:
+                await test(browser, str(client.make_url("/")), client)
+            finally:
+                await browser.close()
+
+    serving(with_browser, **options)
+
+
+async def opened(browser, address: str, **how):
+    """The page in a new context (a person), an episode under way. Waiting for an expression needs `bypass_csp`."""
+    context = await browser.new_context(**{"bypass_csp": True, **how})
+    page = await context.new_page()
+    page.set_default_timeout(PATIENCE)
+    page.faults = []
+    page.on("pageerror", lambda error: page.faults.append(str(error)))
+    await page.goto(address)
+    await page.wait_for_selector("body[data-count]")
+    return page
+
+
+async def count(page) -> int:
+    return int(await page.evaluate("document.body.dataset.count"))
+
+
+async def picture(page) -> np.ndarray:
+    data = await page.get_attribute("#seen", "src")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(data.split(",")[1]))), np.int16)
+
+
+async def actions(client) -> list[list[float]]:
+    """The chunks of every visitor's newest frame."""
+    from experiments.applications.play.server import CROWD
+
+    simulator = client.server.app[CROWD].simulator
+    return [e.chunks[-1].tolist() for e in simulator._episodes if e is not None and e.chunks]
+
+
+def test_keys_move_the_robot_and_letting_go_stops_it():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.keyboard.down("ArrowRight")
+        await page.wait_for_function("document.body.dataset.count > 6")
+        pressed = (await actions(client))[0][:2]
+        assert pressed[0] > 1 and pressed[1] == 0, pressed
+        await page.keyboard.up("ArrowRight")
+        await page.keyboard.down("KeyS")
+        here = await count(page)
+        await page.wait_for_function(f"document.body.dataset.count > {here + 2}")
+        pressed = (await actions(client))[0][:2]
+        assert pressed[0] == 0 and pressed[1] < 0, pressed
+        await page.keyboard.up("KeyS")
+        await page.click("#run")
+        await page.wait_for_timeout(300)
+        before = await count(page)
+        await page.wait_for_timeout(500)
+        assert await count(page) == before, "time goes on while it is paused"
+        assert not page.faults
+
+    browsing(test)
+
+
+def test_a_slider_sets_its_dimension_and_rewinding_goes_back():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.click("#robots button[data-name=arm]")
+        await page.wait_for_function("document.querySelectorAll('.slider').length == 7")
+        box = await page.locator("#dimension3").bounding_box()
+        await page.mouse.move(box["x"] + box["width"] * 0.9, box["y"] + box["height"] / 2)
+        await page.mouse.down()
+        here = await count(page)
+        await page.wait_for_function(f"document.body.dataset.count > {here + 3}")
+        action = (await actions(client))[0][:7]
+        assert action[3] > 0.7 and action[2] == pytest.approx(0.5, abs=0.01), action
+        await page.mouse.up()
+        await page.click("#run")
+        await page.wait_for_timeout(300)
+        before = await count(page)
+        await page.click("#back")
+        await page.wait_for_function(f"document.body.dataset.count < {before}")
+        assert not page.faults
+
+    browsing(test)
+
+
+def test_a_reload_and_a_lost_connection_find_the_episode_again():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.wait_for_function("document.body.dataset.count > 5")
+        await page.click("#run")
+        await page.wait_for_timeout(300)
+        before = await count(page)
+        await page.reload()
+        await page.wait_for_function(f"document.body.dataset.count >= {before}")
+        await page.evaluate("state.socket.close()")
+        here = await count(page)
+        await page.wait_for_function(f"document.body.dataset.count > {here} && state.socket.readyState == 1")
+        assert not page.faults
+
+    browsing(test, visitors=1)
+
+
+def test_two_visitors_do_not_mix_and_a_third_is_told():
+    async def test(browser, address, client):
+        first = await opened(browser, address)
+        second = await opened(browser, address)
+        await second.click("#robots button[data-name=arm]")
+        await second.wait_for_function("document.querySelectorAll('.slider').length == 7")
+        await first.keyboard.down("ArrowUp")
+        for page in (first, second):
+            here = await count(page)
+            await page.wait_for_function(f"document.body.dataset.count > {here + 2}")
+        one, other = await actions(client)
+        assert one[1] > 1 and one[2:] == [0.0] * (len(one) - 2), "the pusher's own action"
+        assert other[:7] == pytest.approx([0.5] * 7, abs=0.01), "the arm's rest"
+        third = await (await browser.new_context(bypass_csp=True)).new_page()
+        await third.goto(address)
+        await third.wait_for_function("document.getElementById('status').textContent.includes('seats')", timeout=PATIENCE)
+
+    browsing(test)
+
+
+def test_it_fits_a_phone():
+    async def test(browser, address, client):
+        phone = {"viewport": {"width": 360, "height": 740}, "has_touch": True, "is_mobile": True}
+        page = await opened(browser, address, bypass_csp=False, **phone)  # as a visitor has it
+        assert await page.evaluate("document.documentElement.scrollWidth") <= 360
+        assert not await page.is_visible("#saved"), "nothing was recorded yet"
+        pad = await page.locator(".pads").bounding_box()
+        assert pad["y"] + pad["height"] <= 740, "the picture and the pad are on one screen"
+        await page.tap(".pad button[data-key=ArrowUp]")
+        assert not page.faults
+
+    browsing(test)

@@ -1,0 +1,276 @@
+"""The page's server: who visits it, well-behaved or not."""
+
+import asyncio
+import contextlib
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+pytest.importorskip("aiohttp", reason="needs the extra `play`")
+
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from experiments.applications.play import crowd as crowd_module
+from experiments.applications.play import server
+from experiments.applications.play.crowd import REPLIES, Visitor
+from experiments.applications.play.turn import Seat
+from tests.experiments.applications.serving import Player, ask, hear, serving
+
+
+@pytest.fixture(autouse=True)
+def shared_programs(monkeypatch):
+    """Simulators of the same tiny model share what they compile."""
+    from hma_jax.simulator import simulator as module
+    from tests.hma_jax.simulator.conftest import programs
+
+    monkeypatch.setattr(module, "Programs", programs)
+
+
+def test_the_page_and_what_it_must_know_are_served():
+    async def test(client):
+        page = await (await client.get("/")).text()
+        assert "<!doctype html>" in page and "http" + "://" not in page.replace("connect-src", ""), "it needs nothing from elsewhere"
+        robots = await (await client.get("/robots")).json()
+        assert [(r["name"], len(r["starts"]), len(r["dimensions"]), r["truth"]) for r in robots] == [
+            ("pusher", 2, 2, False),
+            ("arm", 2, 7, False),
+        ]
+        assert robots[0]["starts"][0].startswith("data:image/jpeg")
+
+    serving(test)
+
+
+def test_two_visitors_do_not_mix():
+    async def test(client):
+        alone, first, second = Player(client), Player(client), Player(client)
+        await alone.enter(seed=1)
+        wanted = await alone.drive(0.5, 6)
+        await alone.socket.close()
+        await first.enter(seed=1)
+        await second.enter(seed=2)
+        one, other = await asyncio.gather(first.drive(0.5, 6), second.drive(0.3, 6))
+        assert one == wanted, "the other's actions reached it"
+        assert other != one
+
+    serving(test)
+
+
+def test_a_lost_connection_finds_its_episode_again():
+    async def test(client):
+        player, again = Player(client), Player(client)
+        await player.enter()
+        await player.drive(0.5, 2)
+        player.socket._response.connection.transport.abort()  # without a word
+        hello = await again.enter(token=player.token, begin=False)
+        assert (hello["token"], hello["robot"]) == (player.token, "arm")
+        frame = await ask(again.socket, type="rewind", frames=0)
+        assert frame["count"] == 4
+        assert len(await again.drive(0.5, 1)) == 1
+
+    serving(test)
+
+
+def test_rewinding_and_the_same_actions_give_the_same_frames():
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        made = await player.drive(0.5, 6)
+        frame = await ask(player.socket, type="rewind", frames=4)
+        assert frame["image"] == made[1] and frame["count"] == 4
+        assert await player.drive(0.5, 4) == made[2:]
+        assert (await ask(player.socket, type="rewind", frames=100))["count"] == 1
+
+    serving(test)
+
+
+def test_a_full_house_says_so_and_an_abandoned_seat_is_given_away():
+    async def test(client):
+        first, second, third = Player(client), Player(client), Player(client)
+        await first.enter()
+        await second.enter()
+        assert (await third.enter())["type"] == "full"
+        await second.socket.close()
+        await asyncio.sleep(0.05)
+        assert (await third.enter())["type"] == "hello"
+        assert len(await first.drive(0.5, 1)) == 1
+
+    serving(test)
+
+
+NONSENSE = [
+    "", "{", "[]", "null", "7", '"act"', "[" * 20000, '{"type": 3}', '{"type": "shutdown"}', '{"type": ["act"]}',
+    '{"type": "act"}', '{"type": "act", "action": "all"}', '{"type": "act", "action": [1, 2]}',
+    '{"type": "act", "action": [[1]]}', '{"type": "act", "action": [NaN, NaN, NaN, NaN, NaN, NaN, NaN]}',
+    '{"type": "act", "action": [1e999, 0, 0, 0, 0, 0, 0]}', '{"type": "act", "action": [true, 0, 0, 0, 0, 0, 0]}',
+    '{"type": "start"}', '{"type": "start", "robot": "walker"}', '{"type": "start", "robot": {}}',
+    '{"type": "start", "robot": "arm", "start": 99}', '{"type": "start", "robot": "arm", "start": -1}',
+    '{"type": "start", "robot": "arm", "seed": 1e300}', '{"type": "rewind", "frames": -5}', '{"type": "rewind", "frames": "x"}',
+    '{"type": "truth", "on": true}',
+]  # fmt: skip
+
+
+def test_malformed_messages_are_errors_of_their_sender_alone(monkeypatch):
+    monkeypatch.setattr(server, "FAULTS", 1000)
+
+    async def test(client):
+        hostile, player = Player(client), Player(client)
+        await hostile.enter()
+        await player.enter()
+        for text in NONSENSE:
+            await hostile.socket.send_str(text)
+            answer = await hear(hostile.socket)
+            assert answer["type"] in ("error", "frame") and len(json.dumps(answer)) < 5000, (text, answer)
+            if answer["type"] == "frame":
+                assert "1e999" in text and answer["clipped"], text
+        await hostile.socket.send_bytes(b"\0" * 100)
+        assert (await hear(hostile.socket))["type"] == "error"
+        assert len(await player.drive(0.5, 2)) == len(await hostile.drive(0.5, 2)) == 2
+
+    serving(test)
+
+
+def test_whoever_sends_only_nonsense_is_let_go():
+    async def test(client):
+        hostile, player = Player(client), Player(client)
+        await hostile.enter()
+        await player.enter()
+        for _ in range(server.FAULTS):
+            await hostile.socket.send_str("?")
+        answers = [await hear(hostile.socket) for _ in range(server.FAULTS + 1)]
+        assert answers[-1]["type"] == "closed"
+        assert len(await player.drive(0.5, 2)) == 2
+
+    serving(test)
+
+
+def test_a_huge_message_ends_its_connection_and_nothing_else():
+    async def test(client):
+        hostile, player = Player(client), Player(client)
+        await hostile.enter()
+        await player.enter()
+        with contextlib.suppress(ConnectionError):  # it may be over before all is sent
+            await hostile.socket.send_str(json.dumps({"type": "act", "action": [0.0] * 10**6}))
+        assert (await hear(hostile.socket))["type"] == "closed"
+        assert len(await player.drive(0.5, 2)) == 2
+
+    serving(test)
+
+
+def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch):
+    monkeypatch.setattr(server, "WAITING", 3)
+
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+
+        async def knock():
+            try:
+                socket = await client.ws_connect("/drive")
+            except Exception as refusal:
+                return getattr(refusal, "status", type(refusal).__name__)
+            return (await hear(socket))["type"]
+
+        knocks = asyncio.gather(*(knock() for _ in range(150)))
+        pictures = await player.drive(0.5, 5)
+        answers = await knocks
+        assert len(pictures) == 5 and answers.count("hello") == 1
+        assert set(answers) <= {"hello", "full", 503} and 503 in answers, set(answers)
+        assert len(await player.drive(0.5, 2)) == 2
+
+    serving(test)
+
+
+def test_one_who_never_reads_is_let_go_and_others_play_on(monkeypatch):
+    monkeypatch.setattr(crowd_module, "SEND_SECONDS", 0.2)
+
+    async def test(client):
+        silent, player = Player(client), Player(client)
+        await silent.enter()
+        await player.enter()
+        crowd = client.server.app[server.CROWD]
+        visitor = crowd.visitors[silent.token]
+
+        async def stuck(_):
+            await asyncio.sleep(3600)
+
+        monkeypatch.setattr(visitor.socket, "send_str", stuck)  # as when the buffers of both ends are full
+        await silent.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
+        assert len(await player.drive(0.5, 3)) == 3
+        for _ in range(100):
+            if visitor.socket is None:
+                break
+            await asyncio.sleep(0.05)
+        assert visitor.socket is None, "its connection is still there"
+
+    serving(test)
+
+
+def test_replies_that_wait_are_bounded():
+    visitor = Visitor("t", Seat(0), replies=asyncio.Queue(REPLIES))
+    for i in range(REPLIES):
+        visitor.tell({"i": i})
+    assert visitor.replies is not None
+    visitor.tell({"i": "one more"})
+    assert visitor.replies is None
+
+
+def test_wishes_that_wait_are_bounded():
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        waiting = client.server.app[server.CROWD].visitors[player.token].wishes
+        for _ in range(60):
+            await player.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
+        counts = []
+        for _ in range(60):
+            counts.append((await hear(player.socket))["count"])
+            assert len(waiting) <= crowd_module.WISHES
+        assert counts == list(range(3, 63)), "none is lost, and they stay in order"
+
+    serving(test)
+
+
+def test_a_page_from_elsewhere_cannot_connect():
+    async def test(client):
+        answer = await client.get("/drive", headers={"Origin": "http" + "://elsewhere.example"})
+        assert answer.status == 403
+
+    serving(test)
+
+
+def test_a_recording_is_a_video_and_a_dataset(tmp_path):
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        assert (await client.get(f"/recording/{player.token}/mp4")).status == 404
+        assert (await ask(player.socket, type="record", on=True))["recording"]
+        await player.drive(0.5, 3)
+        assert (await ask(player.socket, type="rewind", frames=1))["recorded"] == 3
+        await player.drive(0.45, 1)
+        assert (await ask(player.socket, type="record", on=False))["recorded"] == 4
+        await player.drive(0.5, 1)
+
+        video = await (await client.get(f"/recording/{player.token}/mp4")).read()
+        import av
+
+        with av.open(io.BytesIO(video)) as container:
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        assert len(frames) == 4 and frames[0].shape == (32, 32, 3)
+
+        packed = await (await client.get(f"/recording/{player.token}/rlds")).read()
+        zipfile.ZipFile(io.BytesIO(packed)).extractall(tmp_path)
+        ((images, actions),) = _episodes(tmp_path / "arm_played" / "1.0.0")
+        assert images.shape == (4, 8, 8, 3)
+        np.testing.assert_array_equal(actions[:, 0], np.float32([0.5, 0.5, 0.45, 0.0]))
+
+    serving(test)
+
+
+def _episodes(directory):
+    source = RldsDataset(directory, "train")
+    for i in range(len(source)):
+        images = np.stack(source.frames(i, "observation/image", lambda steps: list(range(steps))))
+        with source.open_episode(i, "observation/image", ["action"]) as episode:
+            yield images, np.array(episode.actions)

@@ -1,0 +1,93 @@
+"""Learned and true simulators of a run's robots, and the model that is shipped."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments.applications import ship as ship_module
+from experiments.applications.ship import ship
+from experiments.applications.simulators import load_simulator, make_simulator
+from hma_jax import Simulator
+from hma_jax.config import ConfigError, TrainConfig
+from hma_jax.convert.run_directory import write_run
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.tokenizers.io import save_tokenizer
+from hma_jax.training.runs import Run
+from tests.hma_jax.simulator.small import CONFIG, parts
+
+TABLE = EmbodimentTable((
+    Embodiment("pusher_sand", 2, 2, (0.0, 0.0), (2.0, 2.0)),
+    Embodiment("gripper_wood", 4, 2, (0.5,) * 4, (0.2,) * 4),
+))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of two of the suite's robots, with its tokenizer beside it as in a study's directory."""
+    root, tokenizer = tmp_path_factory.mktemp("study"), parts()[1]
+    save_tokenizer(tokenizer, root / "tokenizer")
+    params = declare_model(CONFIG, TABLE).init(0)
+    write_run(Run(CONFIG, TrainConfig(), TABLE, params, 0, {"tokenizer": tokenizer.identity}), root / "model")
+    return root / "model"
+
+
+def test_robots_of_the_suite_are_described_and_begin_at_held_out_episodes(run):
+    simulator = load_simulator(run)
+    pusher, gripper = simulator.robots.values()
+    assert (pusher.dimensions, pusher.unit, pusher.keeps, pusher.recorded) == (("xy x", "xy y"), "per step", False, False)
+    assert gripper.keeps and gripper.hz == 4.0
+    assert {s.robot for s in simulator.starts} == {"pusher_sand", "gripper_wood"}
+    assert all(s.seed is not None and s.images.shape == (3, 8, 8, 3) for s in simulator.starts)
+
+
+def test_true_and_learned_are_exchanged_by_one_word(run):
+    seen = {}
+    for world in ("learned", "true"):
+        simulator = make_simulator(run, world, episodes=2)
+        starts = [s for s in simulator.starts if s.robot == "pusher_sand"][:2]
+        first = simulator.reset(starts)
+        images = simulator.step([np.array([1e9, 0.0]), None])
+        assert simulator.clipped == [("xy x",), ()]
+        np.testing.assert_array_equal(images[1], first[1])
+        np.testing.assert_array_equal(simulator.rewind(1, [0]), first)
+        seen[world] = simulator.robots, images.shape
+    assert seen["learned"] == seen["true"]
+
+
+def test_what_is_shipped_stands_alone_and_does_the_same(run, tmp_path):
+    out = tmp_path / "simulator"
+    ship(run, out)
+    (tmp_path / "elsewhere").mkdir()
+    moved = out.rename(tmp_path / "elsewhere" / "model")  # nothing of the study is near
+    shipped, known = Simulator.load(moved), load_simulator(run)
+    assert dict(shipped.robots) == dict(known.robots)
+    assert len(shipped.starts) == len(known.starts)
+    action = np.array([1.0, -1.0])
+    for a, b in zip(shipped.starts[:1], known.starts[:1], strict=True):
+        np.testing.assert_array_equal(shipped.reset(a), known.reset(b))
+        np.testing.assert_array_equal(shipped.step([action]), known.step([action]))
+    assert not any(path.name.startswith(".simulator") for path in tmp_path.iterdir())
+
+
+def test_what_is_too_large_is_not_shipped(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(ship_module, "LARGEST", 1000)
+    with pytest.raises(ConfigError, match="more than the 1,000 that a repository should carry"):
+        ship(run, tmp_path / "simulator")
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_tokenizer_or_damaged_robots_are_refused(run, tmp_path):
+    out = tmp_path / "simulator"
+    ship(run, out)
+    (out / "robots.json").write_text(json.dumps([{"name": "pusher_sand"}]))
+    with pytest.raises(ConfigError, match="robots.json: robot 0: missing field"):
+        Simulator.load(out)
+    (out / "starts.npz").write_bytes(b"PK")
+    (out / "robots.json").unlink()
+    with pytest.raises(ConfigError, match="starts.npz cannot be read"):
+        Simulator.load(out)
+    (out / "starts.npz").unlink()
+    with pytest.raises(ConfigError, match="no tokenizer at"):
+        Simulator.load(out, tmp_path / "nowhere")

@@ -1,0 +1,63 @@
+"""What is found of action dimensions whose effect is known."""
+
+import numpy as np
+import pytest
+
+from hma_jax.evaluation.effects import Change, find_effects
+
+DIM, WINDOWS = 4, 48
+WEIGHTS = np.array([1.0, 0.5, -0.8, 0.0])
+"""Of the dimensions in what is seen; the last one does nothing."""
+
+OTHER = np.array([0.3, 1.0, 0.6, 0.0])
+"""Likewise, in the other direction that is seen."""
+
+UNITS = np.array([1.0, 3.0, 0.2, 1.0])
+"""Typical size of each dimension."""
+
+
+def recorded(seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(WINDOWS, 5, 2, DIM)) * UNITS
+
+
+def find(given: np.ndarray):
+    """Of actions `given` for frames that `recorded` ones made, by a model that knows the law exactly, but for noise.
+
+    What is seen is a place in two dimensions, so that exchanged effects can be told apart; a model has nothing to say of
+    actions that are far from all it was trained on.
+    """
+    law = np.stack([WEIGHTS / UNITS, OTHER / UNITS])
+    noise = np.random.default_rng(1).normal(size=(WINDOWS, 5, 2)) * 0.3
+    seen = np.tanh(recorded().mean(2) @ law.T) + noise
+
+    def judge(actions: np.ndarray) -> np.ndarray:
+        return ((np.tanh(actions.mean(2) @ law.T) - seen) ** 2).mean((1, 2))
+
+    return find_effects(judge, given, np.zeros(DIM), np.repeat(np.arange(WINDOWS // 2), 2).tolist())
+
+
+def test_where_nothing_is_wrong_nothing_is_found():
+    effects = find(recorded())
+    assert all(effect.better is None for effect in effects)
+    assert {e.dimension for e in effects if e.ignored} == {3}
+    assert effects[0].worth.mean > 0 and effects[0].worth.errors > 5
+
+
+@pytest.mark.parametrize(
+    "wrong, expected",
+    [
+        (Change(1, "negated"), {1: Change(1, "negated")}),
+        (Change(0, "scaled", 50.0), {0: Change(0, "scaled", 1 / 50)}),
+        (Change(2, "scaled", 1 / 50), {2: Change(2, "scaled", 50.0)}),
+        (Change(0, "swapped", other=2), {d: Change(0, "swapped", other=2) for d in (0, 2)}),
+    ],
+    ids=["negated", "too large", "too small", "swapped"],
+)
+def test_what_is_wrong_is_found_and_nothing_else(wrong: Change, expected: dict[int, Change]):
+    effects = find(wrong(recorded(), np.zeros(DIM)))
+    assert {e.dimension: e.better for e in effects if e.better is not None} == expected
+
+
+def test_a_model_that_is_deaf_ignores_every_dimension():
+    effects = find_effects(lambda actions: np.ones(len(actions)), recorded(), np.zeros(DIM), range(WINDOWS))
+    assert all(effect.ignored for effect in effects)

@@ -1,0 +1,107 @@
+"""Gymnasium's view of a simulator."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium", reason="needs the extra `simulator`")
+
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from hma_jax.config import ConfigError  # noqa: E402
+from hma_jax.simulator.environment import ID, RobotEnv, RobotVectorEnv  # noqa: E402
+from tests.hma_jax.simulator.small import ROBOTS, simulator, start  # noqa: E402
+
+STARTS = [start(robot, 2, seed) for robot in (0, 1) for seed in range(3)]
+NAME = f"hma_jax.simulator.environment:{ID}"
+
+
+def make(**options):
+    return gymnasium.make(NAME, simulator=simulator(), starts=STARTS, **{"robot": "arm", **options})
+
+
+def test_gymnasium_s_own_check_finds_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(not within the default range|symmetric|normalized).*")
+        check_env(make(render_mode="rgb_array").unwrapped)
+
+
+def test_spaces_are_the_robot_s_range_and_the_frame_s_size():
+    env = make()
+    np.testing.assert_array_equal(env.action_space.low, np.array(ROBOTS[1].low, np.float32))
+    np.testing.assert_array_equal(env.action_space.high, np.array(ROBOTS[1].high, np.float32))
+    assert env.observation_space.shape == (8, 8, 3) and env.observation_space.dtype == np.uint8
+
+
+def play(env, seed: int, steps: int = 5) -> np.ndarray:
+    env.action_space.seed(seed)
+    first, _ = env.reset(seed=seed)
+    return np.stack([first, *(env.step(env.action_space.sample())[0] for _ in range(steps))])
+
+
+def test_a_seed_gives_the_same_episode_and_another_seed_another():
+    env = make()
+    one = play(env, 3)
+    np.testing.assert_array_equal(play(env, 3), one)
+    assert (play(env, 4) != one).any()
+
+
+def test_an_episode_ends_by_its_judge_or_its_length():
+    env = make(max_steps=3)
+    env.reset(seed=0)
+    ends = [env.step(env.action_space.sample())[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+    env = make(judge=lambda sim: (np.full(1, 2.5), np.full(1, True)))
+    env.reset(seed=0)
+    assert env.step(env.action_space.sample())[1:3] == (2.5, True)
+
+
+def test_a_clipped_action_is_said():
+    env = RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
+    env.reset(seed=0)
+    *_, info = env.step(env.action_space.high + 1)
+    assert info["clipped"] == ROBOTS[1].dimensions
+
+
+def test_the_vector_environment_begins_episodes_anew_when_they_end():
+    env = gymnasium.make_vec(NAME, num_envs=3, simulator=simulator(episodes=3), starts=STARTS, robot="arm", max_steps=2)
+    env.action_space.seed(0)
+    first, _ = env.reset(seed=1)
+    assert first.shape == (3, 8, 8, 3) and env.unwrapped._task.simulator.counts == (2, 2, 2)
+    truncated = [env.step(env.action_space.sample())[3].tolist() for _ in range(4)]
+    assert truncated == [[False] * 3, [True] * 3, [False] * 3, [False] * 3]
+    assert env.unwrapped._task.simulator.counts == (3, 3, 3)
+
+
+def test_each_of_a_vector_is_what_the_environment_alone_makes():
+    """For the same starts, seeds and actions."""
+    sim = simulator(episodes=3)
+    env = RobotVectorEnv(3, simulator=sim, starts=STARTS, robot="arm")
+    env.action_space.seed(0)
+    env.reset(seed=1)
+    seeds, plan = [e.seed for e in sim._episodes], [env.action_space.sample() for _ in range(3)]
+    images = [env.step(actions)[0] for actions in plan]
+    drawn, _ = gymnasium.utils.seeding.np_random(1)
+    for b in range(3):
+        number, seed = int(drawn.integers(3)), int(drawn.integers(2**32))
+        assert seed == seeds[b]
+        alone = simulator()
+        alone.reset(STARTS[3 + number], seeds=[seed])
+        for t, actions in enumerate(plan):
+            np.testing.assert_array_equal(alone.step([actions[b]])[0], images[t][b])
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
+        ({"starts": []}, "there is no start to begin at"),
+        ({"run": "somewhere"}, "either `run` or `simulator`"),
+        ({"max_steps": 0}, "at least 1 step"),
+    ],
+)
+def test_what_cannot_be_made_is_said(options: dict, message: str):
+    with pytest.raises(ConfigError, match=message):
+        RobotEnv(**{"simulator": simulator(), "starts": STARTS, "robot": "arm", **options})

@@ -1,0 +1,234 @@
+"""The simulator against `rollout`, and everything that may be done to its episodes."""
+
+import logging
+
+import jax
+import jax.monitoring
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.generation import rollout
+from hma_jax.simulator.warm_up import warm_up
+from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, actions, parts, simulator, start
+from tests.tiny import TABLE
+
+FRAMES = 7
+"""Of an episode after its start: the window of 4 slides by then."""
+
+STREAMING = DecodeConfig(2, temperature=1.0, slide="streaming")
+
+
+def chunks_of(robot: int, count: int, seed: int = 9) -> np.ndarray:
+    """[count, stride, A]"""
+    entry = ROBOTS[robot]
+    rng = np.random.default_rng([robot, seed])
+    return actions(robot, count * entry.stride, rng).reshape(count, entry.stride, entry.action_dim)
+
+
+def rolled_out(first, chunks: np.ndarray, seed: int, decode: DecodeConfig) -> np.ndarray:
+    """The frames that `rollout` makes after a start under chunks [n, stride, A], decoded."""
+    model, tokenizer = parts()
+    robot = TABLE.index(first.robot)
+    past = first.actions.reshape(len(first.images) - 1, *chunks.shape[1:])
+    whole = np.concatenate([past, chunks, chunks[:1]])  # the last frame's own is seen by none
+    padded = np.zeros((1, 1, len(whole), TABLE.action_width), np.float32)
+    padded[0, 0, :, : whole[0].size] = whole.reshape(len(whole), -1)
+    prompt, keys = tokenizer.encode(first.images)[None], jax.random.key(seed)[None]
+    made = jax.jit(
+        lambda p: rollout(model.declared.merge(p), prompt, padded, np.array([robot], np.int32), keys, decode)
+    )(model.params)
+    return tokenizer.decode(np.asarray(made)[0, 0])
+
+
+@pytest.mark.exact
+@pytest.mark.parametrize("decode", [DECODE, pytest.param(STREAMING, marks=pytest.mark.slow)], ids=["exact", "streaming"])
+def test_episodes_of_different_robots_starts_and_seeds_are_what_rollout_makes_of_each(decode):
+    lengths, seeds = (1, 2, 6), (5, 5, 2**32 - 1)
+    starts = [start(robot, frames) for robot, frames in enumerate(lengths)]
+    sim = simulator(episodes=3, decode=decode)
+    sim.reset(starts, seeds=seeds)
+    plans = [chunks_of(robot, FRAMES) for robot in range(3)]
+    made = np.stack([sim.step([plan[t] for plan in plans]) for t in range(FRAMES)])
+    for b in range(3):
+        want = rolled_out(starts[b], plans[b], seeds[b], decode)
+        np.testing.assert_array_equal(made[:, b], want, err_msg=f"episode {b}")
+
+
+def test_nothing_is_compiled_once_an_episode_is_under_way():
+    sim, compiled = simulator(episodes=2, decode=DecodeConfig(1)), []  # of no other test
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, _, **more: compiled.append(name) if name.endswith("backend_compile_duration") else None
+    )
+
+    def everything(frames: int) -> None:
+        sim.reset([start(0, frames), start(1, frames)], seeds=frames)
+        kept = sim.snapshot()
+        for t in range(8):
+            sim.step([chunks_of(0, 8)[t], None if t == 3 else chunks_of(1, 8)[t][0]])
+        sim.rewind(2)
+        sim.branch([1, 1])
+        sim.restore(kept)
+
+    warm_up(sim)
+    assert sim.counts == (0, 0) and not sim.images.any(), "warming up leaves nothing behind"
+    everything(1)
+    assert compiled, "the listener hears nothing"
+    compiled.clear()
+    everything(4)
+    everything(9)
+    assert not compiled, f"{len(compiled)} programs were compiled again"
+
+
+def run(sim, plan: np.ndarray, b: int = 0) -> np.ndarray:
+    wait = [None] * (len(sim) - 1)
+    return np.stack([sim.step([*wait[:b], chunk, *wait[b:]])[b] for chunk in plan])
+
+
+def test_a_waiting_episode_stays_and_another_s_actions_do_not_reach_it():
+    sim, plan = simulator(episodes=2), chunks_of(1, 8)
+    sim.reset([start(0, 2), start(1, 2)])
+    alone = run(sim, plan, 1)
+    assert sim.counts == (2, 10)
+    sim.reset([start(0, 2), start(1, 2)])
+    beside = np.stack([sim.step([chunks_of(0, 8)[t], plan[t]])[1] for t in range(8)])
+    np.testing.assert_array_equal(beside, alone)
+    before = sim.images[0].copy()
+    sim.reset(start(1, 3), episodes=[1])
+    np.testing.assert_array_equal(sim.images[0], before)
+    assert sim.counts == (10, 3)
+
+
+@pytest.mark.parametrize("steps", [3, 9], ids=["in the window", "past it"])
+def test_a_snapshot_is_gone_on_from_any_number_of_times(steps: int):
+    sim, plan = simulator(), chunks_of(1, 12)
+    sim.reset(start(1, 1), seeds=3)
+    run(sim, plan[:steps])
+    kept = sim.snapshot()
+    first = run(sim, plan[steps:])
+    for _ in range(2):
+        sim.restore(kept)
+        np.testing.assert_array_equal(run(sim, plan[steps:]), first)
+
+
+@pytest.mark.exact
+@pytest.mark.parametrize("back", [1, 4, 11])
+def test_what_was_taken_back_comes_again_under_the_same_actions(back: int):
+    sim, plan = simulator(), chunks_of(0, 12)
+    first = sim.reset(start(0, 1))[0].copy()
+    made = run(sim, plan)
+    shown = sim.rewind(back)[0]
+    np.testing.assert_array_equal(shown, made[11 - back] if back < 12 else first)
+    np.testing.assert_array_equal(run(sim, plan[12 - back :]), made[12 - back :])
+    assert sim.reach(0) == 12
+    sim.rewind(12)
+    np.testing.assert_array_equal(sim.images[0], first)
+
+
+def test_streaming_goes_on_in_place_after_it_was_taken_back():
+    sim, plan = simulator(decode=STREAMING), chunks_of(0, 14)
+    sim.reset(start(0, 1))
+    made = run(sim, plan[:12])
+    sim.rewind(10)  # to where the window is just full: nothing was approximated before
+    np.testing.assert_array_equal(run(sim, plan[2:12]), made[2:])
+    sim.rewind(5)  # the window's cache is computed anew, of frames in other slots
+    (valid,) = np.asarray(sim.snapshot().state.cache.valid)
+    assert sim.counts == (8,) and valid.tolist() == [True, False, True], "frame 7, the newest, belongs in slot 7 mod 3"
+    run(sim, plan[7:9])
+
+
+def test_history_bounds_how_far_an_episode_is_taken_back():
+    sim, plan = simulator(history=2), chunks_of(0, 12)
+    sim.reset(start(0, 1))
+    made = run(sim, plan)
+    with pytest.raises(ConfigError, match="taken back by 2 frames, not by 3"):
+        sim.rewind(3)
+    sim.rewind(2)
+    np.testing.assert_array_equal(run(sim, plan[10:]), made[10:])
+
+
+def test_branches_differ_by_their_actions_alone():
+    sim, plan = simulator(episodes=3), chunks_of(1, 6)
+    sim.reset([start(0, 2), start(1, 2), start(2, 2)], seeds=4)
+    sim.branch([1, 1, 1])
+    other = chunks_of(1, 6, seed=10)
+    for t in range(6):
+        images = sim.step([plan[t], other[t], plan[t]])
+    np.testing.assert_array_equal(images[0], images[2])
+    assert (images[0] != images[1]).any()
+
+
+def test_at_the_native_rate_a_frame_comes_with_every_stride_th_action():
+    chunks = chunks_of(2, 2)
+    sim = simulator()
+    sim.reset(start(2, 2))
+    want = run(sim, chunks)
+    sim = simulator(rate="native")
+    before = sim.reset(start(2, 2))
+    seen = [sim.step([action]) for action in chunks.reshape(6, 3)]
+    for t in (0, 1):
+        np.testing.assert_array_equal(seen[t], before)
+    np.testing.assert_array_equal(np.concatenate([seen[2], seen[5]]), want)
+
+
+def test_an_action_is_held_for_a_frame():
+    sim, action = simulator(episodes=2), chunks_of(1, 1)[0, 0]
+    sim.reset(start(1, 2), seeds=[1, 1])
+    images = sim.step([action, np.stack([action, action])])
+    np.testing.assert_array_equal(images[0], images[1])
+
+
+def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
+    sim, low = simulator(), np.array(ROBOTS[0].low, np.float32)
+    sim.reset(start(0, 1))
+    sim.step([low])
+    assert sim.clipped == [()]
+    with caplog.at_level(logging.WARNING):
+        outside = sim.step([low - [0.0, 2.0]])
+        sim.step([low - [0.0, 2.0]])
+    assert sim.clipped == [("action 1",)]
+    assert [r.message for r in caplog.records] == [
+        "pusher: action 1 of -7 to -7 is outside what its statistics allow, -5 to 7; clipped, here and from now on"
+    ]
+    sim.reset(start(0, 1))
+    sim.step([low])
+    np.testing.assert_array_equal(sim.step([low]), outside)
+
+    strict = simulator(outside="refuse")
+    before = strict.reset(start(0, 1))
+    with pytest.raises(ConfigError, match="pusher: action 1 of -7"):
+        strict.step([low - [0.0, 2.0]])
+    np.testing.assert_array_equal(strict.images, before)
+    assert strict.counts == (1,)
+
+
+@pytest.mark.parametrize(
+    "deed, message",
+    [
+        (lambda sim: sim.step([None]), "1 actions|as many actions"),
+        (lambda sim: sim.step([np.zeros(2), None]), "episode 0 has not begun"),
+        (lambda sim: sim.reset(start(0, 2), seeds=[1]), "as many starts and seeds"),
+        (lambda sim: sim.reset(start(0, 2), episodes=[0, 2]), "numbers below 2"),
+        (lambda sim: sim.robot("walker"), "no robot 'walker' to drive; this model has pusher, arm, base"),
+    ],
+)
+def test_what_cannot_be_done_is_said(deed, message: str):
+    with pytest.raises(ConfigError, match=message):
+        deed(simulator(episodes=2))
+
+
+def test_an_action_of_another_shape_or_that_is_not_finite_is_refused():
+    sim = simulator()
+    sim.reset(start(1, 1))
+    for action in (np.zeros(3), np.zeros((3, 7)), np.full(7, np.nan)):
+        with pytest.raises(ConfigError, match="arm: "):
+            sim.step([action])
+
+
+def test_a_window_of_the_model_is_all_of_a_start_that_is_seen():
+    """So the frames before it cannot matter."""
+    sim, long = simulator(), start(0, CONFIG.frames + 3)
+    one = sim.reset(long).copy()
+    cut = type(long)(long.robot, long.images[4:], long.actions[4:])
+    np.testing.assert_array_equal(sim.reset(cut), one)
+    assert sim.counts == (CONFIG.frames - 1,)
