@@ -24,6 +24,10 @@ METRICS = ("delta_psnr", "action_nats", "retrieval", "counterfactual_gain")
 ENOUGH = 2.0
 """Standard errors beyond which a robot is counted."""
 
+ROUNDING = 1e-5
+"""dB or nats below which a mean is as good as that of a deaf model: devices round by as much, and rounding scatters
+so little that it would look certain."""
+
 
 @dataclass(frozen=True)
 class Controlled:
@@ -79,7 +83,7 @@ def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float) 
     panel = Panel(first.dataset[there], first.episode[there], (values[:, there],), (tuple(tables),))
     (found,) = bootstrap_intervals(panel)
     away = found.mean - deaf
-    errors = 0.0 if abs(away) < 1e-7 else away / found.sem if found.sem else float(np.copysign(np.inf, away))
+    errors = 0.0 if abs(away) < ROUNDING else away / found.sem if found.sem else float(np.copysign(np.inf, away))
     return (
         Controlled(
             robot, metric, found.mean, found.sem, found.low, found.high, deaf, errors, len(tables), found.n,

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 SHOWN = (
-    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_error", "action_gain"
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval",
+    "counterfactual_gain", "action_error", "action_gain",
 )  # fmt: skip
 """Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all, and
 windows.parquet those of every window."""
@@ -91,7 +92,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
     which = ", averaged weights" if trained.weights == "ema" else ""
     table = tidy_table(f"{short(run)}, step {trained.step:,}{which}", "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
-        table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" for m in metrics))
+        table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" if m in stats else "" for m in metrics))
     console.print(table)
     write_evaluation(run, evaluation)
     write_file(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))

@@ -38,6 +38,13 @@ def test_robots_beyond_two_errors_are_counted_against_what_a_deaf_model_has():
     assert {row.deaf for row in deaf if row.metric == "retrieval"} == {1 / 16}
 
 
+def test_rounding_is_no_control():
+    """Always the same 1e-6 dB: many standard errors, and nothing."""
+    rows = controllability({0: model(0.0, shift=1e-6)})
+    assert beyond(rows, "delta_psnr") == (0, 3)
+    assert beyond(controllability({0: model(0.0, shift=1e-3)}), "delta_psnr") == (3, 3)
+
+
 def test_a_row_says_what_there_is_to_follow():
     rows, truth = controllability({0: model(1.0)}), read_table()
     for row in rows:

@@ -27,6 +27,9 @@ def test_the_exponent_and_its_interval():
 
 def test_budgets_between_branches_are_interpolated():
     fit = fit_isoflop(runs(np.random.default_rng(1)), np.geomspace(1e11, 3e12, 4), draws=50)
+    for budget in fit.budgets:
+        tokens = np.stack([budget.sizes, budget.flops / (6 * budget.sizes)], 1)
+        assert budget.loss == pytest.approx(power(tokens, 1.0, (1.0, 0.5), (1.0, 0.5)), rel=0.01)
     assert fit.exponent.value == pytest.approx(0.5, abs=0.06)
     assert [b.flops for b in fit_isoflop(runs(np.random.default_rng(1)), draws=5).budgets] == pytest.approx(
         np.geomspace(6e10, 6e12, 4)
