@@ -13,7 +13,7 @@ PORT ?= 8765
 
 help:
 	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS))"
-	@echo "make play       drive a trained model in the browser (PORT=$(PORT))"
+	@echo "make play       drive a trained model in the browser; says how to make one (PORT=$(PORT))"
 	@echo "make test       run the tests that take less than about 20 s each"
 	@echo "make test-slow  run the others too"
 	@echo "make clean      remove the environment and caches; results under runs/ stay"
