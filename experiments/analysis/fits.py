@@ -92,7 +92,7 @@ def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: b
     if refused:
         return PowerFit(measured.axes, measured.trial, refused)
     noise = measured.noise()
-    weight = _weight(noise)
+    weight = weight_of(noise)
     centre = np.log(measured.x).mean(0)
     z = np.log(measured.x) - centre
     values = measured.draw(draws, np.random.default_rng(seed), episodes)
@@ -107,7 +107,7 @@ def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: b
     )
 
 
-def _weight(noise: np.ndarray) -> np.ndarray:
+def weight_of(noise: np.ndarray) -> np.ndarray:
     """Residuals count in units of the typical noise, so that the Huber threshold keeps its meaning."""
     if np.isnan(noise).any() or not (noise > 0).all():
         return np.ones(len(noise))

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from experiments.analysis import powerlaw
-from experiments.analysis.fits import fit_power
+from experiments.analysis.fits import fit_power, weight_of
 from tests.experiments.analysis.curves import measured, power, sizes
 
 
@@ -71,7 +71,12 @@ def test_a_noisy_point_weighs_less(rng):
         points.panel.points[i][:] *= factor
     noise = points.noise()
     assert noise[last[0]] > 2 * noise[0]
-    assert fit_power(points, 20)["alpha"].value == pytest.approx(0.5, abs=0.1)
+    weight = weight_of(noise)
+    np.testing.assert_allclose(weight * noise, weight[0] * noise[0])
+    assert np.log(weight).mean() == pytest.approx(0)  # the Huber threshold keeps its meaning
+    fit = fit_power(points, 20)
+    assert fit["alpha"].value == pytest.approx(0.5, abs=0.1)
+    np.testing.assert_array_equal(fit.noise, noise)
 
 
 @pytest.mark.parametrize(
