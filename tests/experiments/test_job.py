@@ -13,7 +13,7 @@ from experiments.running.former import modernise
 from experiments.running.job import read_job
 from experiments.running.shared_runs import ALONE, Shared
 from experiments.sweeps.sweep import reference_trial
-from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
+from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
 
 OLD = Path(__file__).parent / "data" / "job_3caafdd.json"
@@ -32,7 +32,8 @@ def test_a_job_says_the_trial_and_how_it_is_computed():
 def test_a_job_of_an_earlier_version_is_the_same_trial_and_how_it_was_computed_is_kept():
     trial, execution, shared = read_job(json.loads(OLD.read_text()))
     data = {"datasets": trial.datasets, "evaluated": trial.evaluated}  # robots of the suite's first edition
-    assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train, **data)
+    judged = replace(SMOKE.eval, other_actions=EvalConfig().other_actions)  # which it does not name
+    assert trial == replace(reference_trial(SMOKE, 0), model=trial.model, train=trial.train, eval=judged, **data)
     assert (trial.model.width, trial.train.steps) == (SMOKE.model.width, SMOKE.train.steps)
     assert shared == ALONE
     assert execution == ExecutionConfig("bfloat16", "products", "auto", accumulate=2, mesh=MeshConfig(fsdp=2))

@@ -144,4 +144,4 @@ def test_a_rollout_that_goes_where_the_other_actions_lead_gains():
     ignores = counterfactual(shown, shown, truth, before, jnp.ones(3, bool), real)
     np.testing.assert_array_equal(ignores["counterfactual_gain"], 0)
     copied = psnr(np.repeat(np.asarray(before), 4, axis=1), np.asarray(truth)).mean(1)
-    np.testing.assert_allclose(ignores["counterfactual_copy"][[0, 2]], copied[[0, 2]], rtol=1e-5)
+    np.testing.assert_allclose(np.asarray(ignores["counterfactual_copy"])[[0, 2]], copied[[0, 2]], rtol=1e-5)
