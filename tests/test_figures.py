@@ -30,8 +30,8 @@ TRAINED = {
 }
 """Row of the table -> (sweep, x, role)."""
 
-METRICS = ("perplexity", "delta_psnr", "psnr")
-DIGITS = {"perplexity": 2, "delta_psnr": 3, "psnr": 2}
+METRICS = ("perplexity", "action_nats", "delta_psnr", "psnr")
+DIGITS = {"perplexity": 2, "action_nats": 3, "delta_psnr": 3, "psnr": 2}
 
 STAGES = {
     "a frame while the window fills": "fill",

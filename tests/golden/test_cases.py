@@ -12,8 +12,6 @@ import pytest
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from tests.golden import verify
 
-pytestmark = pytest.mark.exact
-
 HERE = Path(__file__).parent
 CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exists())
 
@@ -28,7 +26,12 @@ def keep_small_programs():
     jax.config.update(name, before)
 
 
-@pytest.mark.parametrize("name", CASES)
+VARIANTS = {"08e_mar_mup_unit_width"}
+"""Cases that say little beyond another one; `make test-slow` has them."""
+
+
+@pytest.mark.exact
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in VARIANTS)) for n in CASES])
 def test_the_official_release_s_numbers(name: str):
     assert verify.main([str(HERE / name)]) == 0
 

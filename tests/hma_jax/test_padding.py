@@ -130,7 +130,7 @@ def test_actions_that_are_hidden_in_padding_only_concern_nobody():
 
 TOKENIZER = GreyTokenizer()
 DECODE = DecodeConfig(2, temperature=0.5, sampler=SamplerConfig(steps=3))
-EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=2)
+EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=2, other_actions=2)
 SHORT = np.array([5, 3, 4, 5])
 
 

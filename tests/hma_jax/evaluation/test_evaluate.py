@@ -21,7 +21,7 @@ from tests.hma_jax.evaluation.fakes import SIZE, GreyTokenizer, make_batches
 from tests.tiny import DIFFUSION, TABLE, lively_params, shallow_config
 
 DECODE = DecodeConfig(2, temperature=0.5, sampler=SamplerConfig(steps=3))  # every kind of random number is drawn
-EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=3)
+EVAL = EvalConfig(prompt_frames=2, decode=DECODE, random_actions=3, other_actions=2)
 CONFIG = shallow_config()
 TOKENIZER = GreyTokenizer()  # one for all: an evaluator is compiled for a tokenizer
 

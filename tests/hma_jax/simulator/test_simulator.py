@@ -41,7 +41,6 @@ def rolled_out(first, chunks: np.ndarray, seed: int, decode: DecodeConfig) -> np
     return tokenizer.decode(np.asarray(made)[0, 0])
 
 
-@pytest.mark.exact
 @pytest.mark.parametrize("decode", [DECODE, pytest.param(STREAMING, marks=pytest.mark.slow)], ids=["exact", "streaming"])
 def test_episodes_of_different_robots_starts_and_seeds_are_what_rollout_makes_of_each(decode):
     lengths, seeds = (1, 2, 6), (5, 5, 2**32 - 1)
@@ -111,7 +110,6 @@ def test_a_snapshot_is_gone_on_from_any_number_of_times(steps: int):
         np.testing.assert_array_equal(run(sim, plan[steps:]), first)
 
 
-@pytest.mark.exact
 @pytest.mark.parametrize("back", [1, 4, 11])
 def test_what_was_taken_back_comes_again_under_the_same_actions(back: int):
     sim, plan = simulator(), chunks_of(0, 12)
