@@ -91,6 +91,7 @@ CPU_FULL = replace(
     name="cpu-full",  # the evidence: two cores, half a day; every point of three seeds, every axis with controls
     unseen=tuple(e.name for e in NEW),
     train=replace(CPU.train, steps=8000),
+    eval=replace(CPU.eval, other_actions=15),  # retrieval among sixteen
     tau=1000.0,  # every robot weighs the same, whatever others there are and however much each has
     seeds=(0, 1, 2),
     widths=(20, 32, 48, 64, 80),  # over a decade of trunk parameters
