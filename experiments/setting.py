@@ -16,15 +16,13 @@ from tyro.conf import UseAppendAction, arg
 
 from experiments.presets import get_preset
 from experiments.program import PROGRAM
+from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
 from experiments.study import Study, on_tokenizer, on_user_data, override
 from hma_jax.config import ConfigError
 from hma_jax.training.claim import is_address
 
 Preset = Literal["smoke", "cpu", "cpu-full", "accelerator", "paper", "smoke-continuous", "cpu-continuous", "play"]
-
-UNSET = arg(help_behavior_hint="")
-"""For an option whose text says what happens without it."""
 
 
 @dataclass(frozen=True)

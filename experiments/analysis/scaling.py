@@ -58,7 +58,7 @@ def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
     """One for every sweep over a number and each of its series."""
     found = []
     for sweep in sweeps:
-        if not sweep.scaling:
+        if not sweep.measured:
             continue
         lines: dict[str, list[Point]] = defaultdict(list)
         for point in sweep.points:
@@ -74,7 +74,7 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tup
     groups: dict[str, dict[str, Trial]] = defaultdict(dict)
     for sweep in sweeps:
         for point in sweep.points:
-            if point.role == POINT and sweep.scaling:
+            if point.role == POINT and sweep.measured:
                 groups[_all_but_size(point.trial)][trial_id(point.trial, provenance)] = point.trial
 
     def varies(group: dict[str, Trial], what: Callable[[Trial], float]) -> bool:

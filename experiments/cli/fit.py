@@ -92,7 +92,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     axes = record.axes if name in record.axes else (*record.axes, name)
     sweeps = plan_sweeps(study, axes, workspace.root)
     sweep = next((s for s in sweeps if s.name == name), None)
-    if sweep is None or not sweep.scaling:
+    if sweep is None or not sweep.measured:
         raise ConfigError(f"--predict {asked}: {name} is no axis over a number")
     held = [p for p in sweep.points if p.x == x and p.role == POINT]
     known = ", ".join(f"{v:g}" for v in sorted({p.x for p in sweep.points}))

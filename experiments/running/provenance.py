@@ -27,7 +27,7 @@ from hma_jax.config.json import from_dict, to_dict
 
 FILE = "provenance.json"
 
-ROOTS = ("experiments.running.trial_main", "experiments.running.trial")
+ROOTS = tuple(f"experiments.running.{name}" for name in ("trial_main", "trial", "shared_runs", "newcomers"))
 """The modules whose closure is what a trial runs."""
 
 

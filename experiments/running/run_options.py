@@ -7,8 +7,10 @@ from typing import Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
-from experiments.setting import UNSET
 from hma_jax.config import require
+
+UNSET = arg(help_behavior_hint="")
+"""For an option whose text says what happens without it."""
 
 CHECKPOINTS = 5
 """Saved per training run, evenly spread, besides those by time: what an interrupted trial resumes from."""

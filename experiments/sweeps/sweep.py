@@ -52,6 +52,11 @@ class Sweep:
         """Whether it is one curve over a number."""
         return not self.labels and not self.several
 
+    @property
+    def measured(self) -> bool:
+        """Whether x says how much of something there is, on one curve or several: what a law can be fitted to."""
+        return not self.labels and not self.base
+
     def label(self, x: float) -> str:
         """The name of `x`; '' on an axis of numbers."""
         return self.labels[int(x)] if self.labels else ""

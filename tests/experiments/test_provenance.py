@@ -300,7 +300,7 @@ KEPT = Path(experiments.__file__).parent / "results"
 @pytest.mark.parametrize("name", ["cpu", "ablations"])
 def test_results_that_are_kept_are_read(name):
     record, rows = find_record(Workspace(KEPT / name)), read_csv(KEPT / name / "results.csv")
-    assert record.provenance.results == {"cpu": 1, "ablations": 0}[name]
+    assert record.provenance.results == {"cpu": 2, "ablations": 0}[name]
     assert record.study.name == "cpu" and record.study.eval.decode.unmask_steps == 2
     assert {(r.store, r.manifest, r.tokenizer, r.results) for r in rows} == {tuple(vars(record.provenance).values())}
     assert {r.sweep for r in rows} == set(record.axes) and all(r.code for r in rows)
