@@ -13,7 +13,7 @@ PORT ?= 8765
 
 help:
 	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS))"
-	@echo "make play       drive a trained model in the browser; says how to make one (PORT=$(PORT))"
+	@echo "make play       drive a trained model in the browser (RUN=a training run, PORT=$(PORT))"
 	@echo "make test       run the tests that take less than about 20 s each"
 	@echo "make test-slow  run the others too"
 	@echo "make clean      remove the environment and caches; results under runs/ stay"
@@ -22,7 +22,7 @@ study: $(VENV)/installed
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
 play: $(VENV)/installed-play
-	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play --port $(PORT)
+	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play $(RUN) --port $(PORT)
 
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8

@@ -19,7 +19,6 @@ from data_pipelines.json_file import read_lines, read_object
 from data_pipelines.names import inside, shown
 from data_pipelines.sources.parquet_pages import check_pages
 from data_pipelines.sources.rlds.location import is_failure, retried
-from data_pipelines.sources.units import require_module
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
 ADVICE = "Fetch the dataset again, meta folder included."
@@ -145,7 +144,8 @@ def _rows(table: Any, path: Path) -> list[dict[str, Any]]:
 
 def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> Any:
     """A pyarrow table. Raises DataError for a file that is missing or damaged."""
-    parquet, arrow = require_module("pyarrow.parquet"), require_module("pyarrow")
+    import pyarrow as arrow
+    from pyarrow import parquet
 
     def read() -> Any:
         try:

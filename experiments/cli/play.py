@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hma_jax.simulator.robots import Robot
 
 SHIPPED = Path("experiments/results/simulator")
-"""The model that comes with the repository."""
+"""Where `experiments.applications.ship` puts a model; served unless another run is named."""
 
 
 def play(
@@ -35,7 +35,7 @@ def play(
     Needs the extra `play`. Runs until it is interrupted. docs/simulator.md describes the page.
 
     Args:
-        run: Directory of a training run; without it the model that comes with the repository.
+        run: Directory of a training run; without it the one in experiments/results/simulator, where it was made.
         host: Address to listen at. 127.0.0.1 is this computer alone; 0.0.0.0 lets everybody in who can reach it.
         port: Of the address; 0 takes a free one.
         visitors: Who can drive at once, in one batch.

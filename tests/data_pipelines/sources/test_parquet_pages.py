@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as arrow
 import pytest
+from pyarrow import parquet
 
 from data_pipelines.sources.parquet_pages import MOST_UNPACKED, check_pages
-
-parquet, arrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
 
 
 def first_page(path) -> int:

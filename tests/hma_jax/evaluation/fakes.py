@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import ModelConfig
+from hma_jax.config import DecodeConfig, EvalConfig, ExecutionConfig, MeshConfig, ModelConfig
+from hma_jax.evaluation.evaluate import Evaluation, evaluate
 from hma_jax.model.embodiments import EmbodimentTable
-from tests.tiny import TABLE, random_batch
+from tests.tiny import TABLE, lively_params, model_config, random_batch
 
 SIZE = 8
 
@@ -63,3 +64,19 @@ def make_batches(
         yield {key: np.stack(x) for key, x in columns.items()} | {
             "dataset": dataset, "valid": np.arange(batch) < len(part)
         }  # fmt: skip
+
+
+def evaluate_on(mesh: MeshConfig, each: int, batch: int) -> tuple[Evaluation, list[int]]:
+    """(the tiny model evaluated on a mesh, windows done after each batch): `each` windows of two robots."""
+    config, seen = model_config(), []
+    evaluation = evaluate(
+        lively_params(config)[1],
+        config,
+        TABLE,
+        GreyTokenizer(piece=3),
+        make_batches(config, names=("base", "arm"), each=each, batch=batch),
+        EvalConfig(prompt_frames=2, random_actions=2, decode=DecodeConfig(2, temperature=0.5)),
+        execution=ExecutionConfig(windows_at_once=1, mesh=mesh),
+        progress=seen.append,
+    )
+    return evaluation, seen
