@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
-from data_pipelines.names import inside
+from data_pipelines.names import inside, shown
 from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta, read_table
 from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
@@ -129,7 +129,7 @@ class LeRobotSource:
                 if n not in table.column_names
             ]
             if missing:
-                raise UnitError(f"{entry.data}: no column {missing[0]!r}. {ADVICE}")
+                raise UnitError(f"{entry.data}: no column {shown(missing[0])}. {ADVICE}")
             self._open_table = entry.data, table.select([n for n in names if n in table.column_names])
         return self._open_table[1]
 
@@ -160,10 +160,10 @@ class LeRobotSource:
             with open_video(path) as video:
                 return [encode_jpeg(shrink(f, self.short_side)) for f in video.frames(times + begin)]
         if name not in table.column_names:
-            raise UnitError(f"{where} has no column {name!r}, though the feature is an image. {ADVICE}")
+            raise UnitError(f"{where} has no column {shown(name)}, though the feature is an image. {ADVICE}")
         images = []
         for row, value in enumerate(table[name].to_pylist()):
-            here = f"{where}: {name!r} at row {row}"
+            here = f"{where}: {shown(name)} at row {row}"
             images.append(stored_jpeg(self.image_bytes(value, here), self.short_side, here))
         return images
 
@@ -188,7 +188,7 @@ class LeRobotSource:
             rows = np.asarray(table[name].to_pylist(), np.float64)
         except (TypeError, ValueError) as error:
             raise UnitError(
-                f"{where}: {name!r} is not one array of numbers per row ({error}). {ADVICE}"
+                f"{where}: {shown(name)} is not one array of numbers per row ({error}). {ADVICE}"
             ) from error
         return rows.reshape(len(rows), -1)
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
+from data_pipelines.names import shown
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import SUCCESS, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
@@ -157,8 +158,8 @@ class LeRobotDataset(EpisodeSource):
             video = stack.enter_context(open_video(path))
             return lambda n: video.at(float(times[n] + begin))
         if name not in table.column_names:
-            raise EpisodeError(f"{where}: no column {name!r}, though the feature is an image. Fetch it again.")
-        return lambda n: self._read.image_bytes(table[name][n].as_py(), f"{where}: {name!r} at row {n}")
+            raise EpisodeError(f"{where}: no column {shown(name)}, though the feature is an image. Fetch it again.")
+        return lambda n: self._read.image_bytes(table[name][n].as_py(), f"{where}: {shown(name)} at row {n}")
 
 
 class _Frames(Sequence[Fetched]):

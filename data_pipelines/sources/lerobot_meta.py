@@ -16,7 +16,7 @@ from typing import Any
 
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_lines, read_object
-from data_pipelines.names import inside, shown
+from data_pipelines.names import brief, inside, shown
 from data_pipelines.sources.parquet_pages import check_pages
 from data_pipelines.sources.rlds.location import is_failure, retried
 
@@ -66,7 +66,7 @@ def read_meta(root: Path) -> LeRobotMeta:
     features = info["features"]
     videos = [key for key, feature in features.items() if feature.get("dtype") == "video"]
     if videos and not info.get("video_path"):
-        raise DataError(f"{info_path}: no 'video_path', but {videos[0]!r} is a video. {ADVICE}")
+        raise DataError(f"{info_path}: no 'video_path', but {shown(videos[0])} is a video. {ADVICE}")
     read = _episodes_3 if version == "v3.0" else _episodes_2
     episodes = read(root, info, videos)
     if not episodes:
@@ -96,7 +96,7 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
         table = read_table(path)
         missing = [c for c in columns if c not in table.column_names]
         if missing:
-            raise DataError(f"{path}: no column {missing[0]!r}. {ADVICE}")
+            raise DataError(f"{path}: no column {shown(missing[0])}. {ADVICE}")
         wanted = [*columns, *(["tasks"] if "tasks" in table.column_names else [])]
         for line, row in enumerate(_rows(table.select(wanted), path)):
             where = f"{path}: row {line}"
@@ -129,7 +129,7 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     text = [c for c in ("task", "__index_level_0__", "index") if c in table.column_names]
     if not text or "task_index" not in table.column_names:
         raise DataError(
-            f"{path}: the columns are {', '.join(table.column_names)}; task and task_index are needed."
+            f"{path}: the columns are {brief(', '.join(table.column_names))}; task and task_index are needed."
         )
     rows = enumerate(_rows(table.select(["task_index", text[0]]), path))
     return {_count(row, "task_index", f"{path}: row {line}"): str(row[text[0]]) for line, row in rows}

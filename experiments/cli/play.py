@@ -56,8 +56,8 @@ def play(
 
     require(
         run != SHIPPED or run.is_dir(),
-        f"there is no model at {SHIPPED}: say which run to serve, or make one with `hma train --preset play --out runs/play` "
-        "and `hma play runs/play/model`",
+        f"there is no model at {SHIPPED}: say which run to serve, or make one with "
+        "`hma train --preset play --out runs/play` and `hma play runs/play/model`",
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")

@@ -98,6 +98,16 @@ def test_malformed_tables_are_named_to_row_and_field(tmp_path, version, change, 
         convert(source, tmp_path, "arm")
 
 
+def test_a_name_of_thousands_of_letters_does_not_fill_the_message(tmp_path):
+    root = write_lerobot(tmp_path / "toy", "v3.0")
+    info = json.loads((root / "meta" / "info.json").read_text())
+    info["features"]["x" * 5000] = {"dtype": "video", "shape": [8, 8, 3], "names": None}
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(DataError, match="no column 'videos/xxx") as raised:
+        LeRobotSource(root)
+    assert len(str(raised.value)) < 1000
+
+
 def test_a_video_that_ends_too_early_or_is_none_is_named(tmp_path):
     root = write_lerobot(tmp_path / "toy", "v3.0")
     path = next(root.rglob("*.mp4"))
