@@ -73,6 +73,14 @@ def test_processes_train_as_one_does_and_write_one_log(processes: int, devices: 
     assert not find_damage(tmp_path / "checkpoints" / "20")
 
 
+def test_in_float64_the_losses_of_twenty_steps_are_those_of_one_process(tmp_path: Path, monkeypatch):
+    monkeypatch.setenv("HMA_TESTS_FLOAT64", "1")
+    one, two, four = (train(tmp_path / str(n), n, 4 // n, steps=20)[0]["losses"] for n in (1, 2, 4))
+    assert len(one) == 20 and one != [float(np.float32(x)) for x in one]
+    np.testing.assert_allclose(two, one, rtol=1e-9)
+    np.testing.assert_allclose(four, one, rtol=1e-9)
+
+
 @pytest.mark.parametrize("mesh", [[1, 4, 1], [1, 2, 2]])
 def test_any_mesh_over_four_processes(mesh: list[int], alone, tmp_path: Path):
     """With `tensor` across processes several of them load the same rows."""

@@ -2,7 +2,8 @@
 
     python -m tests.multihost.train_together RUN_DIR '{"steps": 5, "mesh": [-1, 1, 1], ...}'
 
-Ends as `hma train` does, with its exit codes.
+Ends as `hma train` does, with its exit codes. With HMA_TESTS_FLOAT64=1 it computes in float64 what is float32
+otherwise, so that nothing is left to tell two orders of summing apart.
 """
 
 from __future__ import annotations
@@ -17,7 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+FLOAT64 = os.environ.get("HMA_TESTS_FLOAT64") == "1"
+if FLOAT64:  # before the first module of the library says what its arrays are made of
+    jax.config.update("jax_enable_x64", True)
+    jnp.float32, np.float32 = jnp.float64, np.float64
 
 from hma_jax.config import ExecutionConfig, MeshConfig
 from hma_jax.runtime.processes import Processes, end, is_writer, start
@@ -67,7 +74,7 @@ def train(run_dir: Path, asked: dict[str, Any]) -> dict[str, Any]:
 
     result = train_model(
         model, TABLE, config, batches, run_dir=run_dir, provenance={},
-        execution=ExecutionConfig(mesh=mesh),
+        execution=ExecutionConfig(mesh=mesh, dtype="float64" if FLOAT64 else "float32"),
         options=LoopOptions(checkpoint_every=asked["every"], checkpoint_minutes=asked["minutes"], log_every=2),
         validation=Validation(2, lambda: map(own, range(100, 103))) if asked.get("validate") else None,
         progress=announce,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -17,7 +18,8 @@ from experiments.running.attempts import OUTPUT, read_progress
 from experiments.running.workspace import Workspace
 
 SWEEP = ("sweep", "trajectories", "--preset", "smoke", "--set", "trajectory_counts=2,4")
-TRIALS = 3
+PROBE = 300
+"""Steps from which the speed of training is known."""
 
 PATIENCE = 900.0
 """Seconds for anything to happen, on a machine that is busy with something else."""
@@ -27,10 +29,21 @@ def command(out: Path, steps: int, *more: str) -> list[str]:
     return [sys.executable, "-m", "experiments.cli", *SWEEP, "--set", f"train.steps={steps}", "--out", str(out), *more]
 
 
+def steps_within(seconds: float, root: Path) -> int:
+    """How many steps a trial of the sweep makes in `seconds` of training here, found by a short one: enough for
+    it to be disturbed in its middle on a machine of any speed."""
+    print("how fast a trial is ...", flush=True)
+    trial = (sys.executable, "-m", "experiments.cli", "train", "--preset", "smoke", "--set", f"train.steps={PROBE}")
+    subprocess.run([*trial, "--out", str(root / "probe")], check=True, stdout=subprocess.DEVNULL)
+    lines = (root / "probe" / "model" / "timing.jsonl").read_text().splitlines()
+    each = min(json.loads(line)["seconds_per_step"] for line in lines)
+    return math.ceil(seconds / each)
+
+
 def run_here(root: Path, steps: int) -> bytes:
     """The sweep on this machine, undisturbed; returns its CSV."""
     out = Workspace(root / "here")
-    print("the sweep on this machine ...", flush=True)
+    print(f"the sweep on this machine, trials of {steps} steps ...", flush=True)
     subprocess.run(command(out.root, steps), check=True, stdout=subprocess.DEVNULL)
     return out.results.read_bytes()
 

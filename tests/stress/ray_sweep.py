@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.stress.launched import Sweep, run_here
+from tests.stress.launched import Sweep, run_here, steps_within
 
 
 @contextmanager
@@ -56,11 +56,10 @@ def raylet_above(made: Any, process: int) -> Any:
 def disturb(sweep: Sweep, made: Any) -> None:
     first = sweep.wait_for("a trial whose worker is killed", sweep.training)
     os.kill(next(parents(first["process"])), signal.SIGKILL)
-    sweep.wait_for_start("it starts again", first["trial"], 1)
-
     second = sweep.wait_for("a trial whose node is killed", lambda: sweep.training([first["trial"]]))
     made.remove_node(raylet_above(made, second["process"]), allow_graceful=False)
-    sweep.wait_for_start("it starts on the other node", second["trial"], 1)
+    sweep.wait_for_start("the one starts again", first["trial"], 1)
+    sweep.wait_for_start("the other starts on the node that is left", second["trial"], 1)
 
     sweep.wait_for("a trial in the middle when the command is stopped", sweep.training)
     sweep.process.terminate()
@@ -73,11 +72,12 @@ def disturb(sweep: Sweep, made: Any) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=600, help="of each trial")
-    steps = parser.parse_args().steps
+    parser.add_argument("--seconds", type=float, default=60.0, help="that a trial trains on this machine")
+    seconds = parser.parse_args().seconds
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
+        steps = steps_within(seconds, root)
         csv = run_here(root, steps)
         with cluster() as made:
             more = ("--launcher", "ray", "--launcher-set", f"address={made.address}")

@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.stress.launched import Sweep, run_here
+from tests.stress.launched import Sweep, run_here, steps_within
 
 CONFIGURATION = """
 ClusterName=stress
@@ -171,10 +171,11 @@ def disturb(sweep: Sweep) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=600, help="of each trial")
-    steps = parser.parse_args().steps
+    parser.add_argument("--seconds", type=float, default=60.0, help="that a trial trains on this machine")
+    seconds = parser.parse_args().seconds
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
+        steps = steps_within(seconds, root)
         csv = run_here(root, steps)
         more = ("--launcher", "slurm", "--launcher-set", "cpus=1", "--launcher-set", "minutes=120")
         with cluster(root / "slurm") as environment, Sweep(root, steps, more, environment) as sweep:
