@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from data_pipelines.registry.spec import FRAME_RATE, stride_of
+from data_pipelines.registry.spec import stride_of
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.controls import Control, Drive
 from data_pipelines.suite.embodiments import EMBODIMENTS
@@ -151,13 +151,14 @@ def _keys(spec: EmbodimentSpec) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(sign * (d == at) for d, sign in enumerate(signs)) for at in moved)
 
 
-def suite_starts(name: str, count: int, frames: int, *, rate: float | None = FRAME_RATE, seed: int = 0) -> list[Start]:
-    """The first `frames` frames, at the model's rate, of `count` held-out episodes of a suite made with `seed`.
+def suite_starts(name: str, count: int, frames: int, *, stride: int | None = None, seed: int = 0) -> list[Start]:
+    """The first `frames` frames of `count` held-out episodes of a suite made with `seed`.
 
-    Episodes that are not long enough are left out.
+    A frame is seen every `stride` native steps; None: as nearly twice a second as they can be. Episodes that are not long
+    enough are left out.
     """
     spec = SPECS[name]
-    stride, numbers = stride_of(spec.hz, rate), episode_seeds(spec, count, seed, "val")
+    stride, numbers = stride or stride_of(spec.hz), episode_seeds(spec, count, seed, "val")
     rollout, starts = simulate(spec, numbers), []
     for i, number in enumerate(numbers):
         if rollout.lengths[i] <= (frames - 1) * stride:

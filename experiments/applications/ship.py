@@ -111,7 +111,7 @@ def compare(simulator: Simulator, robot: Robot) -> dict[str, list[float]]:
 
 def held_out(robot: Robot, size: int) -> tuple[list[Start], np.ndarray]:
     """`EPISODES` starts, and what was done after them: chunks [EPISODES, FRAMES, stride, A]."""
-    whole = suite_starts(robot.name, 16 * EPISODES, FIRST + FRAMES, seed=1)[:EPISODES]
+    whole = suite_starts(robot.name, 16 * EPISODES, FIRST + FRAMES, stride=robot.stride, seed=1)[:EPISODES]
     longest = SPECS[robot.name].seconds[1]
     require(len(whole) == EPISODES, f"{robot.name}: too few of its episodes (at most {longest:g} s) are long enough")
     given = (FIRST - 1) * robot.stride

@@ -99,7 +99,7 @@ def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_
     starts: list[Start] = []
     for robot in simulator.robots.values():
         if has_truth(robot):
-            made = suite_starts(robot.name, count, START_FRAMES)
+            made = suite_starts(robot.name, count, START_FRAMES, stride=robot.stride)
             starts += [_fitted(start, simulator.tokenizer.image_size) for start in made]
         elif store is not None and robot.name in store.names:
             starts += _stored_starts(store, robot, simulator.tokenizer.image_shape, count)

@@ -15,12 +15,13 @@ def robot(name: str, dim: int, stride: int, most: float = 1.0):
 PUSHER, ARM = robot("pusher_sand", 2, 2), robot("arm_chalk", 3, 2)
 
 
-def test_a_start_goes_on_as_the_recorded_episode_did():
-    start = suite_starts("pusher_sand", 8, 4)[0]
-    begun = SuiteSimulator([robot("pusher_sand", 2, 2, 1e9)])
-    seen = begun.reset(type(start)(start.robot, start.images[:2], start.actions[:2], start.seed))
+@pytest.mark.parametrize("asked, stride", [(None, 2), (1, 1), (3, 3)])
+def test_a_start_goes_on_as_the_recorded_episode_did(asked, stride):
+    start = suite_starts("pusher_sand", 8, 4, stride=asked)[0]
+    begun = SuiteSimulator([robot("pusher_sand", 2, stride, 1e9)])
+    seen = begun.reset(type(start)(start.robot, start.images[:2], start.actions[:stride], start.seed))
     np.testing.assert_array_equal(seen[0], start.images[1])
-    np.testing.assert_array_equal(begun.step([start.actions[2:4]])[0], start.images[2])
+    np.testing.assert_array_equal(begun.step([start.actions[stride : 2 * stride]])[0], start.images[2])
 
 
 def test_episodes_are_apart_clipped_and_taken_back():
