@@ -49,7 +49,7 @@ ONE_ROBOT = EmbodimentTable((Embodiment("one_robot", 2, 1, mean=(0.0, 0.0), std=
 
 def estimate(trial: Trial) -> Cost:
     """The cost of one trial, by formula (`hma_jax.model.flops`, `hma_jax.generation.flops`)."""
-    from hma_jax.model.flops import train_flops_per_window
+    from hma_jax.model.flops import train_flops_per_step
 
     names = trial.datasets if trial.source is None else (*trial.source.datasets, *trial.datasets)
     table, config = declared_table(names, trial.rate), trial.eval
@@ -60,7 +60,7 @@ def estimate(trial: Trial) -> Cost:
     return Cost(
         parameters=_count_parameters(trial.model, table),
         parameters_one_robot=_count_parameters(trial.model, ONE_ROBOT),
-        train_flops=train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
+        train_flops=train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         evaluation_flops=batches * config.batch * evaluation_flops_per_window(trial, table),
     )
 

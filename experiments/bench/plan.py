@@ -19,7 +19,7 @@ from experiments.bench.collectives import Collective, Sent, find_collectives
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, ModelConfig, TrainConfig
 from hma_jax.kernels.attention import backend_of
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.flops import train_flops_per_window
+from hma_jax.model.flops import train_flops_per_step
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared
 from hma_jax.runtime.audit import Decision, audit_sharding, plan_sharding
@@ -96,7 +96,7 @@ def make_plan(
         decisions=tuple(decisions),
         devices=len(devices),
         mesh=dict(mesh.shape),
-        flops_per_step=train.batch * train_flops_per_window(model, table),
+        flops_per_step=train_flops_per_step(model, table, train),
     )
     began = time.perf_counter()
     with jax.set_mesh(mesh):

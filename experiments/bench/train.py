@@ -12,7 +12,7 @@ from experiments.bench.models import Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.timing import compile_call, time_by_turns
 from hma_jax.config import TrainConfig
-from hma_jax.model.flops import pass_flops, train_flops_per_window
+from hma_jax.model.flops import pass_flops, train_flops_per_step
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.masking import mask_batch
@@ -56,5 +56,5 @@ def time_training(subject: Subject, rows: int, repeats: int) -> list[Stage]:
     }
     timings = time_by_turns(calls | {"step": one_step}, repeats)
     one_pass = rows * pass_flops(config, table, config.frames, config.frames / 2)
-    flops = {"forward": one_pass, "plain": one_pass, "step": rows * train_flops_per_window(config, table)}
+    flops = {"forward": one_pass, "plain": one_pass, "step": train_flops_per_step(config, table, settings)}
     return make_stages(rows, compiled, timings, frames=dict.fromkeys(flops, rows * config.frames), flops=flops)

@@ -291,7 +291,7 @@ def run_trial(
 
     from data_pipelines.loading.selection import training_table
     from experiments.running.sealed import write_result
-    from hma_jax.model.flops import train_flops_per_window
+    from hma_jax.model.flops import train_flops_per_step
     from hma_jax.model.hma import declare_model
     from hma_jax.runtime.processes import is_writer
 
@@ -321,7 +321,7 @@ def run_trial(
         "untrained": untrained,
         "losses": trained.losses,
         "parameters": declared.count(),
-        "train_flops": train_flops_per_window(trial.model, table) * trial.train.batch * trial.train.steps,
+        "train_flops": train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         "run": {
             "seconds": time.perf_counter() - started,
             "train_seconds": trained.seconds,

@@ -10,6 +10,8 @@ from hma_jax.config.base import require
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
 
+ActionLeak = Literal["none", "conditioning", "all"]
+"""Where the model is shown actions that are hidden (`MaskingConfig.action_leak`)."""
 
 Weights = Literal["auto", "last", "ema"]
 """Which weights of a run: the last ones, their moving average, or (`auto`) the average where the run
@@ -38,12 +40,16 @@ class MaskingConfig:
     # Continuous variant: mask whole patches. DIFFERS: the release masks single cells, so that
     # patches are partly masked in training and never at inference; `cell` is as released.
     mask_unit: Literal["patch", "cell"] = "patch"
+    # Masked frames are predicted from the true frames before them, as when frames are generated. DIFFERS: the release
+    # masks all frames of a window in one pass, so that each is predicted from masked ones. A step passes over every
+    # frame twice and teaches more than two such steps (docs/performance.md).
+    teacher_forcing: bool = False
     max_corrupt_rate: float = 0.2
     clean_rate_min: float = 0.2
     label_smoothing: float = 0.01
     # DIFFERS: the release shows hidden actions to the blocks (`conditioning`, discrete variant)
     # or everywhere (`all`, continuous variant), so that the objective gives them away.
-    action_leak: Literal["none", "conditioning", "all"] = "none"
+    action_leak: ActionLeak = "none"
 
     def __post_init__(self):
         shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain")
@@ -51,6 +57,10 @@ class MaskingConfig:
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
+        require(
+            not (self.teacher_forcing and self.predicts_actions),
+            f"masking.teacher_forcing is of settings that predict frames alone, and {self.setting!r} predicts actions",
+        )
 
     @property
     def predicts_frames(self) -> bool:

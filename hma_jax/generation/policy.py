@@ -9,7 +9,7 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.generation import steps
 from hma_jax.generation.cache import FrameCache, Window
 from hma_jax.generation.rollout import fold_in
-from hma_jax.generation.teacher import beside
+from hma_jax.model.beside import beside
 from hma_jax.model.hma import HMA, Outputs
 from hma_jax.objective.diffusion import sample_with_key
 from hma_jax.objective.losses import seen_by_all

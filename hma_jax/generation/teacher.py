@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from hma_jax.config import DecodeConfig
 from hma_jax.generation.decoding import Frame, decode_frame
 from hma_jax.generation.rollout import fold_in
+from hma_jax.model.beside import look_beside
 from hma_jax.model.hma import HMA, Outputs, causal
 
 
@@ -20,11 +21,8 @@ def next_frame_outputs(
 ) -> jax.Array:
     """What the model says of frames 1 .. T-1, each wholly masked after its true past: logits
     [B, T - 1, S, Q, V] or conditions [B, T - 1, S, D].
-
-    One pass over 2 (T - 1) frames, the true ones and the masked ones side by side, where the
-    official evaluation makes T - 1 passes over the window (reference section 6.2).
     """
-    return _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, remember=0).said
+    return _look(model, frames, actions_BTU, embodiment_B, hidden_BT).said
 
 
 def next_frames(
@@ -43,7 +41,7 @@ def next_frames(
     one over the true ones, where the official evaluation makes M (T - 1) over the window.
     """
     count = frames.shape[1] - 1
-    out = _look_beside(model, frames, actions_BTU, embodiment_B, hidden_BT, remember=count)
+    out = _look(model, frames, actions_BTU, embodiment_B, hidden_BT, remember=count)
     actions = model.align(actions_BTU)[:, 1:]
     hidden = model.align_hidden(hidden_BT, frames.shape[:2])
     hidden = None if hidden is None else hidden[:, 1:]
@@ -67,6 +65,20 @@ def next_frames(
     return out.said, _by_window(filled, count)
 
 
+def _look(
+    model: HMA,
+    frames: jax.Array,
+    actions_BTU: jax.Array,
+    embodiment_B: jax.Array,
+    hidden_BT: jax.Array | None,
+    remember: int = 0,
+) -> Outputs:
+    """At frames 1 .. T-1, all of them wholly masked."""
+    before = frames[:, :-1]  # what lies under a mask does not matter
+    masked = jnp.ones(before.shape[:3], bool)
+    return look_beside(model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, remember=remember)
+
+
 def _by_frame(x: jax.Array) -> jax.Array:
     """[B, T - 1, ...] -> [B (T - 1), ...]."""
     return x.reshape(-1, *x.shape[2:])
@@ -75,41 +87,3 @@ def _by_frame(x: jax.Array) -> jax.Array:
 def _by_window(x: jax.Array, count: int) -> jax.Array:
     """The inverse."""
     return x.reshape(-1, count, *x.shape[1:])
-
-
-def _look_beside(
-    model: HMA,
-    frames: jax.Array,
-    actions_BTU: jax.Array,
-    embodiment_B: jax.Array,
-    hidden_BT: jax.Array | None,
-    remember: int,
-) -> Outputs:
-    """One pass over frames 0 .. T-2 and, beside them, 1 .. T-1 wholly masked; of these it says something."""
-    count = frames.shape[1] - 1
-    both = jnp.concatenate([frames[:, :-1]] * 2, axis=1)
-    masked = jnp.broadcast_to((jnp.arange(2 * count) >= count)[None, :, None], both.shape[:3])
-    hidden = model.align_hidden(hidden_BT, frames.shape[:2])
-    return model(
-        both,
-        masked,
-        _twice(model.align(actions_BTU)),
-        embodiment_B,
-        hidden_BT=None if hidden is None else _twice(hidden),
-        visible=beside(jnp.tril(jnp.ones((count, count), bool))),
-        positions=jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)]),
-        remember=remember,
-        said_from=count,
-    )
-
-
-def beside(past: jax.Array) -> jax.Array:
-    """bool [2 T, 2 T]: what frames and, beside them, T masked ones may see. A masked frame sees the true
-    frames that `past` [T, T] allows it, and itself; nobody sees a masked frame."""
-    count = len(past)
-    return jnp.block([[causal(count), jnp.zeros_like(past)], [past, jnp.eye(count, dtype=bool)]])
-
-
-def _twice(x: jax.Array) -> jax.Array:
-    """[B, T, ...] -> [B, 2 (T - 1), ...]: frames 0 .. T-2, then 1 .. T-1."""
-    return jnp.concatenate([x[:, :-1], x[:, 1:]], axis=1)

@@ -7,23 +7,31 @@ it counts the body of a scan once.
 
 from __future__ import annotations
 
-from hma_jax.config import ModelConfig
+from hma_jax.config import ModelConfig, TrainConfig
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.heads import TIME_FEATURES
 
 
-def forward_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float:
-    """One forward pass over one window of T frames; with latents also the denoiser, as often as in training."""
+def forward_flops_per_window(config: ModelConfig, table: EmbodimentTable, teacher_forcing: bool = False) -> float:
+    """One forward pass over one window of T frames; with latents also the denoiser, as often as in training.
+
+    With `teacher_forcing` it is a pass over T - 1 frames and, beside them, over the T - 1 that follow them.
+    """
     t, diffusion = config.frames, config.diffusion
-    denoiser = denoiser_flops(config, diffusion.repeats * t * config.tokens) if diffusion else 0.0
-    return pass_flops(config, table, t, t / 2) + denoiser
+    said = t - 1 if teacher_forcing else t
+    denoiser = denoiser_flops(config, diffusion.repeats * said * config.tokens) if diffusion else 0.0
+    return pass_flops(config, table, 2 * said if teacher_forcing else t, t / 2, said) + denoiser
 
 
-def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: float) -> float:
-    """One pass over `frames` frames of one window, up to logits or, with latents, conditions.
+def pass_flops(
+    config: ModelConfig, table: EmbodimentTable, frames: int, seen: float, said: int | None = None
+) -> float:
+    """One pass over `frames` frames of one window, up to logits or, with latents, conditions of `said` of them (None:
+    all).
 
     `seen`: frames that one attends to over time, itself among them, on average; T / 2 in a causal window of T.
     """
+    said = frames if said is None else said
     d, p = config.width, config.frame_tokens
     attention = 2 * 4 * d * d  # q, k, v and output, spatial and temporal
     mlp = 2 * d * config.mlp_width
@@ -36,11 +44,10 @@ def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: f
         per_token += 2 * d * d + 2 * seen * d
         per_frame += 2 * d * d
     stem = table.action_width * d + d * d
-    if config.diffusion:
-        ends = config.tokens * (config.diffusion.token_channels * d + d * d)  # embedding and conditions
-    else:
-        ends = config.tokens * d * config.factors * config.factor_vocab
-    return 2.0 * frames * (config.layers * (p * per_token + per_frame) + stem + ends)
+    embedding = config.tokens * config.diffusion.token_channels * d if config.diffusion else 0
+    outputs = d if config.diffusion else config.factors * config.factor_vocab
+    shared = config.layers * (p * per_token + per_frame) + stem + embedding
+    return 2.0 * (frames * shared + said * config.tokens * d * outputs)
 
 
 def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True) -> float:
@@ -55,6 +62,6 @@ def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True) -> 
     return 2.0 * tokens * (time + (d + c) * w + blocks + 2 * w * w + 2 * w * c)
 
 
-def train_flops_per_window(config: ModelConfig, table: EmbodimentTable) -> float:
-    """Forward and backward: three times the forward pass."""
-    return 3.0 * forward_flops_per_window(config, table)
+def train_flops_per_step(config: ModelConfig, table: EmbodimentTable, train: TrainConfig) -> float:
+    """Forward and backward of the global batch: three times the forward pass."""
+    return 3.0 * train.batch * forward_flops_per_window(config, table, train.masking.teacher_forcing)

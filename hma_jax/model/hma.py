@@ -6,13 +6,14 @@ need. Masking and losses are in `objective`, decoding in `generation`.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import nnx
 
 from hma_jax.config import ExecutionConfig, ModelConfig
+from hma_jax.config.training import ActionLeak
 from hma_jax.kernels.pointwise import over_tokens, replaced, shifted
 from hma_jax.model.conditioning import ActionFeature
 from hma_jax.model.embodiments import EmbodimentTable
@@ -68,7 +69,7 @@ class HMA(nnx.Module):
         embodiment_B: jax.Array,
         *,
         hidden_BT: jax.Array | None = None,
-        leak: Literal["none", "conditioning", "all"] = "none",
+        leak: ActionLeak = "none",
         visible: jax.Array | None = None,
         first: int | jax.Array = 0,
         positions: jax.Array | None = None,
@@ -114,7 +115,7 @@ class HMA(nnx.Module):
         return Outputs(said, pooled, cache)
 
     def _action_tokens(
-        self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, leak: str, positions: jax.Array
+        self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, leak: ActionLeak, positions: jax.Array
     ) -> jax.Array:
         """K copies of each frame's feature, or of its learned vector where it is hidden."""
         if hidden_BT is not None and leak != "all":

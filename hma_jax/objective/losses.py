@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import DiffusionConfig, MaskingConfig
+from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
 from hma_jax.objective.diffusion import diffusion_loss
@@ -94,20 +95,22 @@ def masked_loss(
     """
     slice_B = embodiment_B if slice_B is None else slice_B
     all_shown = masking.setting == "forward" and all(model.table.chunks)
-    hidden = model.align_hidden(None if all_shown else masked.hidden_T, actions_BTU.shape[:2])
-    frames = tokens.shape[1]
-    everything = seen_by_all(frames, real_BT) if masking.setting == "inverse" else None
-    out = model(
-        masked.inputs,
-        masked.masked,
-        model.align(actions_BTU),
-        embodiment_B,
-        hidden_BT=hidden,
-        leak=masking.action_leak,
-        visible=everything,
-        said_from=SAID_FROM,
-        slice_B=slice_B,
-    )
+    hidden = None if all_shown else masked.hidden_T
+    options = {"leak": masking.action_leak, "slice_B": slice_B}
+    if masking.teacher_forcing:
+        inputs = masked.inputs[:, :-1], masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
+        out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
+    else:
+        out = model(
+            masked.inputs,
+            masked.masked,
+            model.align(actions_BTU),
+            embodiment_B,
+            hidden_BT=model.align_hidden(hidden, actions_BTU.shape[:2]),
+            visible=seen_by_all(tokens.shape[1], real_BT) if masking.setting == "inverse" else None,
+            said_from=SAID_FROM,
+            **options,
+        )
     zero = jnp.zeros(())
     loss = correct = action_loss = zero
     if masking.predicts_frames:

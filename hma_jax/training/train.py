@@ -14,7 +14,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig
 from hma_jax.config.json import to_dict
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.flops import train_flops_per_window
+from hma_jax.model.flops import train_flops_per_step
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.runtime.audit import audit_sharding, plan_sharding
@@ -93,7 +93,7 @@ def train_model(
             put_batch=put,
             options=replace(
                 options,
-                flops_per_step=config.batch * train_flops_per_window(model, table),
+                flops_per_step=train_flops_per_step(model, table, config),
                 peak_flops=peak_flops(execution.dtype),
                 may_change=extendable,
             ),

@@ -5,10 +5,11 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from hma_jax.config import ExecutionConfig
+from hma_jax.config import ExecutionConfig, MaskingConfig
 from hma_jax.diagnostics.products import Product, count_products, total_flops
-from hma_jax.model.flops import train_flops_per_window
+from hma_jax.model.flops import train_flops_per_step
 from hma_jax.model.hma import declare_model
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
@@ -42,12 +43,13 @@ def test_what_nothing_needs_is_not_counted():
     assert not count_products(lambda a, b: (a @ b, a)[1], A, B)
 
 
-def test_a_training_step_has_the_products_that_the_formula_counts():
+@pytest.mark.parametrize("teacher_forcing", [False, True])
+def test_a_training_step_has_the_products_that_the_formula_counts(teacher_forcing):
     model = model_config(width=128, tokens=256, action_tokens=64, frames=12, factor_vocab=512)
-    train = train_config(batch=1)
+    train = train_config(batch=1, masking=MaskingConfig(teacher_forcing=teacher_forcing))
     declared = declare_model(model, TABLE, ExecutionConfig(remat="none"))
     step = make_train_step(declared, TABLE, model, train)
     state = jax.eval_shape(lambda: init_state(declared, TABLE, 0))
     found = total_flops(count_products(step, state, random_batch(0, model, 1)))
     # More than the formula: weights of attention within frames, always computed again. Less: frame 0 is not read out.
-    assert 1.0 < found / train_flops_per_window(model, TABLE) < 1.1
+    assert 1.0 < found / train_flops_per_step(model, TABLE, train) < 1.1

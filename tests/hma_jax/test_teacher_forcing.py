@@ -1,0 +1,65 @@
+"""Training on frames that are predicted from their true past: what it asks is what generation is asked."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, MaskingConfig
+from hma_jax.generation.teacher import next_frame_outputs
+from hma_jax.model.beside import look_beside
+from hma_jax.model.frames import factorise
+from hma_jax.model.hma import HMA
+from hma_jax.objective.losses import frame_diffusion_loss, masked_loss, noise_keys, smoothed_cross_entropy
+from hma_jax.objective.masking import mask_batch
+from tests.tiny import DIFFUSION, TABLE, lively_params, random_batch, shallow_config
+
+WHOLLY = MaskingConfig(teacher_forcing=True, min_ratio=1.0, max_corrupt_rate=0.0, non_mlm_ratio=0.0)
+
+
+def make(**changes) -> tuple[HMA, dict[str, jax.Array]]:
+    config = shallow_config(action_heads=False, **changes)
+    declared, params = lively_params(config)
+    return declared.merge(params), jax.tree.map(jnp.asarray, random_batch(0, config, 3))
+
+
+@pytest.mark.parametrize("alignment", ["causal", "released"])
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION])
+def test_of_wholly_masked_frames_it_is_the_loss_of_what_generation_is_asked_first(diffusion, alignment):
+    model, batch = make(diffusion=diffusion, action_alignment=alignment)
+    tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
+    key = jax.random.key(0)
+    masked = mask_batch(key, tokens, batch["embodiment"], model.config, WHOLLY, TABLE)
+    keys = noise_keys(key, 3)
+    found = masked_loss(model, masked, tokens, *rest, WHOLLY, keys)
+    asked = next_frame_outputs(model, tokens, *rest)
+    if diffusion:
+        wanted = frame_diffusion_loss(model, asked, tokens[:, 1:], keys)
+    else:
+        labels = factorise(tokens[:, 1:], model.config.factors, model.config.factor_vocab)
+        wanted, _ = smoothed_cross_entropy(asked, labels, WHOLLY.label_smoothing)
+    assert masked.targets_TS[:, 1:].all()
+    np.testing.assert_allclose(found.tokens, wanted.sum(), rtol=1e-5)
+
+
+def test_a_frame_is_told_the_frames_before_it_and_not_their_masks():
+    model, batch = make()
+    tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
+    some = jax.random.bernoulli(jax.random.key(1), 0.5, tokens[:, 1:].shape)
+
+    def said(before: jax.Array, masked: jax.Array) -> np.ndarray:
+        return np.asarray(look_beside(model, before, tokens[:, 1:], masked, *rest).said)
+
+    shown = said(tokens[:, :-1], some)
+    other_masks = said(tokens[:, :-1], some.at[:, 0].set(~some[:, 0]))
+    np.testing.assert_array_equal(other_masks[:, 1:], shown[:, 1:])
+    assert (other_masks[:, 0] != shown[:, 0]).any()
+    other_past = said(tokens[:, :-1].at[:, 1].set(0), some)
+    np.testing.assert_array_equal(other_past[:, 0], shown[:, 0])
+    assert (other_past[:, 1:] != shown[:, 1:]).any(axis=(0, 2, 3, 4)).all()
+
+
+@pytest.mark.parametrize("setting", ["full", "policy", "inverse"])
+def test_settings_that_predict_actions_are_refused(setting):
+    with pytest.raises(ConfigError, match=f"teacher_forcing is of settings .* '{setting}' predicts actions"):
+        MaskingConfig(setting=setting, teacher_forcing=True)
