@@ -167,17 +167,19 @@ PLAY = replace(
     name="play",  # the model of `make play`: eight robots to drive, 64 pixels, two cores, hours
     suite=SuiteConfig(scale=3.0),
     datasets=(
-        "pusher_sand", "rover_road", "arm_chalk", "gripper_wood", "picker_slate", "pusher_slate", "rover_clay", "arm_sand",
+        "pusher_sand", "rover_road", "arm_chalk", "gripper_wood", "picker_slate", "omni_chalk", "arm_sand", "gripper_night",
     ),
     # As many tokens per frame as at 32 pixels, of 24 bits each.
     tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=24, factors=6, channels=128),
-    tokenizer_train=TokenizerTrainConfig(steps=2500, batch=32),
+    tokenizer_train=TokenizerTrainConfig(steps=3000, batch=32),
+    rate=None,  # 4 to 6 Hz: half as far from frame to frame as at 2 Hz
     model=replace(CPU.model, width=64, layers=3, heads=4, factors=6, mup=MupConfig(base_width=48)),
     # A constant rate with an average of the weights: a run may be stopped, and prolonged, at any step.
     train=replace(
         CPU.train,
         steps=12_000,
         ema_decay=0.999,
+        masking=replace(CPU.train.masking, teacher_forcing=True),
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=100, schedule="constant"),
     ),
     dataset_counts=(8,),

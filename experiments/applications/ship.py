@@ -1,13 +1,13 @@
 """The model of `make play`, small enough for the repository, and what it is worth.
 
 Command: hma train --preset play --out runs/play
-         python -m experiments.applications.ship runs/play/model [--out experiments/results/simulator]
+         python -m experiments.applications.ship runs/play/model --unmask-steps 8 --temperature 0.7
 Cost: the first hours of two cores, resumed where it was stopped; the second minutes.
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
           actions of other episodes.
 
 Writes weights (their average, where the run keeps one), tokenizer, the robots' commands, starts of held-out episodes,
-and report.json: PSNR against the true simulator by frame, of the model, of a still picture and of shuffled actions,
+how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model, of a still picture and of shuffled actions,
 over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
 """
 
@@ -18,6 +18,7 @@ import json
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,10 +30,10 @@ from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_starts
 from experiments.applications.simulators import load_simulator, true_simulator
 from experiments.running.machine import describe_machine
-from hma_jax.config import require
+from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params
-from hma_jax.simulator.folder import ROBOTS, TOKENIZER, save_robots
+from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, USUAL, save_decode, save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import FILE as STARTS
@@ -47,7 +48,7 @@ LARGEST = 10 * 2**20
 """Bytes of everything that is shipped."""
 
 EPISODES = 8
-FRAMES = 14
+FRAMES = 24
 """Frames after the start that are compared."""
 
 FIRST = 3
@@ -59,7 +60,7 @@ class Shipped(NamedTuple):
     params: Params
 
 
-def ship(source: Path, out: Path) -> None:
+def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
     """Replaces `out`, whole or not at all. Raises ConfigError if it would be too large."""
     run = load_run(source, "auto")
     simulator = load_simulator(source)
@@ -73,6 +74,8 @@ def ship(source: Path, out: Path) -> None:
         save_tokenizer(simulator.tokenizer, aside / TOKENIZER)
         save_robots(tuple(simulator.robots.values()), aside / ROBOTS)
         save_starts(simulator.starts, aside / STARTS)
+        if decode is not None:
+            save_decode(decode, aside / DECODE)
         size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())
         require(size <= LARGEST, f"{size:,} bytes are more than the {LARGEST:,} that a repository should carry")
         publish(aside, out)
@@ -147,8 +150,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--unmask-steps", type=int, default=USUAL.unmask_steps, help="looks at a frame")
+    parser.add_argument("--temperature", type=float, default=USUAL.temperature, help="of drawing tokens")
     arguments = parser.parse_args()
-    ship(arguments.run, arguments.out)
+    decode = replace(USUAL, unmask_steps=arguments.unmask_steps, temperature=arguments.temperature)
+    ship(arguments.run, arguments.out, decode)
     report = measure(arguments.out)
     write_file(arguments.out / REPORT, json.dumps(report, indent=1) + "\n")
     for name, by in report["robots"].items():

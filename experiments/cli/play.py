@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,7 +11,7 @@ from tyro.conf import Positional, arg
 
 from experiments.progress import console
 from experiments.setting import UNSET
-from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, require
+from hma_jax.config import ConfigError, ExecutionConfig, require
 
 if TYPE_CHECKING:
     from data_pipelines.suite.simulator import SuiteSimulator
@@ -26,8 +27,8 @@ def play(
     port: int = 8765,
     visitors: int = 4,
     window: Literal["exact", "streaming"] = "exact",
-    unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2,
-    temperature: float = 0.0,
+    unmask_steps: Annotated[int | None, arg(name="unmask-steps", metavar="M"), UNSET] = None,
+    temperature: Annotated[float | None, UNSET] = None,
     tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
 ) -> None:
     """Serve a page on which a trained model is driven with keys, gamepad or sliders.
@@ -40,8 +41,9 @@ def play(
         port: Of the address; 0 takes a free one.
         visitors: Who can drive at once, in one batch.
         window: Past the model's window of frames, exact computes it again for each, streaming is faster and near.
-        unmask_steps: Looks at a frame until it is finished; more are slower.
-        temperature: Of drawing tokens; 0 takes the likeliest.
+        unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says, or 2; more are
+            slower.
+        temperature: Of drawing tokens, instead of what RUN/decode.json says, or 0, which takes the likeliest.
         tokenizer: That the model was trained with, if it is not beside the run.
     """
     try:
@@ -51,7 +53,7 @@ def play(
             raise
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
     from experiments.applications.simulators import has_truth, load_simulator, true_simulator
-    from hma_jax.simulator.simulator import SAMPLER
+    from hma_jax.simulator.folder import find_decode
     from hma_jax.simulator.warm_up import warm_up
 
     require(
@@ -61,7 +63,8 @@ def play(
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
-    decode = DecodeConfig(unmask_steps, temperature, sampler=SAMPLER, slide=window)
+    asked = {"unmask_steps": unmask_steps, "temperature": temperature}
+    decode = replace(find_decode(run), slide=window, **{name: x for name, x in asked.items() if x is not None})
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )

@@ -4,6 +4,7 @@
     RUN/tokenizer     or RUN/../tokenizer, where a study has it
     RUN/robots.json   optional: ranges and names of the robots' commands, as recorded
     RUN/starts.npz    optional: beginnings of recorded episodes
+    RUN/decode.json   optional: how its frames are best filled
 """
 
 from __future__ import annotations
@@ -12,8 +13,9 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from hma_jax.config import ConfigError, require
+from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.simulator.robots import Robot
@@ -25,6 +27,11 @@ from hma_jax.training.runs import Run
 
 ROBOTS = "robots.json"
 TOKENIZER = "tokenizer"
+DECODE = "decode.json"
+
+USUAL = DecodeConfig(sampler=SamplerConfig("dpm++", 12))
+"""How frames are filled where decode.json does not say it. Latents with fewer evaluations of the denoiser than frames
+are judged with."""
 
 
 def find_tokenizer(directory: Path, run: Run, given: Path | None) -> BaseTokenizer:
@@ -56,22 +63,40 @@ def find_starts(directory: Path) -> tuple[Start, ...]:
     return load_starts(path) if path.exists() else ()
 
 
+def find_decode(directory: Path) -> DecodeConfig:
+    """Of decode.json, otherwise the usual one. Raises ConfigError for a file that is damaged."""
+    path = directory / DECODE
+    return from_dict(DecodeConfig, _read(path), str(path)) if path.exists() else USUAL
+
+
 def load_robots(path: Path) -> tuple[Robot, ...]:
     """None where there is no such file. Raises ConfigError for one that is damaged."""
     if not path.exists():
         return ()
-    try:
-        rows = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read ({error}); make it again") from error
+    rows = _read(path)
     require(isinstance(rows, list), f"{path} is no list of robots; make it again")
     return tuple(from_dict(Robot, row, f"{path}: robot {i}") for i, row in enumerate(rows))
 
 
 def save_robots(robots: Sequence[Robot], path: Path) -> None:
+    _write(path, [to_dict(robot) for robot in robots])
+
+
+def save_decode(decode: DecodeConfig, path: Path) -> None:
+    _write(path, to_dict(decode))
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); make it again") from error
+
+
+def _write(path: Path, content: Any) -> None:
     aside = path.with_name(f".{path.name}.tmp")
     with open(aside, "w") as file:
-        file.write(json.dumps([to_dict(robot) for robot in robots], indent=1) + "\n")
+        file.write(json.dumps(content, indent=1) + "\n")
         file.flush()
         os.fsync(file.fileno())
     os.replace(aside, path)

@@ -13,10 +13,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, SamplerConfig, Weights, require
+from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, require
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, begin_episode
-from hma_jax.simulator.folder import find_robots, find_starts, find_tokenizer
+from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
 from hma_jax.simulator.programs import Beginning, Programs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -28,9 +28,6 @@ Rate = Literal["model", "native"]
 
 HISTORY = 600
 """Frames that an episode can be taken back by, unless told otherwise."""
-
-SAMPLER = SamplerConfig("dpm++", 12)
-"""Of latents, unless told otherwise: fewer evaluations of the denoiser than frames are judged with."""
 
 log = logging.getLogger(__name__)
 
@@ -73,13 +70,12 @@ class Simulator:
         taken = config.tokens, config.diffusion.token_channels if config.diffusion else 0
         made = tokenizer.tokens, tokenizer.channels
         require(taken == made, f"the model takes (tokens, channels) {taken} per frame, the tokenizer makes {made}")
-        decode = decode or DecodeConfig(sampler=SAMPLER)
-        self.model, self.tokenizer, self.decode = model, tokenizer, decode
+        self.model, self.tokenizer, self.decode = model, tokenizer, decode or USUAL
         self.robots: Mapping[str, Robot] = {e.name: Robot.of(e) for e in model.table.entries if e.action_dim}
         self.describe(robots)
         self.starts, self.outside, self.rate = tuple(starts), outside, rate
         self.room, self.history = config.frames - 1, history
-        self._programs = Programs(model, tokenizer, episodes, decode)
+        self._programs = Programs(model, tokenizer, episodes, self.decode)
         self._state = self._programs.empty()
         self._images = np.zeros((episodes, *tokenizer.image_shape, 3), np.uint8)
         self._episodes: list[Episode | None] = [None] * episodes
@@ -102,7 +98,7 @@ class Simulator:
         """
         run = Path(run)
         model = load_model(run, execution, weights)
-        found = {"robots": find_robots(run, model.table), "starts": find_starts(run)}
+        found = {"robots": find_robots(run, model.table), "starts": find_starts(run), "decode": find_decode(run)}
         return cls(model, find_tokenizer(run, model.run, tokenizer and Path(tokenizer)), **(found | options))
 
     # --- What there is -----------------------------------------------------------------------------

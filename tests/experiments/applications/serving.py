@@ -7,7 +7,7 @@ import json
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from aiohttp import ClientWebSocketResponse, WSMsgType
+from aiohttp import ClientWebSocketResponse, TCPConnector, WSMsgType
 from aiohttp.test_utils import TestClient, TestServer
 
 from experiments.applications.play.server import make_app
@@ -31,7 +31,7 @@ def serving(test: Callable[[TestClient], Awaitable[None]], *, visitors: int = 2,
     sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
 
     async def main() -> None:
-        async with TestClient(TestServer(make_app(sim, truth))) as client:
+        async with TestClient(TestServer(make_app(sim, truth)), connector=TCPConnector(limit=0)) as client:
             await asyncio.wait_for(test(client), 4 * SECONDS)
 
     asyncio.run(main())

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import io
 import json
+import resource
 import zipfile
 
 import numpy as np
@@ -158,8 +159,12 @@ def test_a_huge_message_ends_its_connection_and_nothing_else():
     serving(test)
 
 
-def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch):
+@pytest.mark.parametrize("many", [150, pytest.param(1000, marks=pytest.mark.slow)])
+def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch, many):
     monkeypatch.setattr(server, "WAITING", 3)
+    files, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if files < 2 * many + 200:  # both ends of every connection are in this process
+        resource.setrlimit(resource.RLIMIT_NOFILE, (2 * many + 200, most))
 
     async def test(client):
         player = Player(client)
@@ -172,7 +177,7 @@ def test_many_connections_are_refused_and_the_visitor_plays_on(monkeypatch):
                 return getattr(refusal, "status", type(refusal).__name__)
             return (await hear(socket))["type"]
 
-        knocks = asyncio.gather(*(knock() for _ in range(150)))
+        knocks = asyncio.gather(*(knock() for _ in range(many)))
         pictures = await player.drive(0.5, 5)
         answers = await knocks
         assert len(pictures) == 5 and answers.count("hello") == 1

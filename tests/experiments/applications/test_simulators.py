@@ -9,7 +9,7 @@ from experiments.applications import ship as ship_module
 from experiments.applications.ship import ship
 from experiments.applications.simulators import load_simulator, make_simulator
 from hma_jax import Simulator
-from hma_jax.config import ConfigError, TrainConfig
+from hma_jax.config import ConfigError, DecodeConfig, TrainConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
@@ -57,11 +57,12 @@ def test_true_and_learned_are_exchanged_by_one_word(run):
 
 
 def test_what_is_shipped_stands_alone_and_does_the_same(run, tmp_path):
-    out = tmp_path / "simulator"
-    ship(run, out)
+    out, decode = tmp_path / "simulator", DecodeConfig(3, temperature=0.5)
+    ship(run, out, decode)
     (tmp_path / "elsewhere").mkdir()
     moved = out.rename(tmp_path / "elsewhere" / "model")  # nothing of the study is near
-    shipped, known = Simulator.load(moved), load_simulator(run)
+    shipped, known = Simulator.load(moved), load_simulator(run, decode=decode)
+    assert shipped.decode == decode
     assert dict(shipped.robots) == dict(known.robots)
     assert len(shipped.starts) == len(known.starts)
     action = np.array([1.0, -1.0])
