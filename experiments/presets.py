@@ -174,13 +174,12 @@ PLAY = replace(
     tokenizer_train=TokenizerTrainConfig(steps=3000, batch=32),
     rate=None,  # 4 to 6 Hz: half as far from frame to frame as at 2 Hz
     model=replace(CPU.model, width=64, layers=3, heads=4, factors=6, mup=MupConfig(base_width=48)),
-    # A constant rate with an average of the weights: a run may be stopped, and prolonged, at any step.
     train=replace(
         CPU.train,
-        steps=12_000,
+        steps=23_000,
         ema_decay=0.999,
         masking=replace(CPU.train.masking, teacher_forcing=True),
-        optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=100, schedule="constant"),
+        optimizer=replace(CPU.train.optimizer, warmup_steps=100, decay_fraction=0.25),
     ),
     dataset_counts=(8,),
     widths=(64,),

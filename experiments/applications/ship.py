@@ -8,22 +8,24 @@ Expected: frames under held-out actions are nearer to the truth than the last fr
 
 Writes weights (their average, where the run keeps one), tokenizer, the robots' commands, starts of held-out episodes,
 how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model, of a still picture and of shuffled actions,
-over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
+over `EPISODES` held-out episodes of each robot; frames per second at batch 1. clip.gif shows the first of them.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from PIL import Image
 
 from data_pipelines.publishing.files import publish, write_file
 from data_pipelines.sources.rlds.images import fit_image
@@ -43,7 +45,7 @@ from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.runs import describe_run, load_run
 
 OUT = Path("experiments/results/simulator")
-REPORT = "report.json"
+REPORT, CLIP = "report.json", "clip.gif"
 LARGEST = 10 * 2**20
 """Bytes of everything that is shipped."""
 
@@ -52,6 +54,7 @@ FRAMES = 24
 """Frames after the start that are compared."""
 
 FIRST = 3
+ZOOM, COLOURS = 2, 128  # of the clip
 
 
 class Shipped(NamedTuple):
@@ -83,33 +86,56 @@ def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
         shutil.rmtree(aside, ignore_errors=True)
 
 
-def measure(run: Path) -> dict[str, Any]:
+class Seen(NamedTuple):
+    """Frames under held-out actions, uint8 [1 + FRAMES, EPISODES, H, W, 3]: the first ones, and one after each chunk."""
+
+    true: np.ndarray
+    model: np.ndarray
+    shuffled: np.ndarray  # of the model under the actions of the episode before
+
+
+def look(simulator: Simulator, robot: Robot) -> Seen:
+    starts, futures = held_out(robot, simulator.tokenizer.image_size)
+    others = np.roll(futures, 1, axis=0)
+    runs = (true_simulator(simulator, [robot], len(starts)), futures), (simulator, futures), (simulator, others)
+    return Seen(*(np.stack([image.copy() for image in rolled(by, starts, chunks)]) for by, chunks in runs))
+
+
+def report_on(run: Path, simulator: Simulator, seen: Mapping[str, Seen]) -> dict[str, Any]:
     """What report.json says."""
-    simulator = load_simulator(run, episodes=EPISODES)
-    robots = {name: compare(simulator, robot) for name, robot in simulator.robots.items()}
     return {
         "step": simulator.model.step,
         "parameters": simulator.model.declared.count(),
         "pixels": simulator.tokenizer.image_size,
         "episodes": EPISODES,
-        "robots": robots,
+        "frames": FRAMES,
+        "robots": {name: compare(one) for name, one in seen.items()},
         "frames_per_second": frames_per_second(run),
         "machine": describe_machine(jax.devices()),
     }
 
 
-def compare(simulator: Simulator, robot: Robot) -> dict[str, list[float]]:
+def compare(seen: Seen) -> dict[str, list[float]]:
     """Mean PSNR in dB by frame after the start, against the true simulator under the same held-out actions."""
-    starts, futures = held_out(robot, simulator.tokenizer.image_size)
-    true = np.stack(list(rolled(true_simulator(simulator, [robot], len(starts)), starts, futures)))
-    made = np.stack(list(rolled(simulator, starts, futures)))
-    others = np.stack(list(rolled(simulator, starts, np.roll(futures, 1, axis=0))))
-    still = np.broadcast_to(made[:1], made.shape)
 
     def against_truth(images: np.ndarray) -> list[float]:
-        return [round(float(np.mean(psnr(a, b))), 2) for a, b in zip(images[1:], true[1:], strict=True)]
+        return [round(float(np.mean(psnr(a, b))), 2) for a, b in zip(images[1:], seen.true[1:], strict=True)]
 
-    return {"model": against_truth(made), "still": against_truth(still), "shuffled": against_truth(others)}
+    still = np.broadcast_to(seen.true[:1], seen.true.shape)
+    kinds = {"model": seen.model, "still": still, "shuffled": seen.shuffled}
+    return {kind: against_truth(images) for kind, images in kinds.items()}
+
+
+def write_clip(seen: Mapping[str, Seen], path: Path, hz: float) -> None:
+    """A GIF of the first episode of every robot, a column each: the truth above, below it the model."""
+    columns = [np.concatenate([one.true[:, 0], one.model[:, 0]], axis=1) for one in seen.values()]
+    film = np.concatenate(columns, axis=2)
+    palette = Image.fromarray(np.concatenate(film)).quantize(COLOURS)
+    frames = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film]
+    larger = [frame.resize((ZOOM * frame.width, ZOOM * frame.height), Image.Resampling.NEAREST) for frame in frames]
+    content = io.BytesIO()
+    larger[0].save(content, "GIF", save_all=True, append_images=larger[1:], duration=round(1000 / hz), loop=0)
+    write_file(path, content.getvalue())
 
 
 def held_out(robot: Robot, size: int) -> tuple[list[Start], np.ndarray]:
@@ -155,8 +181,11 @@ def main() -> None:
     arguments = parser.parse_args()
     decode = replace(USUAL, unmask_steps=arguments.unmask_steps, temperature=arguments.temperature)
     ship(arguments.run, arguments.out, decode)
-    report = measure(arguments.out)
+    simulator = load_simulator(arguments.out, episodes=EPISODES)
+    seen = {name: look(simulator, robot) for name, robot in simulator.robots.items()}
+    report = report_on(arguments.out, simulator, seen)
     write_file(arguments.out / REPORT, json.dumps(report, indent=1) + "\n")
+    write_clip(seen, arguments.out / CLIP, hz=4.0)
     for name, by in report["robots"].items():
         means = ", ".join(f"{kind} {np.mean(values):.2f}" for kind, values in by.items())
         print(f"{name:16s} PSNR over {FRAMES} frames: {means} dB")

@@ -16,7 +16,7 @@ from hma_jax.generation import (
     start,
 )
 from hma_jax.generation.decoding import Frame, masked_counts, unmask
-from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch
+from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, shallow_config
 
 SAMPLER = SamplerConfig(steps=5)
 
@@ -293,7 +293,7 @@ def test_known_positions_are_never_drawn_again():
 
 def test_temperature_is_a_temperature():
     """Low temperatures approach the most likely token; the release's made no difference."""
-    config = model_config()
+    config = shallow_config()
     declared, params = lively_params(config)
     batch = random_batch(0, config, 8)
     actions = batch["actions"][:, None]

@@ -133,6 +133,7 @@ def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path
     assert [json.loads(line)["step"] for line in log.read_text().splitlines()] == [1, 2, 3, 4, 5, 6]
 
 
+@pytest.mark.slow  # on a mesh they are compared every time: tests/multidevice/test_sharding.py
 @pytest.mark.exact
 def test_micro_batches_change_nothing_but_rounding(tmp_path: Path):
     whole = train(tmp_path / "whole")

@@ -126,7 +126,7 @@ def test_branches_of_a_run_share_their_seed(rng):
     assert np.ptp(draws[:, short]) > 0.1 and np.std(ratio) < 0.02
 
 
-@pytest.mark.parametrize("terms", [1, 2])
+@pytest.mark.parametrize("terms", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_minima_are_those_of_a_general_optimiser(rng, terms):
     """L-BFGS from the five best points of the same grid, on the same objective."""
     if terms == 1:
