@@ -16,6 +16,7 @@ from rich.table import Table
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.runner import Job, Monitor
+from hma_jax.runtime.exits import raise_lost_request
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)
@@ -52,6 +53,7 @@ def step(title: str) -> Iterator[Update]:
 
         def update(done: int, total: int, note: str = "") -> None:
             nonlocal said
+            raise_lost_request()
             bars.update(task, completed=done, total=total, note=note)
             if not console.is_terminal and time.monotonic() - said >= SAY_EVERY:
                 said = time.monotonic()

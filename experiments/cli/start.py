@@ -3,12 +3,18 @@
 import faulthandler
 import sys
 
+from hma_jax.runtime.exits import exit_of_interrupt, terminated_like_interrupted
 from hma_jax.runtime.host_memory import restart_keeping_pages
 
 
 def start() -> None:
     faulthandler.enable()  # what each thread did, when a library ends the process by a signal
     restart_keeping_pages()
-    from experiments.cli.main import main
+    try:
+        with terminated_like_interrupted():
+            from experiments.cli.main import main
 
-    sys.exit(main())
+            code = main()
+    except KeyboardInterrupt as request:
+        code = exit_of_interrupt(request)
+    sys.exit(code)

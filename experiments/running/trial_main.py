@@ -17,7 +17,7 @@ from pathlib import Path
 
 from experiments.running.attempts import FAILURE, JOB, PROGRESS, RESULT, RUN, attempt
 from experiments.running.children import enter_child
-from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
 
 LOOK_EVERY = 30.0
 """Seconds between two checks that the trial is still ours."""
@@ -111,6 +111,7 @@ class _ProgressFile:
         self.looked = time.monotonic()
 
     def __call__(self, phase: str, done: int, total: int) -> None:
+        raise_lost_request()
         now = time.monotonic()
         if now - self.looked >= LOOK_EVERY:
             self.looked = now

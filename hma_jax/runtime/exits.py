@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
+from types import FrameType
+
+
+IMPORTER = "<frozen importlib._bootstrap>"
+
+LOOK_EVERY = 0.05
+"""Seconds between two looks whether an import has ended that a request to stop waits for."""
 
 
 class Exit(IntEnum):
@@ -25,21 +33,63 @@ class Terminated(KeyboardInterrupt):
     """SIGTERM, as schedulers send it: a program ends as it does on Ctrl-C."""
 
 
+_raised: list[Exit] = []
+"""Requests whose exceptions were raised in a block that has not ended."""
+
+
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM raises Terminated in the main thread while the block runs; by default the process would just be gone."""
+    """SIGTERM raises Terminated in the main thread while the block runs; by default the process would just be gone.
 
-    def stop(number: int, frame: object) -> None:
-        raise Terminated
+    It waits for imports to end, and so does Ctrl-C: an exception in the middle of one is lost where a library tries
+    what it can import, leaves half a module, or ends the process by a signal in a library's C code.
+    """
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        if _imports(frame):
+            again = threading.Timer(LOOK_EVERY, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return
+        _raised.append(Exit(128 + number))
+        raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may install handlers
         return
-    before = signal.signal(signal.SIGTERM, stop)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # otherwise it is ignored, or handled already
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, stop)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        _raised.clear()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def lost_request() -> Exit | None:
+    """A request to stop whose exception has come to nothing, as it does in a callback of a library; told once.
+
+    For what takes long to ask now and then, before it ends a block of `terminated_like_interrupted` itself.
+    """
+    request = _raised[-1] if _raised else None
+    _raised.clear()
+    return request
+
+
+def raise_lost_request() -> None:
+    """In the main thread; others have no requests."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    if (request := lost_request()) is not None:
+        raise KeyboardInterrupt if request == Exit.INTERRUPTED else Terminated
+
+
+def _imports(frame: FrameType | None) -> bool:
+    while frame is not None and frame.f_code.co_filename != IMPORTER:
+        frame = frame.f_back
+    return frame is not None
 
 
 def exit_of_interrupt(request: KeyboardInterrupt) -> Exit:

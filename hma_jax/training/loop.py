@@ -28,7 +28,7 @@ from typing import Any
 
 import jax
 
-from hma_jax.runtime.exits import Exit
+from hma_jax.runtime.exits import Exit, lost_request
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer, meet
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
@@ -265,6 +265,9 @@ def _stop_requests() -> Iterator[_Stop]:
 
     for number in previous:
         signal.signal(number, request)
+    if (lost := lost_request()) is not None:  # of the time before, when it should have raised an exception
+        event.exit = lost
+        event.set()
     try:
         yield event
     finally:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
 
-from hma_jax.runtime.exits import Exit, Terminated, exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, Terminated, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
 
@@ -27,3 +29,32 @@ def test_sigterm_ends_a_block_as_ctrl_c_does_with_a_code_of_its_own():
     assert stopped.type is Terminated and exit_of_interrupt(stopped.value) == Exit.STOPPED == 143
     assert exit_of_interrupt(KeyboardInterrupt()) == Exit.INTERRUPTED == 130
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
+def test_a_request_to_stop_waits_for_the_import_that_it_meets(number, code, tmp_path, monkeypatch):
+    """A library that tries what it can import would take the exception for a failure, and the request would be lost."""
+    name = f"asked_by_{number.name.lower()}"
+    (tmp_path / f"{name}.py").write_text(f"import os\nos.kill(os.getpid(), {int(number)})\nwhole = sum(range(10**5))\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+        try:
+            module = __import__(name)
+        except BaseException as error:
+            raise AssertionError("the import was interrupted") from error
+        time.sleep(60)
+    assert module.whole and exit_of_interrupt(stopped.value) == code
+    assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
+def test_a_request_that_came_to_nothing_is_raised_again_once(number, code):
+    """In a callback of a library, a finaliser say, exceptions are lost."""
+    raise_lost_request()
+    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+        with contextlib.suppress(KeyboardInterrupt):
+            os.kill(os.getpid(), number)
+        raise_lost_request()
+    assert exit_of_interrupt(stopped.value) == code
+    raise_lost_request()

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import multiprocessing
 import os
+import signal
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hma_jax.runtime.exits import Exit, terminated_like_interrupted
 from hma_jax.training.claim import RunBusy, locked_run
 from hma_jax.training.divergence import DivergedError
-from hma_jax.training.loop import LoopOptions, Watch
+from hma_jax.training.loop import Interrupted, LoopOptions, Watch
 from hma_jax.training.reading import list_steps
 from tests.toy import fit_toy, toy_batches, toy_step
 
@@ -231,3 +234,15 @@ def test_states_of_a_run_and_a_resumed_run_are_equal_bit_for_bit(tmp_path: Path)
     for name in ("params", "opt_state"):
         a, b = (getattr(r.state, name) for r in (whole, resumed))
         assert all(np.asarray(a[k]).tobytes() == np.asarray(b[k]).tobytes() for k in a)
+
+
+# --- Being asked to stop ---------------------------------------------------------------------
+
+
+def test_a_request_that_was_lost_before_training_stops_it_after_a_step(tmp_path: Path):
+    with terminated_like_interrupted():
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(Interrupted) as stopped:
+            fit_toy(tmp_path, steps=1000)
+    assert stopped.value.exit == Exit.STOPPED and list_steps(tmp_path / "checkpoints") == [1]
