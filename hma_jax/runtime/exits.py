@@ -10,7 +10,6 @@ from contextlib import contextmanager
 from enum import IntEnum
 from types import FrameType
 
-
 IMPORTER = "<frozen importlib._bootstrap>"
 
 LOOK_EVERY = 0.05

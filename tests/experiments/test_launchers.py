@@ -205,6 +205,25 @@ def start_attempt(root: Path, kind: type[Attempt] = Attempt) -> tuple[Attempt, t
     return attempt, thread, codes
 
 
+def test_a_trial_on_ray_stops_though_ray_forgets_to_say_so(tmp_path):
+    """As it does of a task that has just begun. What asked an earlier attempt does not stop the next one."""
+    attempt, thread, _ = start_attempt(tmp_path)
+    engine = FakeRay()
+    engine.cancel = lambda *_, **__: None
+    place = RayLauncher(tmp_path, None, engine=engine, command=fake_trial.command)
+    place.ask_to_stop([ray.Task(attempt.directory, None)])
+    thread.join(20)
+    assert not thread.is_alive() and not (attempt.directory / "trial.lock").exists()
+    before = int((attempt.directory / "run/count.txt").read_text())
+    [task] = place.launch([attempt.directory])
+    deadline = time.monotonic() + 30
+    while int((attempt.directory / "run/count.txt").read_text() or 0) < before + 10:
+        assert time.monotonic() < deadline and place.ended(task) is None
+        time.sleep(0.01)
+    place.ask_to_stop([task])
+    assert task.reference.result(timeout=20) == 130
+
+
 def test_an_announced_end_of_a_job_saves_and_hands_back_the_same_attempt(tmp_path):
     """What submitit calls on SIGUSR2, before it puts the job back into the queue."""
     pytest.importorskip("submitit")

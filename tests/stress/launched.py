@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.running.attempts import OUTPUT, read_progress
+from experiments.running.attempts import OUTPUT, PROGRESS, read_progress
 from experiments.running.workspace import Workspace
 
 SWEEP = ("sweep", "trajectories", "--preset", "smoke", "--set", "trajectory_counts=2,4")
@@ -75,12 +75,19 @@ class Sweep:
         """The last start of a trial, none of `but`, that is in the middle of its training."""
         last = {record["trial"]: record for record in self.records()}
         for id, record in last.items():
+            if not self._has_shown(self.out.trials / id / PROGRESS, record["time"]):
+                continue
             progress = read_progress(self.out.trials / id) or {}
             share = progress.get("done", 0) / max(progress.get("total", 1), 1)
             if id not in but and record["event"] == "running" and progress.get("phase", "").startswith("training"):
                 if 0.1 < share < 0.7:
                     return record
         return None
+
+    @staticmethod
+    def _has_shown(progress: Path, since: float) -> bool:
+        """Whether an attempt that began `since` then has written its progress; an earlier one's lies there too."""
+        return progress.exists() and progress.stat().st_mtime > since
 
     def wait_for(self, what: str, condition: Callable[[], Any]) -> Any:
         """What `condition` returns once it is true. Ends the program, with the logs, if that takes too long."""

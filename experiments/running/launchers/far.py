@@ -18,7 +18,10 @@ from experiments.running.children import child_environment
 from experiments.running.launchers.base import GRACE_SECONDS, Command
 
 LOOK_EVERY = 0.1
-"""Seconds between two checks whether the child has ended."""
+"""Seconds between two checks whether the child has ended, or is to."""
+
+STOP = "stop"
+"""A file in the trial's directory that asks its attempt to stop, for engines whose own way does not always arrive."""
 
 
 class Attempt:
@@ -28,9 +31,10 @@ class Attempt:
         self.directory, self.cache, self.command = directory, cache, command
         self._child: subprocess.Popen | None = None
         self._code: int | None = None
+        self._asked = False
 
     def __getstate__(self) -> dict[str, object]:
-        return vars(self) | {"_child": None, "_code": None}
+        return vars(self) | {"_child": None, "_code": None, "_asked": False}
 
     def run(self) -> int:
         """Makes the attempt and returns its exit code, as of `subprocess`."""
@@ -49,8 +53,9 @@ class Attempt:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, lambda *_: self._ask())
         try:
-            while self._code is None:
+            while self._code is None and not (self.directory / STOP).exists():
                 time.sleep(LOOK_EVERY)
+            self.end()
             return self._code
         finally:  # the engine interrupts the call
             self.end()
@@ -59,7 +64,9 @@ class Attempt:
         self._code = self._child.wait()
 
     def _ask(self) -> None:
-        self._child.send_signal(signal.SIGINT)
+        if not self._asked:  # the engine may say it by a signal, by interrupting the call and by the file
+            self._asked = True
+            self._child.send_signal(signal.SIGINT)
 
     def end(self) -> None:
         """Asks the child to save and waits until it has ended; kills it after the grace period."""
@@ -71,3 +78,5 @@ class Attempt:
             time.sleep(LOOK_EVERY)
         if self._code is None:
             self._child.kill()
+        while self._code is None:
+            time.sleep(LOOK_EVERY)

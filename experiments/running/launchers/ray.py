@@ -17,7 +17,7 @@ from typing import Any
 
 from experiments.running.attempts import Ended, is_alive
 from experiments.running.launchers.base import Command, Launcher, trial_command
-from experiments.running.launchers.far import Attempt
+from experiments.running.launchers.far import STOP, Attempt
 from hma_jax.config import ConfigError
 
 
@@ -60,6 +60,8 @@ class RayLauncher(Launcher):
 
     def launch(self, directories: Sequence[Path]) -> list[Task]:
         cache = self._root / "compiled"
+        for directory in directories:
+            (directory / STOP).unlink(missing_ok=True)
         return [Task(d, self._run.remote(Attempt(d, cache, self._command))) for d in directories]
 
     def ended(self, handle: Task) -> Ended | None:
@@ -74,8 +76,9 @@ class RayLauncher(Launcher):
             return Ended(None, f"Ray says: {str(error).strip().splitlines()[0]}")
 
     def ask_to_stop(self, handles: Sequence[Task]) -> None:
-        for handle in handles:  # raises KeyboardInterrupt in the task, which asks its child
-            self._ray.cancel(handle.reference, force=False)
+        for handle in handles:
+            (handle.directory / STOP).touch()  # what Ray does about a task that has just begun comes to nothing
+            self._ray.cancel(handle.reference, force=False)  # raises KeyboardInterrupt in the task, which asks its child
 
     def kill(self, handles: Sequence[Task]) -> None:
         for handle in handles:
