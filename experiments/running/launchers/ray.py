@@ -78,7 +78,7 @@ class RayLauncher(Launcher):
     def ask_to_stop(self, handles: Sequence[Task]) -> None:
         for handle in handles:
             (handle.directory / STOP).touch()  # what Ray does about a task that has just begun comes to nothing
-            self._ray.cancel(handle.reference, force=False)  # raises KeyboardInterrupt in the task, which asks its child
+            self._ray.cancel(handle.reference, force=False)  # raises KeyboardInterrupt in the task, which asks too
 
     def kill(self, handles: Sequence[Task]) -> None:
         for handle in handles:
