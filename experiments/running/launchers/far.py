@@ -29,6 +29,7 @@ class Attempt:
 
     def __init__(self, directory: Path, cache: Path, command: Command):
         self.directory, self.cache, self.command = directory, cache, command
+        (directory / STOP).unlink(missing_ok=True)  # it asked an earlier attempt
         self._child: subprocess.Popen | None = None
         self._code: int | None = None
         self._asked = False

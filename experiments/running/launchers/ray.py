@@ -60,8 +60,6 @@ class RayLauncher(Launcher):
 
     def launch(self, directories: Sequence[Path]) -> list[Task]:
         cache = self._root / "compiled"
-        for directory in directories:
-            (directory / STOP).unlink(missing_ok=True)
         return [Task(d, self._run.remote(Attempt(d, cache, self._command))) for d in directories]
 
     def ended(self, handle: Task) -> Ended | None:
