@@ -19,6 +19,7 @@ from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, make_ablation
 from hma_jax.config import Setting, require
+from hma_jax.config.training import PREDICT_ACTIONS
 
 NAMES: dict[Setting, str] = {"passive": "passive", "full": "full dynamics", "forward": "forward dynamics"}
 
@@ -31,18 +32,19 @@ def under(setting: Setting, trial: Trial) -> Trial:
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories in every setting."""
+    """All datasets and trajectories in every setting; with teacher forcing in those that predict frames alone."""
     default = study.train.masking.setting
     require(
         default in NAMES,
         f"train.masking.setting is {default!r}, which predicts no frames to judge; use one of "
         f"{', '.join(NAMES)}",
     )
+    refused = PREDICT_ACTIONS if study.train.masking.teacher_forcing else ()
     return make_ablation(
         study,
         name="settings",
         axis="setting",
-        variants={name: partial(under, setting) for setting, name in NAMES.items()},
+        variants={name: partial(under, setting) for setting, name in NAMES.items() if setting not in refused},
         default=NAMES[default],
         question="Does it help a video model to be told the actions, or to predict them too? Passive "
         "prediction sees no actions, so that its ΔPSNR is zero by construction.",

@@ -10,6 +10,8 @@ from hma_jax.config.base import require
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
 
+PREDICT_ACTIONS: tuple[Setting, ...] = ("full", "policy", "inverse")
+
 ActionLeak = Literal["none", "conditioning", "all"]
 """Where the model is shown actions that are hidden (`MaskingConfig.action_leak`)."""
 
@@ -68,7 +70,7 @@ class MaskingConfig:
 
     @property
     def predicts_actions(self) -> bool:
-        return self.setting in ("full", "policy", "inverse")
+        return self.setting in PREDICT_ACTIONS
 
 
 # --- Training --------------------------------------------------------------------------------

@@ -73,7 +73,8 @@ def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(stu
     settings, conditioning = settings_axis.plan(study), conditioning_axis.plan(study)
     assert {p.trial.train.seed for p in settings.points} == set(study.ablation_seeds)
     seeds = len(study.ablation_seeds)
-    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (3 + 6 - 1) * seeds + 1
+    kinds = 2 if study.train.masking.teacher_forcing else 3  # the full dynamics predict actions too
+    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (kinds + 6 - 1) * seeds + 1
     width = unique_trials([width_axis.plan(study)], PROVENANCE)
     shared = [p for p in settings.points if p.x == settings.reference_x and p.trial.train.seed in study.seeds]
     assert {p.role for p in shared} == {POINT, CONTROL}
