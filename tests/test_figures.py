@@ -89,6 +89,18 @@ def test_committed_tables_are_read(path):
     assert rows and all(row.status == "finished" for row in rows)
 
 
+def test_the_shipped_model_is_as_good_as_readme_says():
+    report = json.loads((ROOT / "experiments" / "results" / "simulator" / "report.json").read_text())
+    model, still, shuffled = (
+        sum(sum(robot[kind]) / len(robot[kind]) for robot in report["robots"].values()) / len(report["robots"])
+        for kind in ("model", "still", "shuffled")
+    )
+    assert (
+        f"{model:.1f} dB over {report['frames']} frames of held-out episodes, a still picture {still:.1f}, other actions "
+        f"{shuffled:.1f}; {report['frames_per_second']:.0f} frames a second"
+    ) in " ".join(README.read_text().split())
+
+
 def test_readme_is_read_in_a_few_minutes():
     words = README.read_text().replace("|", " ").split()
     assert len(words) <= 900

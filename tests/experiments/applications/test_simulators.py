@@ -1,6 +1,7 @@
 """Learned and true simulators of a run's robots, and the model that is shipped."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hma_jax.config import ConfigError, DecodeConfig, TrainConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.simulator.folder import USUAL, find_decode
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.training.runs import Run
 from tests.hma_jax.simulator.small import CONFIG, parts
@@ -92,3 +94,11 @@ def test_another_tokenizer_or_damaged_robots_are_refused(run, tmp_path):
     (out / "starts.npz").unlink()
     with pytest.raises(ConfigError, match="no tokenizer at"):
         Simulator.load(out, tmp_path / "nowhere")
+
+
+def test_the_model_of_this_repository_is_whole():
+    shipped = Path(ship_module.__file__).parents[2] / ship_module.OUT
+    simulator = Simulator.load(shipped)
+    assert len(simulator.robots) == 8 == len({start.robot for start in simulator.starts})
+    assert simulator.decode == find_decode(shipped) != USUAL
+    assert sum(path.stat().st_size for path in shipped.rglob("*") if path.is_file()) < ship_module.LARGEST
