@@ -2,13 +2,14 @@
 
 Command: hma train --preset play --out runs/play
          python -m experiments.applications.ship runs/play/model --unmask-steps 8 --temperature 0.7
-Cost: the first hours of two cores, resumed where it was stopped; the second minutes.
+Cost: the first under two hours of one core, resumed where it was stopped; the second three minutes.
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
           actions of other episodes.
 
 Writes weights (their average, where the run keeps one), tokenizer, the robots' commands, starts of held-out episodes,
-how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model, of a still picture and of shuffled actions,
-over `EPISODES` held-out episodes of each robot; frames per second at batch 1. clip.gif shows the first of them.
+how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model, of a still picture
+and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1. clip.gif shows
+the first of them.
 """
 
 from __future__ import annotations

@@ -26,8 +26,8 @@ def look_beside(
     remember: int = 0,
     slice_B: jax.Array | None = None,
 ) -> Outputs:
-    """What the model says of frames `ahead` [B, T - 1, S (, C)], which stand at positions 1 .. T-1 and of which it is not
-    shown what bool `masked` says; each follows the frames of `before`, of that shape too, from position 0 on.
+    """What the model says of frames `ahead` [B, T - 1, S (, C)] at positions 1 .. T-1, of which it is not shown what
+    bool `masked` says; each follows the frames of `before`, of that shape too, from position 0 on.
 
     Actions are the recorded chunks, of which those that `hidden_BT` says are not shown (`leak` as for the model);
     `remember` frames of `before` are cached.
