@@ -144,11 +144,10 @@ def node_of(job: str) -> str:
 def disturb(sweep: Sweep) -> None:
     first = sweep.wait_for("a trial to cancel", sweep.training)
     slurm("scancel", first["job"])
-    sweep.wait_for_start("it is submitted and starts again", first["trial"], 1)
-
     second = sweep.wait_for("a trial to requeue", lambda: sweep.training([first["trial"]]))
     slurm("scontrol", "requeue", second["job"])
-    sweep.wait_for_start("it starts again", second["trial"], 1)
+    sweep.wait_for_start("the one is submitted and starts again", first["trial"], 1)
+    sweep.wait_for_start("the other starts again", second["trial"], 1)
 
     sweep.wait_for("a trial in the middle when the command is killed", sweep.training)
     starts = sweep.starts()
