@@ -159,7 +159,7 @@ def disturb(sweep: Sweep) -> None:
     node = node_of(third["job"])
     slurm("scontrol", "update", f"nodename={node}", "state=drain", "reason=stress")
     time.sleep(5)
-    busy = slurm("squeue", "--noheader", f"--nodelist={node}", "--states=running", "--format=%A").split()
+    busy = slurm("squeue", "--noheader", f"--nodelist={node}", "--states=running", "--format=%i").split()
     if busy != [third["job"]]:
         sweep.fail(f"on the drained node {node} run {busy}, not only {third['job']}")
     slurm("scontrol", "update", f"nodename={node}", "state=down", "reason=stress")
