@@ -43,6 +43,7 @@ from hma_jax.simulator.starts import FILE as STARTS
 from hma_jax.simulator.starts import Start, save_starts
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.hashes import write_list
 from hma_jax.training.runs import describe_run, load_run
 
 OUT = Path("experiments/results/simulator")
@@ -75,6 +76,7 @@ def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
         described = describe_run(run.model, run.train, run.table, run.provenance)
         with Checkpoints(aside / "checkpoints", described) as checkpoints:
             checkpoints.save(run.step, Shipped(run.params))
+        forget_places(aside / "checkpoints" / str(run.step))
         save_tokenizer(simulator.tokenizer, aside / TOKENIZER)
         save_robots(tuple(simulator.robots.values()), aside / ROBOTS)
         save_starts(simulator.starts, aside / STARTS)
@@ -85,6 +87,13 @@ def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
         publish(aside, out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def forget_places(checkpoint: Path) -> None:
+    """Orbax marks what it finished by files that name the directory on this machine; the marks alone are shipped."""
+    for mark in checkpoint.rglob("commit_success.txt"):
+        write_file(mark, "finished\n")
+    write_list(checkpoint)
 
 
 class Seen(NamedTuple):
@@ -128,7 +137,8 @@ def compare(seen: Seen) -> dict[str, list[float]]:
 
 
 def write_clip(seen: Mapping[str, Seen], path: Path, hz: float) -> None:
-    """A GIF of the first episode of every robot, a column each: the truth above, below it the model."""
+    """A GIF of the first episode of every robot, `hz` frames per second, a column each: the truth above, below it the
+    model."""
     columns = [np.concatenate([one.true[:, 0], one.model[:, 0]], axis=1) for one in seen.values()]
     film = np.concatenate(columns, axis=2)
     palette = Image.fromarray(np.concatenate(film)).quantize(COLOURS)
@@ -186,7 +196,8 @@ def main() -> None:
     seen = {name: look(simulator, robot) for name, robot in simulator.robots.items()}
     report = report_on(arguments.out, simulator, seen)
     write_file(arguments.out / REPORT, json.dumps(report, indent=1) + "\n")
-    write_clip(seen, arguments.out / CLIP, hz=4.0)
+    slowest = min(robot.hz / robot.stride for robot in simulator.robots.values())
+    write_clip(seen, arguments.out / CLIP, slowest)
     for name, by in report["robots"].items():
         means = ", ".join(f"{kind} {np.mean(values):.2f}" for kind, values in by.items())
         print(f"{name:16s} PSNR over {FRAMES} frames: {means} dB")

@@ -44,7 +44,7 @@ class MaskingConfig:
     mask_unit: Literal["patch", "cell"] = "patch"
     # Masked frames are predicted from the true frames before them, as when frames are generated. DIFFERS: the release
     # masks all frames of a window in one pass, so that each is predicted from masked ones. A step passes over every
-    # frame twice and teaches more than two such steps (docs/performance.md).
+    # frame twice; docs/models.md shows when that pays.
     teacher_forcing: bool = False
     max_corrupt_rate: float = 0.2
     clean_rate_min: float = 0.2

@@ -72,6 +72,7 @@ def test_what_is_shipped_stands_alone_and_does_the_same(run, tmp_path):
         np.testing.assert_array_equal(shipped.reset(a), known.reset(b))
         np.testing.assert_array_equal(shipped.step([action]), known.step([action]))
     assert not any(path.name.startswith(".simulator") for path in tmp_path.iterdir())
+    assert not [path for path in moved.rglob("*") if path.is_file() and str(tmp_path).encode() in path.read_bytes()]
 
 
 def test_what_is_too_large_is_not_shipped(run, tmp_path, monkeypatch):
