@@ -89,14 +89,20 @@ CPU = Study(
 CPU_FULL = replace(
     CPU,
     name="cpu-full",  # the evidence: two cores, half a day; every point of three seeds, every axis with controls
+    suite=SuiteConfig(scale=8.0),  # from 8 to 4,000 trajectories
+    trajectory_counts=(4000,),
     unseen=tuple(e.name for e in NEW),
-    train=replace(CPU.train, steps=8000),
+    # Teacher forcing: with the released objective, perplexity of a true past stops falling (docs/models.md).
+    train=replace(CPU.train, steps=4000, masking=replace(CPU.train.masking, teacher_forcing=True)),
     eval=replace(CPU.eval, other_actions=15),  # retrieval among sixteen
     tau=1000.0,  # every robot weighs the same, whatever others there are and however much each has
     seeds=(0, 1, 2),
     widths=(20, 32, 48, 64, 80),  # over a decade of trunk parameters
-    transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(20, 48, 80), datasets=10, steps=1000),
-    designs=DesignConfig(long=(16_000, 32_000, 64_000), ablation_steps=4000, end_controls=True),
+    transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(20, 48, 80), datasets=10, steps=500),
+    designs=DesignConfig(
+        budgets=(500, 1000, 2000, 4000), long=(8000, 16_000, 32_000), compute=(250, 500, 1000, 2000),
+        ablation_steps=2000, end_controls=True,
+    ),
     axes=(
         "horizon", "dilution", "transfer", "newcomers", "episodes", "width", "compute", "lr", "lr_horizon", "fewshot",
         "settings", "conditioning",

@@ -73,12 +73,15 @@ def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(stu
     settings, conditioning = settings_axis.plan(study), conditioning_axis.plan(study)
     assert {p.trial.train.seed for p in settings.points} == set(study.ablation_seeds)
     seeds = len(study.ablation_seeds)
-    kinds = 2 if study.train.masking.teacher_forcing else 3  # the full dynamics predict actions too
-    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (kinds + 6 - 1) * seeds + 1
+    alone = study.train.masking.teacher_forcing  # the settings are trained without it
+    assert not any(p.trial.train.masking.teacher_forcing for p in settings.points)
+    shared = 0 if alone else seeds + 1
+    assert len(unique_trials([settings, conditioning], PROVENANCE)) == (3 * seeds + 1) + (6 * seeds + 1) - shared
     width = unique_trials([width_axis.plan(study)], PROVENANCE)
-    shared = [p for p in settings.points if p.x == settings.reference_x and p.trial.train.seed in study.seeds]
-    assert {p.role for p in shared} == {POINT, CONTROL}
-    assert all(trial_id(p.trial, PROVENANCE) in width for p in shared)
+    for sweep in (conditioning,) if alone else (settings, conditioning):
+        shared = [p for p in sweep.points if p.x == sweep.reference_x and p.trial.train.seed in study.seeds]
+        assert {p.role for p in shared} == {POINT, CONTROL}
+        assert all(trial_id(p.trial, PROVENANCE) in width for p in shared)
 
 
 def test_published_presets_have_error_bars():

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
+from data_pipelines.suite.generate import episode_count
 from experiments.cost import plan_trials
 from experiments.preparing_cost import estimate_preparing
 from experiments.presets import CPU_FULL, PAPER
@@ -41,7 +42,7 @@ def test_both_ends_of_an_axis_have_a_control(axis):
     controls = {p.x: p.trial for p in points(axis, CONTROL)}
     ends = {min(p.x for p in points(axis)), max(p.x for p in points(axis))}
     assert ends <= controls.keys() and all(t.shuffle_actions for t in controls.values())
-    trained = {p.x: p.trial for p in points(axis) if p.trial.train.seed == 0 and p.trial.train.steps == 8000}
+    trained = {p.x: p.trial for p in points(axis) if p.trial.train.seed == 0 and p.trial.train.steps == 4000}
     for x, control in controls.items():
         if x in trained:
             changed = replace(control, shuffle_actions=False, measure_untrained=trained[x].measure_untrained)
@@ -55,11 +56,18 @@ def test_the_reference_is_a_point(axis):
     assert len(references & {p.trial for p in points(axis)}) >= 3
 
 
-def test_ablations_share_their_default_with_the_horizon():
+def test_the_default_conditioning_is_a_branch_of_the_horizon():
     longer = unique_trials([SWEEPS["horizon"]], PROVENANCE)
-    for axis in ("settings", "conditioning"):
-        default = [p for p in points(axis) if p.x == SWEEPS[axis].reference_x]
-        assert len(default) == 3 and all(trial_id(p.trial, PROVENANCE) in longer for p in default)
+    default = [p for p in points("conditioning") if p.x == SWEEPS["conditioning"].reference_x]
+    assert len(default) == 3 and all(trial_id(p.trial, PROVENANCE) in longer for p in default)
+
+
+def test_settings_are_compared_under_one_objective():
+    """What predicts actions cannot be trained with teacher forcing, which all else is."""
+    assert {p.trial.train.masking.teacher_forcing for p in points("settings")} == {False}
+    assert len({p.trial.train.masking.setting for p in points("settings")}) == 3
+    for axis in set(CPU_FULL.axes) - {"settings"}:
+        assert {p.trial.train.masking.teacher_forcing for p in points(axis)} == {True}
 
 
 def test_judged_robots_are_others_for_every_seed_and_each_of_another_family():
@@ -78,8 +86,8 @@ def test_sets_of_robots_are_nested_and_hold_the_judged():
 
 def test_dilution_holds_all_windows_and_transfer_those_of_the_judged():
     """Under the uniform mixture a robot's share is one over their number."""
-    assert {p.trial.train.steps for p in points("dilution")} == {8000}
-    assert {p.trial.train.steps / len(p.trial.datasets) for p in points("transfer")} == {200.0}
+    assert {p.trial.train.steps for p in points("dilution")} == {4000}
+    assert {p.trial.train.steps / len(p.trial.datasets) for p in points("transfer")} == {100.0}
     for p in (*points("dilution"), *points("transfer")):
         assert p.scope == draw_judged(CPU_FULL, p.trial.train.seed) and set(p.scope) <= set(p.trial.evaluated)
     with pytest.raises(ConfigError, match="uniform mixture"):
@@ -107,7 +115,7 @@ def test_every_width_spends_the_same_compute():
 
 
 def test_trajectories_are_counted_as_they_are():
-    there = [e.episodes for e in TRAINED]  # at scale 1
+    there = [episode_count(e, CPU_FULL.suite.scale) for e in TRAINED]
     for cap in (4, 64, 10_000):
         assert count_episodes(CPU_FULL, cap) == sum(min(n, cap) for n in there)
     assert {p.x for p in points("episodes")} >= {160, sum(there)}
