@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import shutil
 import tempfile
@@ -21,6 +22,8 @@ FAST_COMPILATION = (
     "--xla_cpu_parallel_codegen_split_count=1",  # the other core has tests of its own
 )
 os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
+# Tracing makes millions of objects that live on: looking through them again and again took an eighth of all time.
+gc.set_threshold(100_000, 20, 20)
 if "HMA_CACHE_DIR" not in os.environ:  # not the user's
     os.environ["HMA_CACHE_DIR"] = tempfile.mkdtemp(prefix="hma-cache-")
     atexit.register(shutil.rmtree, os.environ["HMA_CACHE_DIR"], ignore_errors=True)

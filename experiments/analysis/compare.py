@@ -6,7 +6,7 @@ with several it is over seeds and episodes (`bootstrap`), seeds of one name pair
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,9 +64,16 @@ def compare(a: Side, b: Side) -> list[Difference]:
     foreign = OF_TOKENS if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer else ()
     found = []
     for metric in nats_first(m for m in shared if m not in (*foreign, *NOT_OF_MODELS)):
-        panels = [make_panel([dict(enumerate(side))], metric, robots) for side in zip(*pairs, strict=True)]
-        found += _of_metric(metric, *panels)
+        found += _of_metric(metric, *_panels(pairs, metric, robots))
     return found
+
+
+def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:
+    """Of one metric over the mean of `robots`; None where no window has it on both sides. Raises NotComparable."""
+    pairs = _pairs(a, b)
+    if not all(metric in table.metrics for pair in pairs for table in pair):
+        return None
+    return next(iter(_of_metric(metric, *_panels(pairs, metric, robots), by_robot=False)), None)
 
 
 def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
@@ -82,7 +89,11 @@ def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
     return [(a.seeds[seed], b.seeds[seed]) for seed in shared]
 
 
-def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
+def _panels(pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robots: Sequence[str]) -> list[Panel]:
+    return [make_panel([dict(enumerate(side))], metric, robots) for side in zip(*pairs, strict=True)]
+
+
+def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[Difference]:
     """Over the windows that have it, of which there may be none."""
     there = ~np.isnan(np.concatenate([*a.points, *b.points])).any(0)
     robots = list(dict.fromkeys(a.robot[there].tolist()))
@@ -90,6 +101,8 @@ def _of_metric(metric: str, a: Panel, b: Panel) -> list[Difference]:
     if not robots:
         return []
     rows = [(OVERALL, there), *chosen] if len(robots) > 1 else chosen
+    if not by_robot:
+        rows = [(OVERALL, there)]
     return [_difference(scope, metric, _rows(a, index), _rows(b, index)) for scope, index in rows]
 
 

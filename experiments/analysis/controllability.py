@@ -15,6 +15,7 @@ import numpy as np
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.paired import require_same_windows
 from experiments.suite.explained import read_table
+from experiments.sweeps.sweep import POINT
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
 
@@ -45,10 +46,11 @@ class Controlled:
     n: int
     episodes: int
     explained: float = float("nan")  # share of the change of its pixels that actions decide; nan: nobody measured
+    role: str = POINT  # or CONTROL: a model trained on the actions of other episodes, which has nothing to follow
 
 
-def controllability(seeds: dict[int, WindowTable]) -> list[Controlled]:
-    """Of one model under several seeds, {seed: table}: every robot that has the metric, in the order of the tables.
+def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Controlled]:
+    """Of one model of that `role` under several seeds, {seed: table}: every robot that has the metric, in the order of the tables.
 
     Raises NotComparable unless all seeds saw the same windows.
     """
@@ -63,7 +65,7 @@ def controllability(seeds: dict[int, WindowTable]) -> list[Controlled]:
         share = truth[robot].share if robot in truth else float("nan")
         for metric in METRICS:
             if all(metric in table.metrics for table in own.values()):
-                rows += _row(robot, metric, own, share)
+                rows += _row(robot, metric, own, share, role)
     return rows
 
 
@@ -73,7 +75,7 @@ def beyond(rows: Iterable[Controlled], metric: str, errors: float = ENOUGH) -> t
     return sum(row.errors > errors for row in own), len(own)
 
 
-def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float) -> Sequence[Controlled]:
+def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, role: str) -> Sequence[Controlled]:
     values = np.stack([table.metrics[metric] for table in tables.values()])
     there = ~np.isnan(values).any(0)
     if not there.any():
@@ -87,6 +89,6 @@ def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float) 
     return (
         Controlled(
             robot, metric, found.mean, found.sem, found.low, found.high, deaf, errors, len(tables), found.n,
-            found.episodes, share,
+            found.episodes, share, role,
         ),
     )  # fmt: skip

@@ -35,6 +35,7 @@ def draw(workspace: Workspace, record: Record) -> None:
 
 
 def _draw(workspace: Workspace, record: Record) -> None:
+    from experiments.analysis.changes import Change, find_changes
     from experiments.optima import Optimum, find_optima
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers
@@ -59,11 +60,15 @@ def _draw(workspace: Workspace, record: Record) -> None:
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
     others = write_tables(workspace, record, sweeps, states, provenance)
     tables = [workspace.results, workspace.fits, *others]
+    changes = find_changes(sweeps, provenance, numbers.windows)
+    if changes:
+        write_csv(workspace.changes, Change, changes)
+        tables.append(workspace.changes)
     optima = find_optima(rows, sweeps)
     if optima:
         write_csv(workspace.optima, Optimum, optima)
         tables.append(workspace.optima)
-    write_report(workspace, record, sweeps, rows, optima, states, provenance, numbers, checked)
+    write_report(workspace, record, sweeps, rows, optima, changes, states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 
 

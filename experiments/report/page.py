@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.analysis.changes import Change
 from experiments.optima import Optimum
 from experiments.report.clips import describe_clips
 from experiments.report.fits import describe_fits
@@ -42,6 +43,7 @@ def write_report(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     optima: Sequence[Optimum],
+    changes: Sequence[Change],
     states: dict[str, State],
     provenance: Provenance,
     numbers: Numbers,
@@ -61,7 +63,7 @@ def write_report(
     body = [
         _headline(workspace, record, sweeps, rows, states, home, result),
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, optima),
+        *_curves(workspace, sweeps, rows, optima, changes),
         _fits(workspace, numbers),
         _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
         section("Robots, the most controllable first", describe_robots(
@@ -144,19 +146,23 @@ def _at_reference(rows: Sequence[Row], home: Sweep, metric: str, role: str = POI
 
 
 def _curves(
-    workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row], optima: Sequence[Optimum]
+    workspace: Workspace,
+    sweeps: Sequence[Sweep],
+    rows: Sequence[Row],
+    optima: Sequence[Optimum],
+    changes: Sequence[Change],
 ) -> list[str]:
     """A section for the scaling curves, which share a figure, and one for each other sweep."""
     sections = []
     scaling = [s for s in sweeps if s.scaling]
     if scaling:
         overview = picture(workspace.figures / "scaling.png", "Scaling curves")
-        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima) for s in scaling)))
+        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima, changes) for s in scaling)))
     for sweep in sweeps:
         if not sweep.scaling:
             title = sweep.title or sweep.axis.capitalize()
             figure = picture(workspace.figures / f"{sweep.name}.png", title)
-            sections.append(section(title, figure, describe(sweep, rows, optima)))
+            sections.append(section(title, figure, describe(sweep, rows, optima, changes)))
     return sections
 
 

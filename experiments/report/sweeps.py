@@ -7,27 +7,30 @@ import html
 import math
 from collections.abc import Sequence
 
+from experiments.analysis.changes import Change
 from experiments.optima import Optimum
-from experiments.report.pieces import number, pm, table
+from experiments.report.pieces import pm, table
 from experiments.report.plot_families import ROLES
 from experiments.report.plot_style import drawn_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 
 HEADINGS = {"perplexity": "perplexity", "delta_psnr": "ΔPSNR (dB)"}
+CHANGED = {"cross_entropy": "nats per token", "action_nats": "action-nats", "delta_psnr": "ΔPSNR (dB)"}
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
 
-def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum]) -> str:
+def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], changes: Sequence[Change] = ()) -> str:
     """Heading, question and numbers of a sweep of any kind."""
     if sweep.labels:
         numbers = _names(sweep, rows)
     elif sweep.base:
         numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
     elif sweep.several:
-        numbers = "".join(_series(sweep, rows, name) for name in all_series(rows, sweep.name).get(POINT, []))
+        names = all_series(rows, sweep.name).get(POINT, [])
+        numbers = "".join(_series(sweep, rows, name, changes) for name in names)
     else:
-        numbers = _curve(sweep, rows)
+        numbers = _curve(sweep, rows, changes)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
     return (
         f"{heading}<p>{html.escape(sweep.question)} "
@@ -41,14 +44,14 @@ def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePo
     return {m: {p.x: p for p in curve(rows, sweep.name, m)} for m in metrics}
 
 
-def _series(sweep: Sweep, rows: Sequence[Row], name: str) -> str:
+def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Change]) -> str:
     """The numbers of one curve of several, as of a sweep that has it alone."""
     own = [dataclasses.replace(r, series="") for r in rows if r.sweep == sweep.name and r.series == name]
-    return f"<h4>{html.escape(name)}</h4>{_curve(sweep, own)}" if own else ""
+    return f"<h4>{html.escape(name)}</h4>{_curve(sweep, own, changes, name)}" if own else ""
 
 
-def _curve(sweep: Sweep, rows: Sequence[Row]) -> str:
-    """A line per point, and the change from end to end in standard errors."""
+def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series: str = "") -> str:
+    """A line per point, and the change from end to end."""
     columns = _columns(sweep, rows)
     points = next(iter(columns.values()))
     lines = []
@@ -56,20 +59,20 @@ def _curve(sweep: Sweep, rows: Sequence[Row]) -> str:
         values = [pm(column[x].mean, column[x].sem) for column in columns.values()]
         lines.append([f"{x:,}", f"{p.parameters:,}", *values, str(len(p.seeds))])
     numbers = table([sweep.axis, "parameters", *(HEADINGS[m] for m in columns), "seeds"], lines)
-    if len(points) < 2:
-        return numbers
-    ends = min(points), max(points)
-    changes = ", ".join(f"{HEADINGS[m]} {_change(c[ends[0]], c[ends[1]])}" for m, c in columns.items())
-    return f"{numbers}<p>From {ends[0]:,} to {ends[1]:,}: {changes}.</p>"
+    return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
 
 
-def _change(first: CurvePoint, last: CurvePoint) -> str:
-    """From one point to another, and how many standard errors lie between them."""
-    error = math.hypot(first.sem, last.sem)
-    if not error > 0:  # also nan: a single window
-        return f"{first.mean:.3g} → {last.mean:.3g}"
-    size = abs(last.mean - first.mean) / error
-    return f"{number(first.mean, error)} → {number(last.mean, error)} ({size:.1f} standard errors)"
+def _change(changes: Sequence[Change]) -> str:
+    """One sentence: what changes from one end of a curve to the other, window by window."""
+    if not changes:
+        return ""
+    ends = changes[0]
+    said = ", ".join(
+        f"{CHANGED[c.metric]} {c.mean:+.3g} (95 % interval {c.low:+.3g} to {c.high:+.3g})".replace("-", "\u2212")
+        for c in changes
+    )
+    over = f"seeds ({ends.seeds}) and episodes" if ends.seeds > 1 else "episodes of one seed, so it says nothing of others"
+    return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {said}. The interval is over {over}.</p>"
 
 
 def _names(sweep: Sweep, rows: Sequence[Row]) -> str:

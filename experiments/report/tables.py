@@ -11,7 +11,7 @@ from experiments.running.ledger import FINISHED
 from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Record, Workspace
-from experiments.sweeps.sweep import Sweep, reference_trial, titles, unique_trials
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep, control_of, reference_trial, titles, unique_trials
 
 if TYPE_CHECKING:
     from experiments.running.provenance import Provenance
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 def write_tables(
     workspace: Workspace, record: Record, sweeps: Sequence[Sweep], states: Mapping[str, State], provenance: Provenance
 ) -> list[Path]:
-    """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv."""
+    """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
+    and of their controls."""
     from experiments.analysis.controllability import Controlled, controllability
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
@@ -34,10 +35,13 @@ def write_tables(
         loss = last_loss(result["losses"]).mean if result else 0.0
         rows.append(trial_row(id, names[id], state, trial, provenance, result, loss))
     write_trials(workspace.trial_table, rows)
-    ids = [trial_id(reference_trial(record.study, seed), provenance) for seed in record.study.seeds]
-    kept = [id for id in ids if (workspace.trials / id / FILE).exists()]
-    seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
-    found = controllability(dict(sorted(seeds.items()))) if seeds else []
+    found = []
+    references = [reference_trial(record.study, seed) for seed in record.study.seeds]
+    for role, trials in {POINT: references, CONTROL: [control_of(trial) for trial in references]}.items():
+        ids = [trial_id(trial, provenance) for trial in trials]
+        kept = [id for id in ids if (workspace.trials / id / FILE).exists()]
+        seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
+        found += controllability(dict(sorted(seeds.items())), role) if seeds else []
     if not found:
         return [workspace.trial_table]
     write_csv(workspace.controllability, Controlled, found)

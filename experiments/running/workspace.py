@@ -86,6 +86,11 @@ class Workspace:
         return self.root / "optima.csv"
 
     @property
+    def changes(self) -> Path:
+        """What changes from one end of each axis to the other."""
+        return self.root / "changes.csv"
+
+    @property
     def fits(self) -> Path:
         """Coefficients of scaling fits."""
         return self.root / "fits.csv"

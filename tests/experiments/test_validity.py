@@ -1,5 +1,6 @@
 """What makes a study's numbers unbelievable shows at the top of its page."""
 
+import csv
 import json
 import shutil
 from dataclasses import replace
@@ -12,7 +13,7 @@ from experiments.running.sealed import RESULT, write_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import CONTROL
+from experiments.sweeps.sweep import CONTROL, POINT
 from hma_jax.evaluation.windows import FILE, WindowTable
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, judged_study
@@ -83,9 +84,20 @@ def test_a_good_study_passes_everything(study):
     assert "from 252 windows" in found["numbers"][1]  # seven trials of three robots, six episodes, two windows each
 
 
+def test_tables_have_the_control_and_what_changes_along_the_axis(study):
+    workspace, _ = study
+    with open(workspace.controllability) as file:
+        rows = [r for r in csv.DictReader(file) if r["metric"] == "delta_psnr"]
+    errors = {role: [float(r["errors"]) for r in rows if r["role"] == role] for role in (POINT, CONTROL)}
+    assert len(errors[POINT]) == len(errors[CONTROL]) == 3
+    assert max(errors[POINT]) > 10 and max(map(abs, errors[CONTROL])) < 4
+    page = workspace.report.read_text()
+    assert "From 8 to 16, window by window: nats per token \u22120." in page and "seeds (3) and episodes" in page
+
+
 def test_drawing_again_changes_no_byte_of_the_tables(copied):
     workspace, record = copied
-    tables = [workspace.results, workspace.fits]
+    tables = [workspace.results, workspace.fits, workspace.changes, workspace.controllability]
     before = [path.read_bytes() for path in tables]
     for path in tables:
         path.unlink()

@@ -1,0 +1,110 @@
+"""What changes from one end of an axis to the other, window by window.
+
+The trials at both ends were judged on the same windows, so what makes a window hard for both cancels (`compare`). Where
+robots are judged that are others for every seed, each seed's difference is taken on its own robots, and the error is
+over seeds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.analysis.compare import Difference, Side, overall_difference
+from experiments.analysis.intervals import critical
+from experiments.running.provenance import Provenance
+from experiments.running.trial import trial_id
+from experiments.sweeps.sweep import POINT, Point, Sweep
+from hma_jax.evaluation.windows import WindowTable
+
+METRICS = ("cross_entropy", "action_nats", "delta_psnr")
+
+
+@dataclass(frozen=True)
+class Change:
+    """The mean at `last` less that at `first`, over robots, with its interval; `seeds` that both ends have."""
+
+    sweep: str
+    series: str
+    first: float
+    last: float
+    metric: str
+    mean: float
+    sem: float
+    low: float
+    high: float
+    errors: float  # standard errors from zero
+    seeds: int
+    n: int
+    episodes: int
+
+
+def find_changes(
+    sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
+) -> list[Change]:
+    """Of every curve over a number, between its outermost points that are finished. Raises NotComparable."""
+    found = []
+    for sweep in (s for s in sweeps if s.measured):
+        for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
+            ends = _ends(sweep, series, provenance, windows)
+            if ends is not None:
+                found += [c for metric in METRICS if (c := _change(sweep, series, ends, metric)) is not None]
+    return found
+
+
+Ends = Mapping[float, Mapping[int, tuple[Point, WindowTable]]]
+
+
+def _ends(sweep: Sweep, series: str, provenance: Provenance, windows: Mapping[str, WindowTable]) -> Ends | None:
+    """{x: {seed: its trial}} of the first and the last x; None without two that have a seed in common."""
+    there: dict[float, dict[int, tuple[Point, WindowTable]]] = {}
+    for point in sweep.points:
+        table = windows.get(trial_id(point.trial, provenance))
+        if point.role == POINT and point.series == series and table is not None:
+            there.setdefault(point.x, {})[point.trial.train.seed] = point, table
+    if len(there) < 2:
+        return None
+    ends = {x: there[x] for x in (min(there), max(there))}
+    return ends if set.intersection(*(set(side) for side in ends.values())) else None
+
+
+def _change(sweep: Sweep, series: str, ends: Ends, metric: str) -> Change | None:
+    first, last = ends
+    scopes = {seed: point.scope or sweep.scope for seed, (point, _) in ends[last].items()}
+    sides = [Side(f"{sweep.axis} {x:g}", {s: table for s, (_, table) in ends[x].items()}, "") for x in (last, first)]
+    if len(set(scopes.values())) == 1:
+        difference = overall_difference(*sides, metric, next(iter(scopes.values())))
+    else:
+        difference = _over_seeds(*sides, metric, scopes)
+    if difference is None:
+        return None
+    d = difference
+    return Change(
+        sweep.name, series, first, last, metric, d.mean, d.sem, d.low, d.high, d.errors, d.seeds, d.n, d.episodes
+    )
+
+
+def _over_seeds(a: Side, b: Side, metric: str, scopes: Mapping[int, Sequence[str]]) -> Difference | None:
+    """The mean of every seed's difference on its own robots; the seeds being independent, their spread is its error."""
+    each = []
+    for seed, robots in scopes.items():
+        if seed in a.seeds and seed in b.seeds:
+            sides = (Side(side.name, {seed: side.seeds[seed]}, "") for side in (a, b))
+            each.append(overall_difference(*sides, metric, robots))
+    known = [d for d in each if d is not None]
+    if not known:
+        return None
+    if len(known) == 1:
+        return known[0]
+    means = np.array([d.mean for d in known])
+    mean, sem = float(means.mean()), float(means.std(ddof=1) / math.sqrt(len(means)))
+    half = critical(len(means) - 1) * sem
+    at_a, at_b = (float(np.mean([getattr(d, side) for d in known])) for side in "ab")
+    return Difference(
+        known[0].scope, metric, at_a, at_b, mean, sem, mean - half, mean + half,
+        mean / sem if sem else math.copysign(math.inf, mean), len(known),
+        sum(d.n for d in known), sum(d.episodes for d in known),
+    )  # fmt: skip
