@@ -71,7 +71,7 @@ def _change(changes: Sequence[Change]) -> str:
         f"{CHANGED[c.metric]} {c.mean:+.3g} (95 % interval {c.low:+.3g} to {c.high:+.3g})".replace("-", "\u2212")
         for c in changes
     )
-    over = f"seeds ({ends.seeds}) and episodes" if ends.seeds > 1 else "episodes of one seed, so it says nothing of others"
+    over = f"seeds ({ends.seeds}) and episodes" if ends.seeds > 1 else "episodes of one seed: it says nothing of others"
     return f"<p>From {ends.first:,} to {ends.last:,}, window by window: {said}. The interval is over {over}.</p>"
 
 
