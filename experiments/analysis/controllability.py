@@ -50,8 +50,8 @@ class Controlled:
 
 
 def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Controlled]:
-    """Of one model of that `role` under several seeds, {seed: table}: every robot that has the metric, in the order of the
-    tables.
+    """Of one model of that `role` under several seeds, {seed: table}: every robot that has the metric, in the
+    order of the tables.
 
     Raises NotComparable unless all seeds saw the same windows.
     """
