@@ -132,9 +132,10 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
     kind = "width" if sweep.name == "lr" else "curve"
     head = ["", "curve", "loss", "best rate", "steps moved", "lowest", f"base {kind}'s best rate", "penalty"]
     return f"<p>{_transfer(optima, kind)}</p>" + table(head, lines, text=3) + (
-        f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the loss is "
-        f"higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the held-out loss is in "
-        "nats per token. Errors are over seeds, where there are several; the grid is not interpolated. "
+        f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the "
+        f"loss is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the "
+        "held-out loss is in nats per token. Errors are over seeds, where there are several; the grid is not "
+        "interpolated. "
         "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
         "beyond.</p>"
     )
