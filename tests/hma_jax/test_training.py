@@ -50,26 +50,33 @@ def dying_batches(after: int):
     return make
 
 
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory):
+    """(directory, result) of a run that nothing happened to."""
+    run_dir = tmp_path_factory.mktemp("unbroken")
+    return run_dir, train(run_dir)
+
+
 @pytest.mark.exact
-def test_a_run_that_broke_and_resumed_is_byte_equal_to_one_that_did_not(tmp_path: Path):
-    whole = train(tmp_path / "whole")
+def test_a_run_that_broke_and_resumed_is_byte_equal_to_one_that_did_not(tmp_path: Path, unbroken):
+    run_dir, whole = unbroken
     with pytest.raises(OSError):
         train(tmp_path / "broken", make=dying_batches(after=5))
     resumed = train(tmp_path / "broken")
     assert resumed.resumed_from in (2, 4)
     assert resumed.losses == whole.losses
     assert equal_trees(resumed.state, whole.state)
-    metrics = [(tmp_path / d / "metrics.jsonl").read_bytes() for d in ("whole", "broken")]
+    metrics = [(d / "metrics.jsonl").read_bytes() for d in (run_dir, tmp_path / "broken")]
     assert metrics[0] == metrics[1]
 
 
-def test_a_finished_run_is_not_run_again(tmp_path: Path):
-    first = train(tmp_path)
+def test_a_finished_run_is_not_run_again(unbroken):
+    run_dir, first = unbroken
 
     def no_batches(start: int):
         raise AssertionError("a finished run asked for data")
 
-    again = train(tmp_path, make=no_batches)
+    again = train(run_dir, make=no_batches)
     assert again.losses == first.losses
     assert equal_trees(again.state, first.state)
 
@@ -97,7 +104,7 @@ def test_a_checkpoint_of_another_configuration_is_refused_by_name(tmp_path: Path
 
 
 @pytest.mark.exact
-def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path):
+def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path, unbroken):
     def stop_at_three(step: int, steps: int, metrics: dict) -> None:
         if step == 3:
             signal.raise_signal(signal.SIGTERM)
@@ -106,7 +113,7 @@ def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path):
         train(tmp_path / "stopped", progress=stop_at_three, options=LoopOptions(log_every=1))
     resumed = train(tmp_path / "stopped")
     assert resumed.resumed_from >= 3
-    assert equal_trees(resumed.state, train(tmp_path / "whole").state)
+    assert equal_trees(resumed.state, unbroken[1].state)
 
 
 def test_divergence_stops_the_run_and_spares_the_last_checkpoint(tmp_path: Path):
@@ -123,8 +130,8 @@ def test_divergence_stops_the_run_and_spares_the_last_checkpoint(tmp_path: Path)
     assert load_run(tmp_path).step == 2
 
 
-def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path: Path):
-    whole = train(tmp_path / "whole")
+def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path: Path, unbroken):
+    _, whole = unbroken
     with pytest.raises(OSError):
         train(tmp_path / "torn", make=dying_batches(after=4))
     log = tmp_path / "torn" / "metrics.jsonl"
