@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
-playwright = pytest.importorskip("playwright.async_api", reason="needs the extra `test-browser`")
+playwright = pytest.importorskip("playwright.async_api", reason="needs the extra `test`")
 
 from PIL import Image  # noqa: E402
 
