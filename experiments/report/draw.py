@@ -35,12 +35,14 @@ def draw(workspace: Workspace, record: Record) -> None:
 
 
 def _draw(workspace: Workspace, record: Record) -> None:
+    from experiments.analysis.best_steps import AtBest, judge_at_best
     from experiments.analysis.changes import Change, find_changes
     from experiments.optima import Optimum, find_optima
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers
     from experiments.report.page import write_report
     from experiments.report.tables import write_tables
+    from experiments.report.sweeps import Along
     from experiments.report.validity import check_numbers
     from experiments.rows import Row, collect, read_csv, write_csv
 
@@ -61,14 +63,16 @@ def _draw(workspace: Workspace, record: Record) -> None:
     others = write_tables(workspace, record, sweeps, states, provenance)
     tables = [workspace.results, workspace.fits, *others]
     changes = find_changes(sweeps, provenance, numbers.windows)
-    if changes:
-        write_csv(workspace.changes, Change, changes)
-        tables.append(workspace.changes)
+    at_best = judge_at_best(sweeps, provenance, numbers.windows)
+    for path, kind, found in ((workspace.changes, Change, changes), (workspace.best_steps, AtBest, at_best)):
+        if found:
+            write_csv(path, kind, found)
+            tables.append(path)
     optima = find_optima(rows, sweeps)
     if optima:
         write_csv(workspace.optima, Optimum, optima)
         tables.append(workspace.optima)
-    write_report(workspace, record, sweeps, rows, optima, changes, states, provenance, numbers, checked)
+    write_report(workspace, record, sweeps, rows, optima, Along(changes, at_best), states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments.analysis.changes import Change
 from experiments.optima import Optimum
 from experiments.report.clips import describe_clips
 from experiments.report.fits import describe_fits
@@ -22,7 +21,7 @@ from experiments.report.pieces import card, picture, section, table
 from experiments.report.plot_style import drawn_metrics
 from experiments.report.robots import Robot, describe_robots, robots_of
 from experiments.report.style import CSS
-from experiments.report.sweeps import describe
+from experiments.report.sweeps import Along, describe
 from experiments.report.validity import Check, check_study, draw_box
 from experiments.rows import UNTRAINED, CurvePoint, Row, curve
 from experiments.running.agreement import describe as describe_sources
@@ -43,7 +42,7 @@ def write_report(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     optima: Sequence[Optimum],
-    changes: Sequence[Change],
+    along: Along,
     states: dict[str, State],
     provenance: Provenance,
     numbers: Numbers,
@@ -63,7 +62,7 @@ def write_report(
     body = [
         _headline(workspace, record, sweeps, rows, states, home, result),
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, optima, changes),
+        *_curves(workspace, sweeps, rows, optima, along),
         _fits(workspace, numbers),
         _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
         section("Robots, the most controllable first", describe_robots(
@@ -150,19 +149,19 @@ def _curves(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     optima: Sequence[Optimum],
-    changes: Sequence[Change],
+    along: Along,
 ) -> list[str]:
     """A section for the scaling curves, which share a figure, and one for each other sweep."""
     sections = []
     scaling = [s for s in sweeps if s.scaling]
     if scaling:
         overview = picture(workspace.figures / "scaling.png", "Scaling curves")
-        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima, changes) for s in scaling)))
+        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima, along) for s in scaling)))
     for sweep in sweeps:
         if not sweep.scaling:
             title = sweep.title or sweep.axis.capitalize()
             figure = picture(workspace.figures / f"{sweep.name}.png", title)
-            sections.append(section(title, figure, describe(sweep, rows, optima, changes)))
+            sections.append(section(title, figure, describe(sweep, rows, optima, along)))
     return sections
 
 

@@ -6,7 +6,9 @@ import dataclasses
 import html
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+from experiments.analysis.best_steps import AtBest
 from experiments.analysis.changes import Change
 from experiments.optima import Optimum
 from experiments.report.pieces import pm, table
@@ -20,7 +22,15 @@ CHANGED = {"cross_entropy": "nats per token", "action_nats": "action-nats", "del
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
 
 
-def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], changes: Sequence[Change] = ()) -> str:
+@dataclass(frozen=True)
+class Along:
+    """What is said of whole axes from every window's numbers."""
+
+    changes: Sequence[Change] = ()
+    best: Sequence[AtBest] = ()
+
+
+def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along: Along) -> str:
     """Heading, question and numbers of a sweep of any kind."""
     if sweep.labels:
         numbers = _names(sweep, rows)
@@ -28,13 +38,35 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], chang
         numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
     elif sweep.several:
         names = all_series(rows, sweep.name).get(POINT, [])
-        numbers = "".join(_series(sweep, rows, name, changes) for name in names)
+        numbers = "".join(_series(sweep, rows, name, along.changes) for name in names) + _at_best(sweep, along.best)
     else:
-        numbers = _curve(sweep, rows, changes)
+        numbers = _curve(sweep, rows, along.changes)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
     return (
         f"{heading}<p>{html.escape(sweep.question)} "
         f"Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
+    )
+
+
+def _at_best(sweep: Sweep, rows: Sequence[AtBest]) -> str:
+    """A line per point of an axis of several numbers of steps, at the number that suits it."""
+    points: dict[float, dict[str, AtBest]] = {}
+    for row in rows:
+        if row.sweep == sweep.name:
+            points.setdefault(row.x, {})[row.metric] = row
+    if not points:
+        return ""
+    metrics = list(dict.fromkeys(m for found in points.values() for m in found))
+    lines = []
+    for x, found in points.items():
+        cells = [f"{f.mean:.3g} ({f.low:.3g} to {f.high:.3g})" if (f := found.get(m)) else "–" for m in metrics]
+        any_of = next(iter(found.values()))
+        lines.append([f"{x:,}", *cells, str(any_of.seeds), any_of.chosen])
+    head = [sweep.axis, *(CHANGED[m] for m in metrics), "seeds", "steps chosen, and how often"]
+    return "<h4>At the number of steps that suits each point</h4>" + table(head, lines) + (
+        "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other, both ways: the "
+        "lowest of several losses on the windows that judge it would flatter a point. Intervals of 95 % are over seeds "
+        "and episodes.</p>"
     )
 
 

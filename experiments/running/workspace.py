@@ -91,6 +91,11 @@ class Workspace:
         return self.root / "changes.csv"
 
     @property
+    def best_steps(self) -> Path:
+        """Points of an axis at the number of steps that suits them."""
+        return self.root / "best_steps.csv"
+
+    @property
     def fits(self) -> Path:
         """Coefficients of scaling fits."""
         return self.root / "fits.csv"

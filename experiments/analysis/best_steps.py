@@ -1,0 +1,116 @@
+"""Every point of an axis at the number of steps that suits it, chosen on other episodes than those it is judged on.
+
+Where data is scarce a model is best after fewer steps. To take the lowest of several losses on the windows that judge
+it would flatter every point, the noisiest most. So the episodes of every robot are halved: steps are chosen by the loss
+on the one half and judged on the other, both ways, and every window is judged once (two-fold cross-fitting).
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
+from experiments.analysis.changes import METRICS
+from experiments.analysis.paired import require_same_windows
+from experiments.running.provenance import Provenance
+from experiments.running.trial import trial_id
+from experiments.sweeps.sweep import POINT, Sweep
+from hma_jax.evaluation.windows import WindowTable
+
+LOSS = "cross_entropy"
+
+
+@dataclass(frozen=True)
+class AtBest:
+    """A point judged at the steps chosen on other episodes; `chosen` lists steps and how often each was, 'n x m'."""
+
+    sweep: str
+    x: float
+    metric: str
+    mean: float
+    sem: float
+    low: float
+    high: float
+    seeds: int
+    n: int
+    episodes: int
+    chosen: str
+
+
+def judge_at_best(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[AtBest]:
+    """Of sweeps whose curves differ in steps: points and seeds that have at least two of them. Raises NotComparable."""
+    found = []
+    for sweep in sweeps:
+        if not (sweep.measured and sweep.several):
+            continue
+        there: dict[float, dict[int, dict[int, WindowTable]]] = defaultdict(lambda: defaultdict(dict))
+        for point in sweep.points:
+            table = windows.get(trial_id(point.trial, provenance))
+            if point.role == POINT and not point.scope and table is not None and LOSS in table.metrics:
+                there[point.x][point.trial.train.seed][point.trial.train.steps] = table
+        for x, seeds in sorted(there.items()):
+            several = {seed: tables for seed, tables in sorted(seeds.items()) if len(tables) > 1}
+            if several:
+                found += _judge(sweep, x, several)
+    return found
+
+
+def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]]) -> list[AtBest]:
+    composed, chosen = {}, Counter()
+    for seed, tables in seeds.items():
+        composed[seed], steps = cross_fit(tables, sweep.scope)
+        chosen.update(steps)
+    listed = ", ".join(f"{steps} x {count}" for steps, count in sorted(chosen.items()))
+    rows = []
+    for metric in METRICS:
+        if not all(metric in t.metrics and not np.isnan(t.metrics[metric]).any() for t in composed.values()):
+            continue
+        panel = make_panel([composed], metric, sweep.scope)
+        (i,) = bootstrap_intervals(panel)
+        rows.append(
+            AtBest(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed)
+        )
+    return rows
+
+
+def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple[WindowTable, tuple[int, int]]:
+    """({steps: table} as one table in which every window is judged at steps chosen without it, the steps chosen by each
+    half of the episodes). The loss by which they are chosen is the mean over `robots` that the half has.
+
+    Raises NotComparable unless all tables are of the same windows.
+    """
+    first = next(iter(tables.values()))
+    first = first.rows(np.flatnonzero(np.isin(first.dataset, robots)))
+    matched = {}
+    for steps, table in tables.items():
+        require_same_windows(first, table)
+        matched[steps] = table.rows(np.flatnonzero(np.isin(table.dataset, robots))).matched_to(first)
+    half = halves(first)
+    chosen = []
+    for h in (0, 1):
+        losses = {steps: _mean_of_robots(t, half == h) for steps, t in matched.items()}
+        chosen.append(min(sorted(losses), key=losses.__getitem__))
+    shared = [m for m in first.metrics if all(m in t.metrics for t in matched.values())]
+    by_other = [matched[chosen[1]], matched[chosen[0]]]  # windows of half 0 are judged by the choice of half 1
+    metrics = {m: np.where(half == 0, by_other[0].metrics[m], by_other[1].metrics[m]) for m in shared}
+    return replace(first, metrics=metrics), (chosen[0], chosen[1])
+
+
+def halves(table: WindowTable) -> np.ndarray:
+    """int [n], 0 or 1: every other episode of each robot, in the order of their numbers."""
+    half = np.zeros(len(table), int)
+    for robot in table.datasets:
+        own = table.dataset == robot
+        half[own] = np.unique(table.episode[own], return_inverse=True)[1] % 2
+    return half
+
+
+def _mean_of_robots(table: WindowTable, chosen: np.ndarray) -> float:
+    loss = table.metrics[LOSS]
+    own = [chosen & (table.dataset == robot) for robot in table.datasets]
+    means = [loss[rows].mean() for rows in own if rows.any()]
+    return float(np.mean(means)) if means else float("inf")

@@ -1,0 +1,72 @@
+"""Points at the number of steps that suits them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.analysis.best_steps import cross_fit, halves, judge_at_best
+from experiments.analysis.paired import NotComparable
+from experiments.report.sweeps import Along, describe
+from experiments.running.trial import trial_id
+from experiments.sweeps.registry import plan_sweeps
+from tests.experiments.analysis.worlds import judged, with_loss
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.judged import WIDE, windows_of
+
+ROBOTS = ("r0", "r1")
+
+
+def noisy(rng, table, shift=0.0):
+    """The same windows; episodes differ by chance."""
+    of_episode = {key: rng.normal() for key in zip(table.dataset.tolist(), table.episode.tolist(), strict=True)}
+    noise = [of_episode[key] for key in zip(table.dataset.tolist(), table.episode.tolist(), strict=True)]
+    return with_loss(table, table.metrics["cross_entropy"] + shift + np.array(noise))
+
+
+def test_steps_are_not_chosen_on_the_episodes_that_judge():
+    """Five equally good models: the lowest of their losses is too low, the cross-fitted one is not."""
+    best, fitted = [], []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        table = judged(rng, robots=2, episodes=8, each=1, mean=2.0, of_episode=0.0, of_window=0.0)
+        tables = {steps: noisy(rng, table) for steps in range(5)}
+        best.append(min(t.metrics["cross_entropy"].mean() for t in tables.values()))
+        fitted.append(cross_fit(tables, ROBOTS)[0].metrics["cross_entropy"].mean())
+    assert np.mean(best) < 1.8
+    assert abs(np.mean(fitted) - 2.0) < 3 * np.std(fitted) / np.sqrt(len(fitted))
+
+
+def test_the_better_steps_are_found_and_every_window_is_judged_once():
+    rng = np.random.default_rng(0)
+    table = judged(rng, robots=2, episodes=8, mean=2.0)
+    tables = {100: noisy(rng, table, 5.0), 200: table}
+    whole, chosen = cross_fit(tables, ROBOTS)
+    assert chosen == (200, 200)
+    np.testing.assert_array_equal(whole.metrics["cross_entropy"], table.metrics["cross_entropy"])
+    half = halves(table)
+    for robot in ROBOTS:
+        own = table.dataset == robot
+        sides = [set(table.episode[own & (half == h)].tolist()) for h in (0, 1)]
+        assert not sides[0] & sides[1] and len(sides[0]) == len(sides[1]) == 4
+    with pytest.raises(NotComparable):
+        cross_fit({100: table, 200: replace(table, episode=table.episode + 1)}, ROBOTS)
+
+
+def test_the_axis_of_trajectories_is_judged_at_its_best_steps():
+    named = replace(WIDE, datasets=("pusher_sand", "arm_sand", "rover_road"))
+    study = replace(named, designs=replace(WIDE.designs, caps=(2,)), train=replace(WIDE.train, steps=8))
+    (sweep,) = plan_sweeps(study, ("episodes",))
+    tables = {}
+    for point in sweep.points:
+        longer = point.trial.train.steps == 8
+        table = windows_of(point.trial)
+        scarce = point.trial.max_trajectories == 2
+        worse = 1.0 if longer == scarce else 0.0  # scarce data: fewer steps; all data: more
+        tables[trial_id(point.trial, PROVENANCE)] = with_loss(table, table.metrics["cross_entropy"] + worse)
+    found = judge_at_best([sweep], PROVENANCE, tables)
+    assert "At the number of steps that suits each point" in describe(sweep, [], [], Along(best=found))
+    rows = {r.x: r for r in found if r.metric == "cross_entropy"}
+    fewest, most = min(rows), max(rows)
+    assert rows[fewest].chosen == "2 x 6" and rows[most].chosen == "8 x 6" and rows[most].seeds == 3
+    assert abs(rows[fewest].mean - rows[most].mean) < 0.1
