@@ -41,8 +41,8 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers
     from experiments.report.page import write_report
-    from experiments.report.tables import write_tables
     from experiments.report.sweeps import Along
+    from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
     from experiments.rows import Row, collect, read_csv, write_csv
 
