@@ -2,7 +2,8 @@
 
 Question: perplexity and delta PSNR on robots that no model was trained on, after adapting (`hma adapt`: the new
     robots' own parameters alone are trained) with few trajectories of each, for models that know more and more
-    robots, against a new model trained on the same trajectories.
+    robots, against a new model trained on the same trajectories; after the most robots also with everything trained
+    (`hma adapt --everything`).
 Paper figure: 7, in spirit.
 Command: python -m experiments.sweeps.fewshot --preset cpu-full
 Cost: one short training run per point, curve and seed, after those of `dilution`; `--dry-run` prints it.
@@ -26,9 +27,9 @@ def plan(study: Study) -> Sweep:
     designs, unseen = study.designs, study.unseen
     require(bool(unseen), "the axis fewshot needs robots to adapt to; name them with --set unseen=...")
 
-    def trial(seed: int, shots: int, source: Trial | None) -> Trial:
+    def trial(seed: int, shots: int, source: Trial | None, whole: bool = False) -> Trial:
         fresh = reference_trial(study, seed, designs.shots_steps)
-        train = replace(fresh.train, only=unseen if source else ())
+        train = replace(fresh.train, only=unseen if source and not whole else ())
         return replace(
             fresh, datasets=unseen, evaluated=unseen, max_trajectories=shots, train=train, source=source,
             measure_untrained=False,
@@ -44,6 +45,12 @@ def plan(study: Study) -> Sweep:
         for n in designs.shots
         for s in study.seeds
     ]
+    most = designs.shots_after[-1]
+    points += [
+        Point(n, trial(s, n, source(s, most), whole=True), series=f"after {most} robots, everything trained")
+        for n in designs.shots
+        for s in study.seeds
+    ]
     return Sweep(
         "fewshot",
         "trajectories of each new robot",
@@ -51,7 +58,7 @@ def plan(study: Study) -> Sweep:
         tuple(points),
         question=f"How much of a new robot must a trained model see? Judged on {len(unseen)} robots that no model was "
         f"trained on, after {designs.shots_steps:,} steps in which their own parameters alone are trained; from "
-        "scratch, everything is.",
+        "scratch, and where it is said, everything is.",
         gain="knowing other robots",
         title="New robots from few trajectories",
     )

@@ -125,7 +125,10 @@ def test_few_shots_start_from_trials_of_other_axes():
     others = unique_trials([SWEEPS["dilution"]], PROVENANCE).values()
     sources = {p.trial.source for p in points("fewshot")} - {None}
     assert sources <= set(others) and len(sources) == 9
-    assert all(p.trial.train.only == CPU_FULL.unseen for p in points("fewshot") if p.trial.source)
+    whole = [p for p in points("fewshot") if "everything" in p.series]
+    assert len(whole) == 9 and all(p.trial.source and p.trial.train.only == () for p in whole)
+    adapted = [p for p in points("fewshot") if p.trial.source and p not in whole]
+    assert all(p.trial.train.only == CPU_FULL.unseen for p in adapted)
 
 
 def test_the_whole_fits_into_about_twelve_hours_of_two_cores():

@@ -82,11 +82,11 @@ def test_jobs_of_the_designs_wait_for_their_sources_and_siblings():
     trials = unique_trials(sweeps, PROVENANCE)
     jobs = {j.id: j for j in make_jobs(trials, titles(sweeps, PROVENANCE), PROVENANCE, {})}
     adapted = {id: t for id, t in trials.items() if t.source}
-    assert len(adapted) == 27
+    assert len(adapted) == 36
     for id, one in adapted.items():
         assert trial_id(one.source, PROVENANCE) in jobs[id].after
-    longest = trial_id(reference_trial(CPU_FULL, 0, 64_000), PROVENANCE)
-    assert len(jobs[longest].after) == 6  # 1,000 to 32,000 steps
+    longest = trial_id(reference_trial(CPU_FULL, 0, 32_000), PROVENANCE)
+    assert len(jobs[longest].after) == 6  # 500 to 16,000 steps
     assert len({j.title for j in jobs.values()}) == len(jobs)
 
 
