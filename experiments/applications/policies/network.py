@@ -23,7 +23,7 @@ class EncoderConfig:
     """`size`: pixels of a side that the first convolution sees; the map of points is half as wide."""
 
     size: int = 32
-    channels: tuple[int, ...] = (16, 32, 32)
+    channels: tuple[int, ...] = (12, 16, 24)
     hidden: int = 128
 
     def __post_init__(self):
@@ -109,6 +109,21 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
     if (height, width) == (size, size):
         return images
     return images.reshape(batch, size, height // size, size, width // size, channels).mean((2, 4))
+
+
+def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
+    """`shrink` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
+    height, width = images.shape[-3:-1]
+    require(height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}")
+    parts = images.reshape(*images.shape[:-3], size, height // size, size, width // size, images.shape[-1])
+    return np.round(parts.mean((-4, -2), dtype=np.float32)).astype(np.uint8)
+
+
+def lit(frames: jax.Array, key: jax.Array, strength: float) -> jax.Array:
+    """Frames [B, n, H, W, 3] in [-1, 1] of episodes each under another light: colours scaled and moved a little."""
+    shape = (len(frames), 1, 1, 1, 3)
+    gain, offset = strength * jax.random.normal(key, (2, *shape))
+    return frames * (1 + gain) + offset
 
 
 def as_floats(images: jax.Array) -> jax.Array:
