@@ -22,7 +22,6 @@ from experiments.applications.policies.network import (
     as_floats,
     beside,
     encode,
-    features_of,
     init_encoder,
     init_mlp,
     lit,
@@ -54,7 +53,7 @@ def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),
-        "mlp": init_mlp(second, (features_of(config.encoder), hidden, hidden, config.chunk * action_dim)),
+        "mlp": init_mlp(second, (hidden, hidden, config.chunk * action_dim)),
     }
 
 
