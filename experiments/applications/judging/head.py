@@ -1,5 +1,5 @@
 """The success head: from the present frame, how probable it is that the goal is reached. Trained on recorded frames
-that the simulator's state labels; half of them as the model's tokenizer would show them."""
+that the simulator's state labels; some of them as the model's tokenizer would show them."""
 
 from __future__ import annotations
 
@@ -39,6 +39,8 @@ from hma_jax.simulator.interface import AnySimulator
 DESCRIPTION, WEIGHTS = "head.json", "head.safetensors"
 PIECE = 256
 """Frames that are looked at in one call."""
+
+RECONSTRUCTED = 4
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ def train_head(
 ) -> SuccessHead:
     """A function of its arguments. Positive and negative frames are drawn equally often.
 
-    `reconstruct` gives uint8 [n, H, W, 3] as the model's tokenizer shows them: every second frame is learnt so.
+    `reconstruct` gives uint8 [n, H, W, 3] as the model's tokenizer shows them: every `RECONSTRUCTED`-th is learnt so.
     Raises ConfigError where all frames have one label.
     """
     steps = demos.steps()
@@ -109,7 +111,7 @@ def train_head(
     labels = demos.reached[steps[:, 0], steps[:, 1]]
     require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
     if reconstruct is not None:
-        images[::2] = reconstruct(images[::2])
+        images[::RECONSTRUCTED] = reconstruct(images[::RECONSTRUCTED])
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
     data = {"images": shrink_bytes(images, config.encoder.size), "label": labels.astype(np.float32), "weight": weight}
 
