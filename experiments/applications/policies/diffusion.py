@@ -1,7 +1,8 @@
 """Diffusion Policy, small: a chunk of actions is drawn by denoising, given what is seen (Chi et al. 2023).
 
-The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps. Training
-adds noise of one of `levels` strengths (squared-cosine schedule) and predicts it; acting takes `samples` steps of DDIM.
+The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps.
+Training adds noise of one of `levels` strengths (squared-cosine schedule) and predicts it; acting takes `samples` steps
+of DDIM.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ class DiffusionConfig:
     light: float = 0.03
 
     def __post_init__(self):
-        require(1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed")
+        require(
+            1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed"
+        )
         require(1 <= self.samples <= self.levels, f"{self.samples} denoising steps do not fit {self.levels} levels")
 
 

@@ -88,7 +88,7 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
     batch, height, width, channels = images.shape
     require(
         height % size == 0 == width % size,
-        f"images of {height} x {width} pixels cannot be averaged down to {size} x {size}; choose a size that divides them",
+        f"images of {height} x {width} pixels cannot be averaged down to {size}; choose a size that divides them",
     )
     if (height, width) == (size, size):
         return images
@@ -98,7 +98,9 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
 def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
     """`shrink` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
     height, width = images.shape[-3:-1]
-    require(height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}")
+    require(
+        height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}"
+    )
     parts = images.reshape(*images.shape[:-3], size, height // size, size, width // size, images.shape[-1])
     return np.round(parts.mean((-4, -2), dtype=np.float32)).astype(np.uint8)
 
