@@ -62,7 +62,7 @@ class DiffusionConfig:
 def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:
     first, second = jax.random.split(jax.random.key(seed))
     out, width = config.chunk * action_dim, config.width
-    inputs = config.encoder.hidden + EMBEDDED + out
+    inputs = config.encoder.features + EMBEDDED + out
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),
         "denoiser": init_mlp(second, (inputs, width, width, out)),
@@ -77,7 +77,7 @@ def signal(levels: int) -> np.ndarray:
 
 
 def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array) -> jax.Array:
-    """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, hidden]."""
+    """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, 3 K]."""
     rate = jnp.exp(-jnp.log(1000.0) * jnp.arange(EMBEDDED // 2) / (EMBEDDED // 2))
     angle = level[:, None] * rate
     return mlp(params["denoiser"], jnp.concatenate([seen, jnp.sin(angle), jnp.cos(angle), noised], -1))

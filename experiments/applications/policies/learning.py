@@ -24,7 +24,7 @@ class FitConfig:
 
     steps: int = 3000
     batch: int = 64
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     warmup: int = 50
     weight_decay: float = 1e-4
     ema: float = 0.995
