@@ -62,7 +62,7 @@ def init_head(config: HeadConfig, seed: int) -> Params:
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3),
-        "mlp": init_mlp(second, (hidden, hidden, 1)),
+        "mlp": init_mlp(second, (config.encoder.features, hidden, hidden, 1)),
     }
 
 

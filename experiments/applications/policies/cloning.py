@@ -55,7 +55,7 @@ def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),
-        "mlp": init_mlp(second, (hidden, hidden, config.chunk * action_dim)),
+        "mlp": init_mlp(second, (config.encoder.features, hidden, hidden, config.chunk * action_dim)),
     }
 
 
