@@ -112,5 +112,6 @@ def test_the_head_judges_environments_and_forgets_with_them(judged):
     judge = HeadJudge(head, hold=2)
     head.reached = lambda images: images[:, 0, 0, 0] > 0
     frames = [[1, 0], [1, 1], [1, 0], [0, 1], [1, 1]]
-    done = [judge(SimpleNamespace(images=np.full((2, 8, 8, 3), 1) * np.array(f)[:, None, None, None]))[1] for f in frames]
+    images = [np.broadcast_to(np.array(f)[:, None, None, None], (2, 8, 8, 3)) for f in frames]
+    done = [judge(SimpleNamespace(images=each))[1] for each in images]
     assert [d.tolist() for d in done] == [[False, False], [True, False], [True, False], [False, False], [False, True]]

@@ -41,7 +41,8 @@ def test_demonstrations_are_what_the_simulator_does_under_their_actions():
 
 
 def test_experts_succeed_more_often_than_play_and_their_episodes_end_soon_after(demos):
-    assert len(demos) == 24 and demos.successes.mean() > record(TASK, 24, image_size=8, play=True).successes.mean() + 0.3
+    play = record(TASK, 24, image_size=8, play=True)
+    assert len(demos) == 24 and demos.successes.mean() > play.successes.mean() + 0.3
     done = np.flatnonzero(demos.successes)
     first = held(demos.reached, TASK.hold).argmax(1)
     assert (demos.lengths[done] == np.minimum(first[done] + 2, TASK.frames)).all()
@@ -81,10 +82,9 @@ def test_cloning_learns_and_is_a_function_of_its_seed(demos):
     assert sorted(kept) == [1, 50, 150]
     assert losses[150] < 0.8 * losses[50]
     short = BcConfig(encoder=SMALL, fit=FitConfig(steps=1, batch=16))
-    again, other = train_bc(demos, short, 1)[1], train_bc(demos, short, 2)[1]
-    first = "convolutions"
-    np.testing.assert_array_equal(again["encoder"][first][0]["w"], train_bc(demos, short, 1)[1]["encoder"][first][0]["w"])
-    assert not np.array_equal(again["encoder"][first][0]["w"], other["encoder"][first][0]["w"])
+    one, again, other = (train_bc(demos, short, seed)[1]["mlp"][0]["w"] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("kind", ["cloned", "diffusion"])
