@@ -13,10 +13,15 @@ from experiments.applications.policies.diffusion import DiffusionConfig, Diffusi
 from experiments.applications.policies.files import DESCRIPTION, load_policy, save_policy
 from experiments.applications.policies.learning import FitConfig, Report, ladder
 from experiments.applications.policies.network import EncoderConfig
+from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
 
 RANDOM = "random"
+
+OWN_HEAD = "hma"
+"""The model itself, where it predicts actions."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,10 @@ def train_ladder(
             save_policy(policy, directory / f"{kind}-{step}", about | {"step": step, "seed": seed})
 
 
-def find_policy(directory: Path, name: str, robot: Robot) -> Policy:
+def find_policy(directory: Path, name: str, robot: Robot, simulator: Simulator) -> Policy:
     """Raises ConfigError where it is not, or damaged."""
-    return RandomPolicy(robot) if name == RANDOM else load_policy(directory / name)
+    if name == RANDOM:
+        return RandomPolicy(robot)
+    if name == OWN_HEAD:
+        return OwnHeadPolicy(simulator.model, simulator.tokenizer, robot)
+    return load_policy(directory / name)

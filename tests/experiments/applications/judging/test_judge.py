@@ -51,9 +51,9 @@ def judged(tmp_path_factory):
 
 def test_every_policy_is_judged_at_every_start_in_every_world(judged):
     _, found = judged
-    assert found.policies == ("random", "cloned-1", "cloned-3") == tuple(names(ASKED.ladder))
+    assert found.policies == ("random", "cloned-1", "cloned-3", "hma") == (*names(ASKED.ladder), "hma")
     rows = {(o.policy, o.start, o.world, o.judge) for o in found.outcomes}
-    assert len(rows) == len(found.outcomes) == 3 * 4 * 4
+    assert len(rows) == len(found.outcomes) == 4 * 4 * 4
     assert {o.world for o in found.outcomes if o.judge == STATE} == {TRUE}
     a, b = (found.rollouts("cloned-3", world) for world in (TRUE, LEARNED))
     assert a.images.shape == b.images.shape == (4, 3, 8, 8, 3)
@@ -87,13 +87,13 @@ def test_table_summary_and_page(judged):
     assert head["low"] <= head["mean"] <= head["high"]
     draw_scatter(summary, out / "scatter.png")
     page = write_page(found, summary, out, "hma judge").read_text()
-    assert page.count("<figure") == 3 and "cloned-3" in page and "http" not in page
+    assert page.count("<figure") == 4 and "cloned-3" in page and "http" not in page
 
 
 def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path):
     root, found = judged
     page = write_blind(found, root / "out", clips=10).read_text()
-    assert page.count("<img") == 10 and not any(name in page for name in (*found.policies, LEARNED))
+    assert page.count("<img") == 10 and not any(name in page for name in ("cloned", "random", LEARNED))
     key = json.loads((root / "out" / "blind.json").read_text())
     said = {(o.policy, o.world, o.start): o.success for o in found.outcomes if o.judge == HEAD}
     labels = {str(n): said[tuple(clip)] for n, clip in enumerate(key["clips"])}
