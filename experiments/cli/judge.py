@@ -32,10 +32,10 @@ def judge(
     """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
 
     Policies are trained on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and
-    a random one, and the model itself where it has action heads. Success in the model is told by a head, in the truth by the state; the head looks at true frames too,
-    and a control executes what a policy does in another episode. Writes table, agreement with intervals, a page with
-    clips, and a page on which a person can label successes blindly. Goes on where it was stopped. docs/judging.md says
-    how to read it.
+    a random one; the model itself, where it has action heads. Success in the model is told by a head, in the truth by
+    the state; the head looks at true frames too, and a control executes what a policy does in another episode. Writes
+    table, agreement with intervals, a page with clips, and a page on which a person can label successes blindly. Goes
+    on where it was stopped. docs/judging.md says how to read it.
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.
