@@ -18,7 +18,7 @@ def judge(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
     robot: Annotated[str, arg(metavar="NAME")],
     out: Annotated[Path, arg(metavar="DIR")],
-    task: Literal["own", "reach"] = "own",
+    task: Literal["own", "reach", "hover"] = "own",
     starts: int = 50,
     batch: Annotated[int | None, UNSET] = None,
     frames: Annotated[int | None, UNSET] = None,
@@ -41,7 +41,8 @@ def judge(
         run: Directory of a training run, or experiments/results/simulator.
         robot: Which of its robots; the suite must have it.
         out: Where everything is written.
-        task: The robot's own task (push or carry the puck to the mark), or reaching the mark with the tool.
+        task: The robot's own task (push or carry the puck to the mark), reaching the mark with the tool, or hovering
+            with the tool above a puck.
         starts: Held-out episodes at whose beginning every policy starts.
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's.

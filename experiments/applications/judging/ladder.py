@@ -34,6 +34,7 @@ class LadderConfig:
     first: int = 60  # the step of the first checkpoint
     batch: int = 64
     learning_rate: float = 2e-3
+    frames: int = 1  # one shows all there is; of two, what was just done can be read, and is then merely done again
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def fit(self, rungs: int) -> FitConfig:
@@ -66,11 +67,11 @@ def train_ladder(
         recorded = demos() if recorded is None else recorded
         scale, fit = scale_of(recorded), config.fit(rungs)
         if kind == ClonedPolicy.kind:
-            bc = BcConfig(encoder=config.encoder, fit=fit)
+            bc = BcConfig(frames=config.frames, encoder=config.encoder, fit=fit)
             params = train_bc(recorded, bc, seed, reports(kind))
             made = {step: ClonedPolicy(bc, p, scale) for step, p in params.items()}
         else:
-            dp = DiffusionConfig(encoder=config.encoder, fit=fit)
+            dp = DiffusionConfig(frames=config.frames, encoder=config.encoder, fit=fit)
             params = train_diffusion(recorded, dp, seed, reports(kind))
             made = {step: DiffusionPolicy(dp, p, scale) for step, p in params.items()}
         for step, policy in made.items():

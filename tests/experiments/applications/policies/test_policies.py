@@ -146,3 +146,9 @@ def test_denoising_with_the_true_noise_gives_the_chunk(monkeypatch, demos):
 
 def test_a_ladder_has_its_first_and_last_rung():
     assert ladder(1000, 4, 1) == (1, 10, 100, 1000)
+
+
+@pytest.mark.parametrize("name", ["reach", "hover"])
+def test_another_task_changes_no_frame_and_no_start(name):
+    other, own = (record(find_task("gripper_wood", task, 2), 2) for task in (name, "own"))
+    np.testing.assert_array_equal(other.images[:, 0], own.images[:, 0])
