@@ -1,0 +1,123 @@
+"""What policies of the suite's robots are to do, and when it is done: by the simulator's state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from data_pipelines.suite.simulator import SPECS
+from data_pipelines.suite.spec import EmbodimentSpec
+from data_pipelines.suite.tasks import Push, Reach, Scene
+from data_pipelines.suite.world import State, World
+from hma_jax.config import require
+
+OWN, REACH, HOVER = "own", "reach", "hover"
+TASKS = (OWN, REACH, HOVER)
+
+RADIUS = 0.22
+"""Within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own."""
+
+
+@dataclass(frozen=True)
+class ReachMark(Reach):
+    """The tool nearer to the mark than the mark is large, whose size and the episode's start stay what they were."""
+
+    within: float = RADIUS
+
+    def done(self, scene: Scene) -> np.ndarray:
+        return self.away(scene) < self.within
+
+    def away(self, scene: Scene) -> np.ndarray:
+        """float [n]: how far the farthest tool is from its mark."""
+        return np.linalg.norm(scene.tools - scene.goals, axis=-1).max(1)
+
+
+@dataclass(frozen=True)
+class HoverPuck(ReachMark):
+    """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things. The
+    expert takes small steps, so that its recordings are of the way there."""
+
+    step: float = 0.15  # that the expert moves the tool at once, world units
+
+    def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        target, move = scene.tools.copy(), self._move(scene)
+        target[:, 0] += move * np.minimum(self.step / np.maximum(np.linalg.norm(move, axis=-1), 1e-9), 1.0)[:, None]
+        return target, np.ones(target.shape[:2])
+
+    def away(self, scene: Scene) -> np.ndarray:
+        """float [n]: how far the tool is from the nearest puck."""
+        return np.linalg.norm(self._move(scene), axis=-1)
+
+    def _move(self, scene: Scene) -> np.ndarray:
+        """[n, 2], from the tool to that puck."""
+        moves = scene.objects - scene.tools[:, :1]
+        return moves[np.arange(len(moves)), np.linalg.norm(moves, axis=-1).argmin(1)]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of one robot. An episode succeeds when the goal is reached at `hold` frames in a row, within `frames`."""
+
+    robot: str
+    name: str
+    frames: int = 16
+    hold: int = 2
+
+    def __post_init__(self):
+        require(self.robot in SPECS, f"the suite has no robot {self.robot!r}; it has {', '.join(SPECS)}")
+        require(self.name in TASKS, f"no task {self.name!r}; there are {', '.join(TASKS)}")
+        require(1 <= self.hold <= self.frames, f"a goal held for {self.hold} frames does not fit {self.frames} frames")
+
+    @property
+    def spec(self) -> EmbodimentSpec:
+        """The robot with this task. Only what counts as done differs from its own: frames look the same."""
+        spec = SPECS[self.robot]
+        if self.name == OWN:
+            return spec
+        own, kind = spec.task, ReachMark if self.name == REACH else HoverPuck
+        return replace(spec, task=kind(own.radius, own.objects, own.size, own.carries, own.marks_object))
+
+    @property
+    def goal(self) -> str:
+        """In words."""
+        if self.name != OWN:
+            return "the tool on the mark" if self.name == REACH else "the tool above a puck"
+        return "the puck on the mark" if isinstance(SPECS[self.robot].task, Push) else "the puck carried to the mark"
+
+
+def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int | None = None) -> Task:
+    """A task with its usual length, unless another is given. Raises ConfigError for one that there is not."""
+    task = Task(robot, name)
+    # A tool that wanders passes over the mark; one that was steered there stays.
+    task = replace(task, frames=16, hold=4) if name != OWN else task
+    return replace(task, frames=frames or task.frames, hold=hold or task.hold)
+
+
+def stack(states: Sequence[State]) -> State:
+    """States of one robot as one of all their episodes."""
+    return State(**{f.name: np.concatenate([getattr(s, f.name) for s in states]) for f in fields(State)})
+
+
+def reached(spec: EmbodimentSpec, states: Sequence[State]) -> np.ndarray:
+    """bool [n]: the goal of the spec's task is reached in each state."""
+    return world_of(spec, states).success()
+
+
+def world_of(spec: EmbodimentSpec, states: Sequence[State]) -> World:
+    """A world that goes on from these states."""
+    state = stack(states)
+    world = World(spec, state.seeds)
+    world.state = state
+    return world
+
+
+def held(reached_NL: np.ndarray, hold: int) -> np.ndarray:
+    """bool [N, L]: the goal was reached at this frame and the hold - 1 before it."""
+    runs = np.zeros(reached_NL.shape, int)
+    count = np.zeros(len(reached_NL), int)
+    for t in range(reached_NL.shape[1]):
+        count = np.where(reached_NL[:, t], count + 1, 0)
+        runs[:, t] = count
+    return runs >= hold
