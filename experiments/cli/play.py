@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -54,7 +55,7 @@ def play(
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
     from experiments.applications.simulators import has_truth, load_simulator, true_simulator
     from hma_jax.simulator.folder import find_decode
-    from hma_jax.simulator.warm_up import warm_up
+    from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
     require(
         run != SHIPPED or run.is_dir(),
@@ -69,7 +70,7 @@ def play(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )
     console.print(f"{run}: {len(simulator.robots)} robots; compiling")
-    warm_up(simulator)
+    warm_up(simulator, together=1)
 
     def truth(robot: Robot) -> SuiteSimulator | None:
         return true_simulator(simulator, [robot]) if has_truth(robot) else None
@@ -79,6 +80,8 @@ def play(
     def say(actual: int) -> None:
         shown = "localhost" if host == "127.0.0.1" else host
         console.print(f"drive it at http://{shown}:{actual} (end with Ctrl-C)", soft_wrap=True)
+        if visitors > 1:  # the first one need not wait until it is compiled for all
+            threading.Thread(target=warm_up_more, args=(simulator, 1), daemon=True).start()
 
     try:
         asyncio.run(serve(app, host, port, say))

@@ -5,8 +5,9 @@
 with it, `environment` Gymnasium's view of both. Decoding and the window are `hma_jax.generation`'s.
 """
 
+from hma_jax.simulator.episode import Snapshot
 from hma_jax.simulator.robots import Robot
-from hma_jax.simulator.simulator import Simulator, Snapshot
+from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 __all__ = ["Robot", "Simulator", "Snapshot", "Start"]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 from collections import deque
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from hma_jax.config import require
+from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -55,3 +57,11 @@ def begin_episode(robot: Robot, index: int, start: Start, seed: int, room: int, 
     chunks[:, : flat.shape[1]] = flat[between + 1 - seen :]
     kept = room + history
     return Episode(robot, index, seed, seen, deque(maxlen=kept), deque(chunks, maxlen=kept - 1))
+
+
+class Snapshot(NamedTuple):
+    """Where all episodes of a simulator stood."""
+
+    state: Episodes
+    images: np.ndarray
+    episodes: tuple[Episode | None, ...]

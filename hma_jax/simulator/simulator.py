@@ -9,13 +9,14 @@ import copy
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import jax
 import numpy as np
 
 from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, require
 from hma_jax.generation.episodes import Episodes
-from hma_jax.simulator.episode import Episode, begin_episode
+from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
 from hma_jax.simulator.programs import Beginning, Programs, padded
 from hma_jax.simulator.robots import Outside, Robot
@@ -30,14 +31,6 @@ HISTORY = 600
 """Frames that an episode can be taken back by, unless told otherwise."""
 
 log = logging.getLogger(__name__)
-
-
-class Snapshot(NamedTuple):
-    """Where all episodes of a simulator stood."""
-
-    state: Episodes
-    images: np.ndarray
-    episodes: tuple[Episode | None, ...]
 
 
 class Simulator:
@@ -245,6 +238,15 @@ class Simulator:
             episode.chunks.append(chunk)
             episode.count += 1
         return self._show(list(chunks), np.asarray(seen)[: len(chunks)])
+
+    def compile(self, together: int) -> None:
+        """What so many episodes that advance at once need, before somebody waits for it. From any thread: the episodes
+        themselves are not touched."""
+        require(1 <= together <= len(self), f"1 to {len(self)} episodes advance at once, not {together}")
+        rows = np.array(padded(list(range(together)), len(self)), np.int32)
+        chunk_nU = np.zeros((len(rows), self.model.table.action_width), np.float32)
+        blank = self._programs.empty(), rows, chunk_nU, np.zeros(len(rows), np.uint32)
+        jax.block_until_ready(self._programs.advance(self._programs.weights, *blank))
 
     # --- Going back, and apart ---------------------------------------------------------------------
 

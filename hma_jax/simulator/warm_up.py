@@ -8,16 +8,25 @@ from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
 
-def warm_up(simulator: Simulator) -> None:
-    """Begins, rewinds and advances black episodes, as many together as there may be; then all is as before."""
-    kept, together = simulator.snapshot(), 0
+def warm_up(simulator: Simulator, together: int | None = None) -> None:
+    """Begins and rewinds black episodes, then all is as before; and compiles for as many as advance together, or up to
+    `together` of them. The others: `warm_up_more`."""
+    kept = simulator.snapshot()
     robot = next(iter(simulator.robots.values()))
     black = np.zeros((1, *simulator.images.shape[1:]), np.uint8)
     simulator.reset(Start(robot.name, black, np.zeros((0, robot.action_dim), np.float32)))
     simulator.rewind(0)
-    action = np.array(robot.rest, np.float32)
-    while together < len(simulator):
-        together = min(2 * together or 1, len(simulator))
-        for _ in range(robot.stride if simulator.rate == "native" else 1):
-            simulator.step([action] * together + [None] * (len(simulator) - together))
     simulator.restore(kept)
+    warm_up_more(simulator, 0, together)
+
+
+def warm_up_more(simulator: Simulator, above: int, most: int | None = None) -> None:
+    """Compiles for more than `above` episodes that advance together, up to `most` or all; also in a thread of its own."""
+    for together in sizes(len(simulator)):
+        if above < together <= (most or len(simulator)):
+            simulator.compile(together)
+
+
+def sizes(episodes: int) -> list[int]:
+    """Of the programs that advance so many episodes: the powers of two below, and all."""
+    return sorted({*(1 << k for k in range(episodes.bit_length()) if 1 << k < episodes), episodes})
