@@ -1,4 +1,4 @@
-"""True frames of the suite's robots with what is to be seen in them: where each tool and each object is, by its colour."""
+"""True frames of the suite's robots with what is to be seen in them: where tools and objects are, these by colour."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import IMAGE_SIZE, EmbodimentSpec
 from data_pipelines.suite.visible import object_colours, visible_shares
-from hma_jax.simulator.robots import Robot
 
 SEEN = 0.25
 """Share of a thing that must be seen for it to be there."""
@@ -34,13 +33,12 @@ class Points(NamedTuple):
         return self.share >= SEEN
 
 
-class Pairs(NamedTuple):
-    """n pairs of true frames in a row, and the action between them."""
+class Scenes(NamedTuple):
+    """n true frames and what is in them."""
 
-    images: np.ndarray  # uint8 [2, n, H, W, 3]
-    position: np.ndarray  # float32 [2, n, P, 2]
-    there: np.ndarray  # bool [2, n, P]
-    action: np.ndarray  # float32 [n, A], normalised
+    images: np.ndarray  # uint8 [n, H, W, 3]
+    position: np.ndarray  # float32 [n, P, 2]
+    there: np.ndarray  # bool [n, P]
 
 
 def point_names(spec: EmbodimentSpec) -> tuple[str, ...]:
@@ -64,28 +62,16 @@ def points_of(spec: EmbodimentSpec, seed_F: np.ndarray, q: np.ndarray, objects: 
     return Points(position, share)
 
 
-def normalised(robot: Robot, actions: np.ndarray) -> np.ndarray:
-    """Actions [..., A] in half ranges around the middle of the range."""
-    low, high = np.array(robot.low), np.array(robot.high)
-    return ((actions - (low + high) / 2) / np.maximum((high - low) / 2, 1e-9)).astype(np.float32)
-
-
-def draw_pairs(
-    spec: EmbodimentSpec, robot: Robot, split: str, episodes: int, per_episode: int, seed: int, missing: float = 0.0
-) -> Pairs:
-    """Pairs of frames at random moments of a split's first episodes; each object is missing with that probability."""
+def draw_scenes(
+    spec: EmbodimentSpec, split: str, episodes: int, per_episode: int, seed: int, missing: float = 0.0
+) -> Scenes:
+    """Frames at random moments of a split's first episodes; each object is missing with probability `missing`."""
     seeds = episode_seeds(spec, episodes, 0, split)
     rollout, rng = simulate(spec, seeds), np.random.default_rng([seed, *map(ord, spec.name)])
     episode = np.repeat(np.arange(episodes), per_episode)
-    when = (rng.random(len(episode)) * (rollout.lengths[episode] - 1)).astype(int)
+    when = (rng.random(len(episode)) * rollout.lengths[episode]).astype(int)
     gone = rng.random((len(episode), rollout.objects.shape[2])) < missing
-    looks = draw_appearance(spec, seeds)
-    images, position, there = [], [], []
-    for t in (when, when + 1):
-        q, objects = rollout.q[episode, t], np.where(gone[..., None], AWAY, rollout.objects[episode, t])
-        points = points_of(spec, seeds[episode], q, objects)
-        images.append(render_frames(spec, looks, rollout.goals, q, objects, episode))
-        position.append(points.position)
-        there.append(points.there)
-    action = normalised(robot, rollout.actions[episode, when])
-    return Pairs(np.stack(images), np.stack(position), np.stack(there), action)
+    q, objects = rollout.q[episode, when], np.where(gone[..., None], AWAY, rollout.objects[episode, when])
+    points = points_of(spec, seeds[episode], q, objects)
+    images = render_frames(spec, draw_appearance(spec, seeds), rollout.goals, q, objects, episode)
+    return Scenes(images, points.position, points.there)

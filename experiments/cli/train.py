@@ -41,8 +41,8 @@ def train(
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
         hosts: Several processes that train together, on one host or on many.
-        begin: A trained model of the same robots and architecture, whose weights (their average, where it keeps one) the
-            new run begins with.
+        begin: A trained model of the same robots and architecture. The new run begins with its weights, or with their
+            average where it keeps one.
     """
     hosts.join()
     setting = make_setting(asked)

@@ -1,8 +1,7 @@
-"""A small network that finds what is in a robot's frames: points by heatmaps, and the action between two frames.
+"""A small network that finds points in a robot's frames, by heatmaps: its tools, and objects by their colour.
 
 One trunk for all robots, an output of its own for each. The peak of a point's heatmap says whether it is there at all,
-the cells around the peak where. Two frames in a row say which action moved what: what is read is compared with what was
-commanded. Pure functions of arrays; who trains it, and on what, is not its business.
+the cells around the peak where. Pure functions of arrays; who trains it, and on what, is not its business.
 """
 
 from __future__ import annotations
@@ -26,12 +25,9 @@ AROUND = 2
 LAYERS = {
     "half": (4, 3, 16), "half2": (3, 16, 24), "quarter": (3, 24, 32), "quarter2": (3, 32, 32), "eighth": (3, 32, 64),
     "eighth2": (3, 64, 64), "up_quarter": (1, 64, 32), "merge_quarter": (3, 32, 32), "up_half": (1, 32, 24),
-    "merge_half": (3, 24, 24), "motion": (1, 64, 16),
+    "merge_half": (3, 24, 24),
 }  # fmt: skip
 """Convolutions: side, channels in, channels out."""
-
-HIDDEN = 64
-"""Units that read an action."""
 
 
 class Found(NamedTuple):
@@ -41,21 +37,17 @@ class Found(NamedTuple):
     confidence: jax.Array
 
 
-def init_detector(key: jax.Array, robots: int, points: int, actions: int, size: int) -> Weights:
-    """For `robots` robots of at most `points` points and `actions` action values, and square frames of `size` pixels,
-    a multiple of 8."""
+def init_detector(key: jax.Array, robots: int, points: int) -> Weights:
+    """For `robots` robots of at most `points` points, and frames whose sides are multiples of 8 pixels."""
     shapes = {name: (side, side, a, b) for name, (side, a, b) in LAYERS.items()}
-    cells = (size // 8) ** 2
-    shapes |= {"hidden": (cells * 2 * LAYERS["motion"][2], HIDDEN)}
-    shapes |= {"heads": (robots, LAYERS["merge_half"][2], points), "read": (robots, HIDDEN, actions)}
+    shapes["heads"] = (robots, LAYERS["merge_half"][2], points)
     weights = {}
     for name, shape in shapes.items():
         key, own = jax.random.split(key)
         fan_in = shape[-2] * (shape[0] * shape[1] if len(shape) == 4 else 1)
         weights[name] = jax.random.normal(own, shape) * (2.0 / fan_in) ** 0.5
-        if name not in ("heads", "read"):
-            weights[name + "_bias"] = jnp.zeros(shape[-1])
-    return weights | {"heads_bias": jnp.full((robots, points), -4.0), "read_bias": jnp.zeros((robots, actions))}
+        weights[name + "_bias"] = jnp.zeros(shape[-1])
+    return weights | {"heads_bias": jnp.full((robots, points), -4.0)}
 
 
 def _conv(weights: Weights, name: str, x: jax.Array, stride: int = 1) -> jax.Array:
@@ -68,8 +60,8 @@ def _twice(x: jax.Array) -> jax.Array:
     return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)
 
 
-def look(weights: Weights, images: jax.Array, robot_n: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(heat logits [n, H / 2, W / 2, P], features [n, H / 8, W / 8, 64]) of frames [n, H, W, 3] in 0..255."""
+def look(weights: Weights, images: jax.Array, robot_n: jax.Array) -> jax.Array:
+    """Heat logits [n, H / 2, W / 2, P] of frames [n, H, W, 3] in 0..255."""
     act = jax.nn.relu
     x = images.astype(jnp.float32) / 127.5 - 1.0
     half = act(_conv(weights, "half2", act(_conv(weights, "half", x, 2))))
@@ -78,21 +70,12 @@ def look(weights: Weights, images: jax.Array, robot_n: jax.Array) -> tuple[jax.A
     x = act(_conv(weights, "merge_quarter", act(quarter + _twice(_conv(weights, "up_quarter", eighth)))))
     x = act(_conv(weights, "merge_half", act(half + _twice(_conv(weights, "up_half", x)))))
     heat = jnp.einsum("nhwc,ncp->nhwp", x, weights["heads"][robot_n])
-    return heat + weights["heads_bias"][robot_n][:, None, None], eighth
+    return heat + weights["heads_bias"][robot_n][:, None, None]
 
 
-def read_action(weights: Weights, before: jax.Array, after: jax.Array, robot_n: jax.Array) -> jax.Array:
-    """The normalised action [n, U] between frames that follow each other, from the features of both."""
-    seen = [jax.nn.relu(_conv(weights, "motion", x)).reshape(len(x), -1) for x in (before, after)]
-    hidden = jnp.concatenate(seen, axis=-1) @ weights["hidden"] + weights["hidden_bias"]
-    return jnp.einsum("nd,ndu->nu", jax.nn.relu(hidden), weights["read"][robot_n]) + weights["read_bias"][robot_n]
-
-
-def watch(weights: Weights, film: jax.Array, robot: jax.Array) -> tuple[Found, jax.Array]:
-    """Points in all frames of one robot's film [n + 1, H, W, 3], and the normalised actions [n, U] between them."""
-    robots = jnp.full(len(film), robot)
-    heat, features = look(weights, film, robots)
-    return locate(heat), read_action(weights, features[:-1], features[1:], robots[1:])
+def watch(weights: Weights, film: jax.Array, robot: jax.Array) -> Found:
+    """Points in all frames of one robot's film [n, H, W, 3]."""
+    return locate(look(weights, film, jnp.full(len(film), robot)))
 
 
 def locate(heat: jax.Array) -> Found:
@@ -118,18 +101,14 @@ def heat_of(position: jax.Array, there: jax.Array, cells: int) -> jax.Array:
     return jnp.exp(-away / (2 * SPREAD**2)) * there[:, None, None]
 
 
-def detection_loss(
-    weights: Weights, images: jax.Array, robot_n: jax.Array, position: jax.Array, there: jax.Array, known: jax.Array,
-    action: jax.Array, alive: jax.Array,
-) -> jax.Array:  # fmt: skip
-    """Of pairs of frames [2, n, H, W, 3] with points [2, n, P, 2], there or not [2, n, P], of which `known` [n, P] are
-    asked, and the normalised action [n, U] between them, of which `alive` [n, U] are the robot's."""
-    count = len(robot_n)
-    heat, features = look(weights, images.reshape(-1, *images.shape[2:]), jnp.concatenate([robot_n, robot_n]))
-    read = read_action(weights, features[:count], features[count:], robot_n)
-    wanted = heat_of(position.reshape(-1, *position.shape[2:]), there.reshape(-1, there.shape[-1]), heat.shape[1])
-    cost = jax.nn.softplus(heat) - wanted * heat  # cross-entropy of every cell
-    floor = jax.scipy.special.entr(wanted) + jax.scipy.special.entr(1 - wanted)
-    asked = jnp.concatenate([known, known])[:, None, None]
-    heats = ((cost - floor) * asked).sum() / asked.sum()
-    return heats + (jnp.square(read - action) * alive).sum() / alive.sum()
+def points_loss(
+    weights: Weights, images: jax.Array, robot_n: jax.Array, position: jax.Array, there: jax.Array, known: jax.Array
+) -> jax.Array:
+    """Of frames [n, H, W, 3] with points [n, P, 2], there or not [n, P], of which `known` [n, P] are the robot's: the
+    cross-entropy of all cells, above its least value."""
+    heat = look(weights, images, robot_n)
+    wanted = heat_of(position, there, heat.shape[1])
+    cost = jax.nn.softplus(heat) - wanted * heat
+    least = jax.scipy.special.entr(wanted) + jax.scipy.special.entr(1 - wanted)
+    asked = known[:, None, None]
+    return ((cost - least) * asked).sum() / asked.sum()

@@ -1,0 +1,104 @@
+"""Question: how long does a learned simulator hold?
+Command: python -m experiments.applications.endurance RUN --minutes 10 --out DIR
+Cost: ten minutes of eight robots, 20 minutes of one core for each variant.
+Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
+
+Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped. Writes
+DIR/endurance.csv (a row per variant, robot and minute) and figures. A detector is needed
+(experiments.applications.detector).
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from data_pipelines.suite.simulator import SPECS
+from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.detector import WEIGHTS, Detector, known_robots
+from experiments.applications.endurance.drives import Kind, make_drive
+from experiments.applications.endurance.films import Film, load_films, make_films, save_films
+from experiments.applications.endurance.tables import Row, over_robots, rows_of, write_rows
+from experiments.applications.simulators import load_simulator
+from experiments.progress import console, step
+from experiments.wrote import wrote
+from hma_jax.config import ExecutionConfig, require
+from hma_jax.simulator.folder import find_decode
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "shipped": {},
+    "streaming": {"slide": "streaming"},
+    "likeliest": {"temperature": 0.0},
+    "temperature_0.4": {"temperature": 0.4},
+    "temperature_1": {"temperature": 1.0},
+    "confidence": {"order": "confidence"},
+    "steps_2": {"unmask_steps": 2},
+    "steps_16": {"unmask_steps": 16},
+    "top_1_of_steps_16": {"unmask_steps": 16, "temperature": 0.0},
+}
+"""What is changed of the way in which RUN/decode.json fills frames."""
+
+KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
+TABLE = "endurance.csv"
+
+
+def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float) -> Path:
+    return out / "films" / f"{name}-{variant}-{kind}-{minutes:g}.npz"
+
+
+def run_variant(run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, update) -> dict[str, Film]:
+    """All robots of a run that the suite knows, each from its first start on, in one batch."""
+    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
+    robots = known_robots(simulator.robots)
+    decode = replace(find_decode(run), **VARIANTS[variant])
+    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=len(robots), decode=decode, history=1)
+    drives = []
+    for name, robot in robots.items():
+        start = next(s for s in simulator.starts if s.robot == name and s.seed is not None)
+        drives.append(make_drive(robot, start, round(60 * minutes * robot.hz), kind, seed=0))
+    return make_films(simulator, detector, drives, update)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
+    parser.add_argument("--minutes", type=float, default=10.0, help="of simulated time")
+    parser.add_argument("--variants", nargs="+", default=["shipped"], choices=list(VARIANTS), metavar="NAME")
+    parser.add_argument("--drives", nargs="+", default=["behaviour"], choices=KINDS)
+    parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
+    parser.add_argument("--name", default="model", help="of the run, in file names and the table")
+    parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
+    asked = parser.parse_args()
+    require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
+    detector, rows = Detector.load(asked.detector), []
+    for kind in asked.drives:
+        for variant in asked.variants:
+            path = film_path(asked.out, asked.name, variant, kind, asked.minutes)
+            if not path.exists():
+                with step(f"{variant}, {kind}, {asked.minutes:g} min") as update:
+                    save_films(run_variant(asked.run, detector, variant, kind, asked.minutes, update), path)
+            films = load_films(path)
+            hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
+            new = rows_of(f"{asked.name}/{variant}", kind, films, hz, tools, asked.every)
+            show(new)
+            rows += new
+    write_rows(asked.out / TABLE, rows)
+    wrote(asked.out / TABLE)
+
+
+def show(rows: list[Row]) -> None:
+    """Means over robots of the first part, the last one, and some between."""
+    parts = sorted({row["part"] for row in rows})
+    for part in dict.fromkeys([parts[0], parts[len(parts) // 2], parts[-1]]):
+        mine = [row for row in rows if row["part"] == part]
+        words = [f"{n} {over_robots(mine, n)[0]:.3f}±{over_robots(mine, n)[1]:.3f}" for n in (
+            "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves", "true_follows",
+            "true_tool_close", "true_object_close", "histogram")]  # fmt: skip
+        console.print(f"{mine[0]['variant']} {mine[0]['drive']} part {part}: " + ", ".join(words), soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()
