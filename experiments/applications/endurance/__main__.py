@@ -4,8 +4,8 @@ Cost: ten minutes of eight robots, 20 minutes of one core for each variant.
 Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
 
 Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped. Writes
-DIR/endurance.csv (a row per variant, robot and minute) and figures. A detector is needed
-(experiments.applications.detector).
+DIR/endurance.csv (a row per variant, drive, robot and minute), curves.png and, of every variant, a sheet of frames, the
+truth above. A detector is needed (experiments.applications.detector).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.detector import WEIGHTS, Detector, known_robots
 from experiments.applications.endurance.drives import Kind, make_drive
+from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
 from experiments.applications.endurance.tables import Row, over_robots, rows_of, write_rows
 from experiments.applications.simulators import load_simulator
@@ -41,7 +42,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """What is changed of the way in which RUN/decode.json fills frames."""
 
 KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
-TABLE = "endurance.csv"
+TABLE, CURVES = "endurance.csv", "curves.png"
 
 
 def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float) -> Path:
@@ -55,7 +56,7 @@ def run_variant(run: Path, detector: Detector, variant: str, kind: Kind, minutes
     decode = replace(find_decode(run), **VARIANTS[variant])
     simulator = load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=len(robots), decode=decode, history=1)
     drives = []
-    for name, robot in robots.items():
+    for name, robot in robots.items():  # of true starts, in the true simulator: what is commanded does not see the model
         start = next(s for s in simulator.starts if s.robot == name and s.seed is not None)
         drives.append(make_drive(robot, start, round(60 * minutes * robot.hz), kind, seed=0))
     return make_films(simulator, detector, drives, update)
@@ -85,8 +86,11 @@ def main() -> None:
             new = rows_of(f"{asked.name}/{variant}", kind, films, hz, tools, asked.every)
             show(new)
             rows += new
+            draw_sheet(films, asked.out / f"{asked.name}-{variant}-{kind}.png")
+            console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
     write_rows(asked.out / TABLE, rows)
-    wrote(asked.out / TABLE)
+    draw_curves([row for row in rows if row["drive"] == asked.drives[0]], asked.out / CURVES)
+    wrote(asked.out / TABLE, asked.out / CURVES)
 
 
 def show(rows: list[Row]) -> None:

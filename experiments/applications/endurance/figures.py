@@ -55,7 +55,7 @@ def _curve(rows: Sequence[Row], name: str) -> tuple[np.ndarray, np.ndarray, np.n
     return minutes, *np.array(found).T
 
 
-def draw_sheet(films: Mapping[str, Film], hz: Mapping[str, float], path: Path) -> None:
+def draw_sheet(films: Mapping[str, Film], path: Path) -> None:
     """Two rows per robot, the truth above; columns at the same frames, `SHOWN`, of all."""
     columns = min(film.shown.shape[1] for film in films.values())
     rows = [np.concatenate(list(kind[:columns]), axis=1) for film in films.values() for kind in film.shown]
