@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -107,7 +107,12 @@ def batches(scenes: Sequence[Scenes], seed: int, count: int, size: int) -> Itera
 
 
 def train_detector(
-    scenes: Mapping[str, Scenes], *, steps: int = STEPS, size: int = BATCH, seed: int = 0, progress=lambda done, total: None
+    scenes: Mapping[str, Scenes],
+    *,
+    steps: int = STEPS,
+    size: int = BATCH,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Detector:
     """Raises ConfigError without scenes, or where training diverges."""
     require(bool(scenes), "there is no robot to train a detector on")
@@ -161,7 +166,8 @@ def shown_by(tokenizer, images: np.ndarray) -> np.ndarray:
     """Frames uint8 [n, H, W, 3] as a tokenizer shows them."""
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
     filled = np.concatenate([images, np.repeat(images[-1:], -len(images) % BLOCK, 0)])
-    return np.concatenate([np.asarray(whole(filled[i : i + BLOCK])) for i in range(0, len(filled), BLOCK)])[: len(images)]
+    parts = [np.asarray(whole(filled[i : i + BLOCK])) for i in range(0, len(filled), BLOCK)]
+    return np.concatenate(parts)[: len(images)]
 
 
 def as_shown(tokenizer, scenes: Scenes, every: int = 1) -> Scenes:
@@ -190,7 +196,8 @@ def main() -> None:
     with step("true frames") as update:
         train, held = {}, {}
         for i, name in enumerate(robots):
-            train[name] = as_shown(tokenizer, draw_scenes(SPECS[name], "train", EPISODES, PER_EPISODE, 0, MISSING), every=2)
+            drawn = draw_scenes(SPECS[name], "train", EPISODES, PER_EPISODE, 0, MISSING)
+            train[name] = as_shown(tokenizer, drawn, every=2)
             held[name] = draw_scenes(SPECS[name], "val", *HELD_OUT, 1)
             update(i + 1, len(robots), name)
     with step("train the detector") as update:

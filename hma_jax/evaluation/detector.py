@@ -31,7 +31,7 @@ LAYERS = {
 
 
 class Found(NamedTuple):
-    """P points in n frames: float32 [n, P, 2] in pixels (column, row), and [n, P] in [0, 1], how sure that it is there."""
+    """P points in n frames: float32 [n, P, 2] in pixels (column, row), and how sure it is there, [n, P] in [0, 1]."""
 
     position: jax.Array
     confidence: jax.Array

@@ -4,7 +4,7 @@ Cost: ten minutes of eight robots, 20 minutes of one core for each variant.
 Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
 
 Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped. Writes
-DIR/endurance.csv (a row per variant, drive, robot and minute), curves.png and, of every variant, a sheet of frames, the
+DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every variant, a sheet of frames, the
 truth above. A detector is needed (experiments.applications.detector).
 """
 
@@ -42,7 +42,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """What is changed of the way in which RUN/decode.json fills frames."""
 
 KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
-TABLE, CURVES = "endurance.csv", "curves.png"
+TABLE = "endurance.csv"
+SAID = (
+    "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves",
+    "true_follows", "true_tool_close", "true_object_close", "histogram",
+)  # fmt: skip
+"""Measures that are printed."""
 
 
 def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float) -> Path:
@@ -54,9 +59,10 @@ def run_variant(run: Path, detector: Detector, variant: str, kind: Kind, minutes
     simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
     robots = known_robots(simulator.robots)
     decode = replace(find_decode(run), **VARIANTS[variant])
-    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"), episodes=len(robots), decode=decode, history=1)
+    options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
+    simulator = load_simulator(run, **options)
     drives = []
-    for name, robot in robots.items():  # of true starts, in the true simulator: what is commanded does not see the model
+    for name, robot in robots.items():
         start = next(s for s in simulator.starts if s.robot == name and s.seed is not None)
         drives.append(make_drive(robot, start, round(60 * minutes * robot.hz), kind, seed=0))
     return make_films(simulator, detector, drives, update)
@@ -71,6 +77,7 @@ def main() -> None:
     parser.add_argument("--drives", nargs="+", default=["behaviour"], choices=KINDS)
     parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
     parser.add_argument("--name", default="model", help="of the run, in file names and the table")
+    parser.add_argument("--table", default=TABLE, help="file in DIR; curves of the same name")
     parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
     asked = parser.parse_args()
     require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
@@ -88,9 +95,10 @@ def main() -> None:
             rows += new
             draw_sheet(films, asked.out / f"{asked.name}-{variant}-{kind}.png")
             console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
-    write_rows(asked.out / TABLE, rows)
-    draw_curves([row for row in rows if row["drive"] == asked.drives[0]], asked.out / CURVES)
-    wrote(asked.out / TABLE, asked.out / CURVES)
+    table, curves = asked.out / asked.table, (asked.out / asked.table).with_suffix(".png")
+    write_rows(table, rows)
+    draw_curves([row for row in rows if row["drive"] == asked.drives[0]], curves)
+    wrote(table, curves)
 
 
 def show(rows: list[Row]) -> None:
@@ -98,9 +106,7 @@ def show(rows: list[Row]) -> None:
     parts = sorted({row["part"] for row in rows})
     for part in dict.fromkeys([parts[0], parts[len(parts) // 2], parts[-1]]):
         mine = [row for row in rows if row["part"] == part]
-        words = [f"{n} {over_robots(mine, n)[0]:.3f}±{over_robots(mine, n)[1]:.3f}" for n in (
-            "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves", "true_follows",
-            "true_tool_close", "true_object_close", "histogram")]  # fmt: skip
+        words = [f"{n} {over_robots(mine, n)[0]:.3f}±{over_robots(mine, n)[1]:.3f}" for n in SAID]
         console.print(f"{mine[0]['variant']} {mine[0]['drive']} part {part}: " + ", ".join(words), soft_wrap=True)
 
 

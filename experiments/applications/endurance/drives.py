@@ -22,8 +22,8 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 Kind = Literal["behaviour", "extremes", "alternation"]
-"""`behaviour`: as recorded, begun anew every `AGAIN` seconds; `extremes`: one action value after the other held at an end
-of its range for `HOLD` seconds, the others at rest; `alternation`: all values at once jump from end to end every frame."""
+"""`behaviour`: as recorded, begun anew every `AGAIN` seconds; `extremes`: one action value after the other held at an
+end of its range for `HOLD` seconds, the others at rest; `alternation`: all values jump from end to end every frame."""
 
 AGAIN, HOLD = 12.0, 2.0
 
@@ -48,9 +48,9 @@ class Drive:
 
     def frames(self, first: int, stop: int) -> np.ndarray:
         """True frames uint8 [stop - first, H, W, 3]."""
-        part, seeds = slice(first, stop), np.array([self.start.seed])
-        q, objects = self.q[part], self.objects[part]
-        return render_frames(self.spec, draw_appearance(self.spec, seeds), self.goals, q, objects, np.zeros(len(q), int))
+        q, objects = self.q[first:stop], self.objects[first:stop]
+        looks = draw_appearance(self.spec, [self.start.seed])
+        return render_frames(self.spec, looks, self.goals, q, objects, np.zeros(len(q), int))
 
     def points(self) -> Points:
         """Of all n + 1 states."""

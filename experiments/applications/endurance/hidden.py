@@ -4,9 +4,9 @@ Command: python -m experiments.applications.endurance.hidden RUN --out DIR
 Cost: ten minutes of one core.
 Expected: what was hidden for less than the model's window comes back as often as what was never hidden is still there.
 
-Held-out episodes of the suite in which an object of one is covered by the robot, or leaves the image, and is seen again
-within `HORIZON` frames after the start. Beside each stands a control: an object that is seen all the time, judged as long
-after the start. Writes DIR/hidden.csv, a row per event.
+Held-out episodes in which an object is covered by the robot or leaves the image, and is back within
+`HORIZON` frames after the start. Beside each stands a control: an object that is seen all the time, judged as long after
+the start. Writes DIR/hidden.csv, a row per event.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.rand
     """
     hidden: list[Event] = []
     for episode in rng.permutation(len(share)):
-        found = [e for p in range(tools, share.shape[2]) for e in _of(share[episode, : lengths[episode], p], int(episode), p)]
+        own = share[episode, : lengths[episode]]
+        found = [e for p in range(tools, share.shape[2]) for e in _of(own[:, p], int(episode), p)]
         if found:
             hidden.append(max(found, key=lambda e: e.gone))  # the longest are the rarest
     hidden = hidden[:PER_ROBOT]
@@ -74,8 +75,9 @@ def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.rand
     for event in hidden:
         for episode in rng.permutation(len(share)):
             start, stop = START_FRAMES - 1, START_FRAMES + event.lag
-            points = [p for p in range(tools, share.shape[2]) if lengths[episode] >= stop and (share[episode, :stop, p] >= WHOLE).all()]
-            if points:
+            whole = (share[episode, :stop] >= WHOLE).all(0)
+            points = [p for p in range(tools, share.shape[2]) if whole[p]]
+            if points and lengths[episode] >= stop:
                 controls.append(Event("control", int(episode), start, points[0], 0, event.lag))
                 break
     return hidden + controls
@@ -97,7 +99,9 @@ def _of(share: np.ndarray, episode: int, point: int) -> list[Event]:
     return events
 
 
-def judge(simulator: Simulator, detector: Detector, spec: EmbodimentSpec, rollout: Rollout, events: list[Event]) -> list[Row]:
+def judge(
+    simulator: Simulator, detector: Detector, spec: EmbodimentSpec, rollout: Rollout, events: list[Event]
+) -> list[Row]:
     """The model's frame at the end of each event, all of one robot in one batch."""
     robot, last = simulator.robots[spec.name], max(e.lag for e in events)
     starts, actions, true = [], [], []
@@ -151,7 +155,8 @@ def main() -> None:
     write_rows(asked.out / "hidden.csv", rows)
     for kind in ("hidden", "control"):
         mine = [row for row in rows if row["kind"] == kind]
-        means = {k: np.mean([float(r[k]) for r in mine]) for k in ("gone", "lag", "found", "close", "true_found", "true_close")}
+        names = ("gone", "lag", "found", "close", "true_found", "true_close")
+        means = {k: np.mean([float(r[k]) for r in mine]) for k in names}
         console.print(f"{kind}: {len(mine)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
     wrote(asked.out / "hidden.csv")
 

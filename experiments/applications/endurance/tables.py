@@ -28,7 +28,7 @@ MEASURES = (
 
 
 def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
-    """`MEASURES` of the frames `part` of a film whose first `tools` points are tools; of what is to be seen in truth."""
+    """`MEASURES` of the frames `part` of a film whose first `tools` points are tools, of what is seen in truth."""
     found: dict[str, float] = {"psnr": film.psnr[part].mean(), "psnr_still": film.still[part].mean()}
     there = film.true_share[part] >= SEEN
     for name, position, confidence in (

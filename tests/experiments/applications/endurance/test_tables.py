@@ -19,8 +19,8 @@ def film(**changes) -> Film:
     sure = share * 0.9
     made = dict(
         psnr=np.full(N, 20.0), still=np.full(N, 15.0), true_position=true, true_share=share, position=true.copy(),
-        confidence=sure, seen_position=true.copy(), seen_confidence=sure.copy(), level=np.zeros(N), variance=np.ones(N), histogram=np.zeros(N),
-        shown=np.zeros((2, 1, 4, 4, 3), np.uint8),
+        confidence=sure, seen_position=true.copy(), seen_confidence=sure.copy(), level=np.zeros(N), variance=np.ones(N),
+        histogram=np.zeros(N), shown=np.zeros((2, 1, 4, 4, 3), np.uint8),
     )  # fmt: skip
     return Film(**(made | changes))
 

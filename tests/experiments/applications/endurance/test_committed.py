@@ -1,0 +1,66 @@
+"""The committed tables of how long the shipped model holds, and that docs/endurance.md shows their figures."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.detector import WEIGHTS, Detector
+from experiments.applications.endurance.tables import over_robots, read_rows
+
+ROOT = Path(__file__).parents[4]
+RESULTS = ROOT / "experiments" / "results" / "endurance"
+PAGE = ROOT / "docs" / "endurance.md"
+
+SHOWN = {
+    "psnr": 1, "psnr_still": 1, "tool_found": 2, "tool_close": 2, "object_found": 2, "object_close": 2, "follows": 2,
+    "moves": 2,
+}  # fmt: skip
+"""Measures of the page's tables, in the order of their columns, and digits."""
+
+
+def table(header: str) -> dict[str, list[str]]:
+    """First cell -> the others, of the page's table whose head begins with `header`."""
+    rows = {}
+    for line in PAGE.read_text().split(header, 1)[1].splitlines()[2:]:
+        if not line.startswith("|"):
+            break
+        first, *rest = (cell.strip() for cell in line.strip().strip("|").split("|"))
+        rows[first] = rest
+    assert rows
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("header", "name"), [("| minute |", "endurance.csv"), ("| variant, seconds |", "variants.csv")]
+)
+def test_the_page_shows_what_was_measured(header, name):
+    rows = read_rows(RESULTS / name)
+    for label, cells in table(header).items():
+        if name == "endurance.csv":
+            mine = [row for row in rows if row["part"] == float(label)]
+        else:
+            variant, part = label.split(", ")
+            mine = [row for row in rows if str(row["variant"]) == variant and _seconds(row) == part]
+        assert len(mine) == 8, f"{label}: all eight robots"
+        for (measure, digits), cell in zip(SHOWN.items(), cells, strict=True):
+            mean, half, _ = over_robots(mine, measure)
+            assert cell == f"{mean:.{digits}f} ± {half:.{digits}f}", (label, measure)
+
+
+def _seconds(row: dict) -> str:
+    end = row["part"] * row["seconds"]
+    return f"{end - row['seconds']:.0f} to {end:.0f}"
+
+
+def test_the_detector_finds_what_is_there():
+    detector = Detector.load(DETECTOR / WEIGHTS)
+    with (DETECTOR / "errors.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["robot"] for row in rows} == set(detector.robots) and len(detector.robots) == 8
+    for row in rows:
+        if row["frames_of"] == "true":
+            assert float(row["within_4px"]) > 0.9 and float(row["median_px"]) < 0.6, row
