@@ -50,12 +50,14 @@ SAID = (
 """Measures that are printed."""
 
 
-def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float) -> Path:
-    return out / "films" / f"{name}-{variant}-{kind}-{minutes:g}.npz"
+def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float, which: int) -> Path:
+    return out / "films" / f"{name}-{variant}-{kind}-{minutes:g}-{which}.npz"
 
 
-def run_variant(run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, update) -> dict[str, Film]:
-    """All robots of a run that the suite knows, each from its first start on, in one batch."""
+def run_variant(
+    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int, update
+) -> dict[str, Film]:
+    """All robots of a run that the suite knows, each from its start number `which` on, in one batch."""
     simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
     robots = known_robots(simulator.robots)
     decode = replace(find_decode(run), **VARIANTS[variant])
@@ -63,8 +65,9 @@ def run_variant(run: Path, detector: Detector, variant: str, kind: Kind, minutes
     simulator = load_simulator(run, **options)
     drives = []
     for name, robot in robots.items():
-        start = next(s for s in simulator.starts if s.robot == name and s.seed is not None)
-        drives.append(make_drive(robot, start, round(60 * minutes * robot.hz), kind, seed=0))
+        starts = [s for s in simulator.starts if s.robot == name and s.seed is not None]
+        require(which < len(starts), f"{name} has {len(starts)} starts in the true simulator, no number {which}")
+        drives.append(make_drive(robot, starts[which], round(60 * minutes * robot.hz), kind, seed=which))
     return make_films(simulator, detector, drives, update)
 
 
@@ -73,6 +76,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
     parser.add_argument("--minutes", type=float, default=10.0, help="of simulated time")
+    parser.add_argument("--starts", type=int, default=1, help="of each robot")
     parser.add_argument("--variants", nargs="+", default=["shipped"], choices=list(VARIANTS), metavar="NAME")
     parser.add_argument("--drives", nargs="+", default=["behaviour"], choices=KINDS)
     parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
@@ -84,13 +88,16 @@ def main() -> None:
     detector, rows = Detector.load(asked.detector), []
     for kind in asked.drives:
         for variant in asked.variants:
-            path = film_path(asked.out, asked.name, variant, kind, asked.minutes)
-            if not path.exists():
-                with step(f"{variant}, {kind}, {asked.minutes:g} min") as update:
-                    save_films(run_variant(asked.run, detector, variant, kind, asked.minutes, update), path)
-            films = load_films(path)
-            hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
-            new = rows_of(f"{asked.name}/{variant}", kind, films, hz, tools, asked.every)
+            new: list[Row] = []
+            for which in range(asked.starts):
+                path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which)
+                if not path.exists():
+                    with step(f"{variant}, {kind}, {asked.minutes:g} min, start {which}") as update:
+                        made = run_variant(asked.run, detector, variant, kind, asked.minutes, which, update)
+                    save_films(made, path)
+                films = load_films(path)
+                hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
+                new += rows_of(f"{asked.name}/{variant}", kind, which, films, hz, tools, asked.every)
             show(new)
             rows += new
             draw_sheet(films, asked.out / f"{asked.name}-{variant}-{kind}.png")

@@ -49,8 +49,7 @@ def draw_curves(rows: Sequence[Row], path: Path) -> None:
 def _curve(rows: Sequence[Row], name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(minutes, mean, half of the interval) at the end of each part that all robots have."""
     robots = {row["robot"] for row in rows}
-    whole = [sum(row["part"] == p for row in rows) == len(robots) for p in sorted({row["part"] for row in rows})]
-    parts = [p for p, all_there in zip(sorted({row["part"] for row in rows}), whole, strict=True) if all_there]
+    parts = [p for p in sorted({row["part"] for row in rows}) if {r["robot"] for r in rows if r["part"] == p} == robots]
     found = [over_robots([row for row in rows if row["part"] == p], name)[:2] for p in parts]
     minutes = np.array(parts, float) * float(rows[0]["seconds"]) / 60
     return minutes, *np.array(found).T

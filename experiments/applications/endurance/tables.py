@@ -20,7 +20,6 @@ CLOSE = NEAR[1]
 
 Row = dict[str, object]
 
-KEYS = ("variant", "drive", "robot", "part", "seconds")
 MEASURES = (
     "psnr", "psnr_still", "tool_found", "tool_close", "tool_px", "object_found", "object_close", "object_px", "follows",
     "moves", "true_tool_close", "true_object_close", "true_follows", "true_moves", "level", "variance", "histogram",
@@ -65,8 +64,10 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 1e-9 and b.std() > 1e-9 else 0.0
 
 
-def rows_of(variant: str, drive: str, films: Mapping[str, Film], hz: Mapping[str, float], tools: Mapping[str, int],
-            seconds: float) -> list[Row]:  # fmt: skip
+def rows_of(
+    variant: str, drive: str, start: int, films: Mapping[str, Film], hz: Mapping[str, float], tools: Mapping[str, int],
+    seconds: float,
+) -> list[Row]:  # fmt: skip
     """A row per robot and `seconds` of its film; what is left at the end counts if it is half as long."""
     rows: list[Row] = []
     for robot, film in films.items():
@@ -74,15 +75,17 @@ def rows_of(variant: str, drive: str, films: Mapping[str, Film], hz: Mapping[str
         for i, first in enumerate(range(0, len(film.psnr), size)):
             part = slice(first, min(first + size, len(film.psnr)))
             if 2 * (part.stop - part.start) >= size:
-                row = {"variant": variant, "drive": drive, "robot": robot, "part": i + 1, "seconds": seconds}
-                rows.append(row | measure(film, part, tools[robot]))
+                names = {"variant": variant, "drive": drive, "robot": robot, "start": start}
+                rows.append(names | {"part": i + 1, "seconds": seconds} | measure(film, part, tools[robot]))
     return rows
 
 
 def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
-    """(mean, half of the 95 % interval by Student's t, n) over robots, which are a sample here: others would differ."""
-    values = np.array([row[name] for row in rows], float)
-    values = values[np.isfinite(values)]
+    """(mean, half of the 95 % interval by Student's t, n) over robots, of the mean over each one's starts: robots are a
+    sample here, and others would differ."""
+    rows = [row for row in rows if np.isfinite(float(row[name]))]
+    robots = dict.fromkeys(row["robot"] for row in rows)
+    values = np.array([np.mean([float(row[name]) for row in rows if row["robot"] == robot]) for robot in robots])
     half = critical(len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
     return float(values.mean()), float(half), len(values)
 

@@ -22,18 +22,18 @@ def test_the_share_that_is_seen_is_that_of_the_pixels_an_object_changes(robot):
     looks = draw_appearance(spec, rollout.seeds)
 
     def changed(objects: np.ndarray, k: int) -> np.ndarray:
-        """Pixels that differ clearly without object k; its soft shadow does not."""
+        """Pixels that differ without object k, by more than its soft shadow does."""
         without = objects.copy()
         without[:, k] = AWAY
         pair = [render_frames(spec, looks, rollout.goals, q, o, episode).astype(int) for o in (objects, without)]
-        return (np.abs(pair[0] - pair[1]).max(-1) > 70).sum((1, 2))
+        return (np.abs(pair[0] - pair[1]).max(-1) > 30).sum((1, 2))
 
     share = visible_shares(spec, q, objects)[:, 0]
     pixels = changed(objects, 0)
     whole, little = share == 1, share < 0.4
     assert whole.sum() > 20 and little.sum() > 2
-    assert pixels[little].max() < 0.6 * np.median(pixels[whole])
-    assert np.corrcoef(share, pixels)[0, 1] > 0.8
+    assert pixels[little].mean() < 0.6 * np.mean(pixels[whole])
+    assert np.corrcoef(share, pixels)[0, 1] > 0.85
 
 
 def test_an_object_has_the_colour_that_is_said():

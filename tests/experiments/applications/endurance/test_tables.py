@@ -60,7 +60,7 @@ def test_rows_are_of_whole_parts_and_are_read_again(tmp_path):
     again = load_films(tmp_path / "x" / "films.npz")
     for f in dataclasses.fields(Film):
         np.testing.assert_allclose(getattr(again["b"], f.name), getattr(films["b"], f.name), rtol=1e-6)
-    rows = rows_of("v", "behaviour", again, {"a": 4.0, "b": 6.0}, {"a": 1, "b": 1}, seconds=10.0)
+    rows = rows_of("v", "behaviour", 0, again, {"a": 4.0, "b": 6.0}, {"a": 1, "b": 1}, seconds=10.0)
     assert [r["part"] for r in rows if r["robot"] == "a"] == [1, 2, 3, 4, 5]
     assert [r["part"] for r in rows if r["robot"] == "b"] == [1, 2, 3]  # 20 frames of 60 are left: too few
     write_rows(tmp_path / "rows.csv", rows)
