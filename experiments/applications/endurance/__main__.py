@@ -37,7 +37,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "confidence": {"order": "confidence"},
     "steps_2": {"unmask_steps": 2},
     "steps_16": {"unmask_steps": 16},
-    "top_1_of_steps_16": {"unmask_steps": 16, "temperature": 0.0},
 }
 """What is changed of the way in which RUN/decode.json fills frames."""
 

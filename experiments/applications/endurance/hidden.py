@@ -4,9 +4,8 @@ Command: python -m experiments.applications.endurance.hidden RUN --out DIR
 Cost: ten minutes of one core.
 Expected: what was hidden for less than the model's window comes back as often as what was never hidden is still there.
 
-Held-out episodes in which an object is covered by the robot or leaves the image, and is back within
-`HORIZON` frames after the start. Beside each stands a control: an object that is seen all the time, judged as long after
-the start. Writes DIR/hidden.csv, a row per event.
+Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
+after the start. Beside each stands a control: an object that is seen all the time, judged as long after the start. Writes DIR/hidden.csv, a row per event.
 """
 
 from __future__ import annotations
@@ -115,8 +114,8 @@ def judge(
         actions.append(np.clip(told[e.start : e.start + last], np.float32(robot.low), np.float32(robot.high)))
         true.append((images[-1], points_of(spec, np.repeat(seeds, len(q)), q, objects)))
     films = [simulator.reset(starts, seeds=0).copy()]
-    for t in range(last):
-        films.append(simulator.step([a[t] if t < e.lag else None for a, e in zip(actions, events, strict=True)]).copy())
+    for t in range(last):  # all of them until the last is judged: other numbers of episodes would be compiled anew
+        films.append(simulator.step([a[min(t, len(a) - 1)] for a in actions]).copy())
     film, rows = np.stack(films), []
     for b, (e, (image, points)) in enumerate(zip(events, true, strict=True)):
         row: Row = {"robot": spec.name, "kind": e.kind, "gone": e.gone, "lag": e.lag}

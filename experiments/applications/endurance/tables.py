@@ -18,6 +18,9 @@ from experiments.applications.scenes import SEEN
 CLOSE = NEAR[1]
 """Pixels of a 64-pixel frame, 2 of a frame of 32: what is found within them of the truth is where it should be."""
 
+STILL = 1e-3
+"""Pixels: what varies less does not move."""
+
 Row = dict[str, object]
 
 MEASURES = (
@@ -60,8 +63,10 @@ def motion(true: np.ndarray, seen: np.ndarray, there: np.ndarray, prefix: str) -
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's; 0 where nothing moves."""
-    return float(np.corrcoef(a, b)[0, 1]) if len(a) > 2 and a.std() > 1e-9 and b.std() > 1e-9 else 0.0
+    """Pearson's of what was asked and done, in pixels; nan where nothing was asked, 0 where nothing was done."""
+    if len(a) < 3 or a.std() < STILL:
+        return float("nan")
+    return float(np.corrcoef(a, b)[0, 1]) if b.std() >= STILL else 0.0
 
 
 def rows_of(

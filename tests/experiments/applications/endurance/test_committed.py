@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import pytest
-
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.detector import WEIGHTS, Detector
 from experiments.applications.endurance.tables import over_robots, read_rows
@@ -34,21 +32,32 @@ def table(header: str) -> dict[str, list[str]]:
     return rows
 
 
-@pytest.mark.parametrize(
-    ("header", "name"), [("| minute |", "endurance.csv"), ("| variant, seconds |", "variants.csv")]
-)
-def test_the_page_shows_what_was_measured(header, name):
-    rows = read_rows(RESULTS / name)
-    for label, cells in table(header).items():
-        if name == "endurance.csv":
-            mine = [row for row in rows if row["part"] == float(label)]
-        else:
-            variant, part = label.split(", ")
-            mine = [row for row in rows if str(row["variant"]) == variant and _seconds(row) == part]
-        assert len({row["robot"] for row in mine}) == 8, f"{label}: all eight robots"
-        for (measure, digits), cell in zip(SHOWN.items(), cells, strict=True):
-            mean, half, _ = over_robots(mine, measure)
-            assert cell == f"{mean:.{digits}f} ± {half:.{digits}f}", (label, measure)
+def test_the_page_shows_what_was_measured():
+    ten, unlike = (read_rows(RESULTS / name) for name in ("endurance.csv", "unlike.csv"))
+    tried = [row for name in ("variants.csv", "own_past.csv") for row in read_rows(RESULTS / name)]
+    shown = {
+        "| minute |": lambda label: [row for row in ten if row["part"] == float(label)],
+        "| variant, seconds |": lambda label: [row for row in tried if f"{row['variant']}, {_seconds(row)}" == label],
+        "| drive |": lambda label: [row for row in unlike if row["drive"] == label and row["part"] == 3],
+    }
+    for header, rows_of in shown.items():
+        for label, cells in table(header).items():
+            mine = rows_of(label)
+            assert len({row["robot"] for row in mine}) == 8, f"{label}: all eight robots"
+            for (measure, digits), cell in zip(SHOWN.items(), cells, strict=True):
+                mean, half, _ = over_robots(mine, measure)
+                assert cell == f"{mean:.{digits}f} ± {half:.{digits}f}", (label, measure)
+
+
+def test_what_was_hidden_for_long_does_not_come_back():
+    rows, page = read_rows(RESULTS / "hidden.csv"), " ".join(PAGE.read_text().split())
+    hidden, control = ([row for row in rows if row["kind"] == kind] for kind in ("hidden", "control"))
+    assert len(hidden) == len(control) == 48
+    for mine in (hidden, control):
+        found, close = ([round(100 * x) for x in over_robots(mine, name)[:2]] for name in ("found", "close"))
+        assert f"{found[0]} ± {found[1]} " in page and f"{close[0]} ± {close[1]} %" in page
+    short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
+    assert f"it is {sum(short):.0f} of {len(short)}, after four or more none of {len(long)}" in page and not sum(long)
 
 
 def _seconds(row: dict) -> str:
