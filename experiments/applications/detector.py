@@ -38,7 +38,7 @@ WEIGHTS, ERRORS = "detector.npz", "errors.csv"
 EPISODES, PER_EPISODE, HELD_OUT = 240, 16, (24, 16)
 """Of each robot, from the suite's training split, and frames of each; the same of the held-out split."""
 
-STEPS, BATCH, RATE = 2000, 16, 2e-3
+STEPS, BATCH, RATE = 2000, 32, 2e-3
 MISSING = 0.2
 NOISE = 16.0
 """Grey levels of noise that frames are given at most."""
