@@ -144,6 +144,8 @@ def _complaint_of_module(module: str, arguments: list[str], calls: list[dict], c
         missing = [word for word in arguments if not word.startswith("-") and not (ROOT / word).exists()]
         return f"no {', '.join(missing)}" if missing else None
     found = importlib.util.find_spec(module)
+    if found is not None and found.submodule_search_locations:
+        found = importlib.util.find_spec(f"{module}.__main__")
     if found is None or found.origin is None:
         return f"no module {module}"
     text = Path(found.origin).read_text()

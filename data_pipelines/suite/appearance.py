@@ -34,7 +34,9 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
     n, palette, count = len(seeds), spec.palette, spec.task.objects
     draws = [np.random.default_rng([seed, 4]) for seed in seeds]
     light = np.array([rng.uniform(0.97, 1.03) for rng in draws])[:, None, None]
-    order = np.array([rng.permutation(len(palette.objects)) for rng in draws])[:, :count]
+    order = np.array([object_order(spec, seed) for seed in seeds])[:, :count]
+    for rng in draws:
+        rng.permutation(len(palette.objects))  # that order's; what follows is drawn after it
     slope = np.array([rng.uniform(-2, 2, 2) for rng in draws], np.float32)
 
     def colours(base: np.ndarray) -> np.ndarray:
@@ -53,3 +55,10 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
         goal=colours(goal),
         slope=slope,
     )
+
+
+def object_order(spec: EmbodimentSpec, seed: int) -> np.ndarray:
+    """int: which of the palette's colours for objects the first object of an episode has, the second, and so on."""
+    rng = np.random.default_rng([seed, 4])
+    rng.uniform()  # the light's
+    return rng.permutation(len(spec.palette.objects))

@@ -29,6 +29,7 @@ def train(
     options: OmitArgPrefixes[RunOptions],
     remake: OmitArgPrefixes[Remake],
     hosts: OmitArgPrefixes[Hosts],
+    begin: Annotated[Path | None, arg(name="from", metavar="RUN"), UNSET] = None,
 ) -> None:
     """Train one model: the study's reference trial, on all trajectories unless told otherwise.
 
@@ -40,10 +41,12 @@ def train(
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
         hosts: Several processes that train together, on one host or on many.
+        begin: A trained model of the same robots and architecture. The new run begins with its weights, or with their
+            average where it keeps one.
     """
     hosts.join()
     setting = make_setting(asked)
-    train_model(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace)
+    train_model(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace, begin=begin)
 
 
 def adapt(
@@ -88,12 +91,30 @@ def train_model(
     *,
     trajectories: int | None = None,
     replace: Step | None = None,
+    begin: Path | None = None,
 ) -> None:
-    """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot."""
+    """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
+    the run `begin` on where one is given. Raises ConfigError if that is of another model."""
     _check(trajectories, options)
     _prepare(setting, replace)
     trial = _single_trial(setting, trajectories)
-    _train(setting, trial, run or setting.workspace.root / "model", options)
+    start = {} if begin is None else _begin_with(begin, setting, trial)
+    _train(setting, trial, run or setting.workspace.root / "model", options, **start)
+
+
+def _begin_with(source: Path, setting: Setting, trial: Trial) -> dict[str, Any]:
+    """What `train_trial` takes for a run that begins with the weights of `source`."""
+    from experiments.running.trial import open_materials
+    from hma_jax.training.runs import load_run
+
+    trained = load_run(source, "auto")
+    check_tokenizer(trained, open_materials(setting.workspace), f"; add --tokenizer with that of {short(source)}")
+    require(
+        (trained.model, trained.table.names) == (trial.model, trial.datasets),
+        f"--from {short(source)} is another model or has other robots; give the settings it was trained with",
+    )
+    origin = {"step": trained.step, "provenance": trained.provenance}
+    return {"table": trained.table, "initial": trained.params, "origin": origin}
 
 
 def adapt_model(

@@ -46,6 +46,10 @@ class MaskingConfig:
     # masks all frames of a window in one pass, so that each is predicted from masked ones. A step passes over every
     # frame twice; docs/models.md shows when that pays.
     teacher_forcing: bool = False
+    # With teacher forcing, of discrete tokens: past frames that the model drew itself, up to this share of them
+    # (`objective.own_past`). DIFFERS: the release corrupts the past with random tokens alone (`max_corrupt_rate`, which
+    # does so here too). A step passes over every frame three times.
+    own_past: float = 0.0
     max_corrupt_rate: float = 0.2
     clean_rate_min: float = 0.2
     label_smoothing: float = 0.01
@@ -54,7 +58,7 @@ class MaskingConfig:
     action_leak: ActionLeak = "none"
 
     def __post_init__(self):
-        shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain")
+        shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain", "own_past")
         for name in (*shares, "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
@@ -62,6 +66,10 @@ class MaskingConfig:
         require(
             not (self.teacher_forcing and self.predicts_actions),
             f"masking.teacher_forcing is of settings that predict frames alone, and {self.setting!r} predicts actions",
+        )
+        require(
+            self.teacher_forcing or not self.own_past,
+            "masking.own_past replaces frames of the past that masking.teacher_forcing shows: set that too",
         )
 
     @property

@@ -17,6 +17,7 @@ from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
 from hma_jax.objective.diffusion import diffusion_loss
 from hma_jax.objective.masking import Masked
+from hma_jax.objective.own_past import draw_own_past
 from hma_jax.objective.process import make_process
 
 SAID_FROM = 1
@@ -87,8 +88,8 @@ def masked_loss(
     slice_B: jax.Array | None = None,
     real_BT: jax.Array | None = None,
 ) -> LossSums:
-    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise; `slice_B` as for the
-    model.
+    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise, or the past that
+    `masking.own_past` asks for; `slice_B` as for the model.
 
     `real_BT` (bool; None: all) is False for frames that only fill up a window, at its end. They have no targets
     (`masking`), and where attention is causal no real frame sees them; where it is not, they are hidden here.
@@ -98,7 +99,11 @@ def masked_loss(
     hidden = None if all_shown else masked.hidden_T
     options = {"leak": masking.action_leak, "slice_B": slice_B}
     if masking.teacher_forcing:
-        inputs = masked.inputs[:, :-1], masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
+        past = masked.inputs[:, :-1]
+        if masking.own_past:
+            given = actions_BTU, embodiment_B, hidden, masking.own_past, key_B, slice_B
+            past = draw_own_past(model, past, *given)
+        inputs = past, masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
         out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
     else:
         out = model(

@@ -59,6 +59,7 @@ def make_train_step(
         f"train.masking.setting {masking.setting!r} predicts actions from action tokens, of which "
         f"model.conditioning {model.conditioning!r} has none; choose one with concat",
     )
+    require(not (masking.own_past and model.diffusion), "train.masking.own_past draws ids; continuous tokens have none")
     multipliers = jax.tree.map(
         lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
     )

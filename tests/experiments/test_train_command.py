@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -130,3 +131,18 @@ def test_a_width_that_no_sweep_has(train, where, tmp_path):
     _, trial, _ = train("--set", "model.width=24")
     assert trial.model.width == 24
     assert load_run(tmp_path / "run").model.width == 24
+
+
+def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where):
+    train("--set", "train.steps=3")
+    source = tmp_path / "run"
+    begun = tmp_path / "begun"
+    options = ("--set", "train.steps=1", "--set", "train.optimizer.learning_rate=1e-9", "--run", str(begun))
+    train("--from", str(source), *options)  # the last --run counts
+    before, after = load_run(source), load_run(begun)
+    assert after.step == 1 and after.provenance["origin"]["step"] == 3
+    for old, new in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_allclose(new, old, atol=1e-6)
+    other = ["train", *where, "--run", str(tmp_path / "other"), "--from", str(source), "--set", "model.width=24"]
+    assert main(other) != 0
+    assert "is another model or has other robots" in " ".join(capsys.readouterr().err.split())

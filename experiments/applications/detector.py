@@ -1,0 +1,219 @@
+"""A detector of tools and objects in frames of a simulator's robots, trained on true frames.
+
+Command: python -m experiments.applications.detector RUN
+Cost: about ten minutes of one core.
+Expected: it finds tools and visible objects of held-out true frames within 2 pixels of 64 in nearly all of them, most
+          also as the run's tokenizer shows them.
+
+The suite says where everything is; half of the frames it learns from are as RUN's tokenizer shows them, and in some an
+object is missing, so that it learns what nothing looks like.
+Writes detector.npz (half precision) and errors.csv, its own errors on held-out episodes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from data_pipelines.publishing.files import write_file
+from data_pipelines.suite.simulator import SPECS
+from experiments.applications.scenes import Scenes, draw_scenes, point_names
+from experiments.progress import step
+from experiments.wrote import wrote
+from hma_jax.config import ConfigError, require
+from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
+from hma_jax.simulator.robots import Robot
+
+OUT = Path("experiments/results/detector")
+WEIGHTS, ERRORS = "detector.npz", "errors.csv"
+EPISODES, PER_EPISODE, HELD_OUT = 240, 16, (24, 16)
+"""Of each robot, from the suite's training split, and frames of each; the same of the held-out split."""
+
+STEPS, BATCH, RATE = 2000, 32, 2e-3
+MISSING = 0.2
+NOISE = 16.0
+"""Grey levels of noise that frames are given at most."""
+
+SURE = 0.15
+"""Confidence from which a point counts as found."""
+
+NEAR = (2.0, 4.0)
+"""Pixels of a 64-pixel frame: the second is 2 pixels of a frame of 32."""
+
+BLOCK = 64
+"""Frames that are watched in one call."""
+
+
+class Detector:
+    """Trained weights and the robots that they know, in the order of the weights."""
+
+    def __init__(self, weights: Weights, robots: Sequence[str]):
+        self.weights, self.robots = weights, tuple(robots)
+        self._watch = jax.jit(watch)
+
+    def watch(self, robot: str, film: np.ndarray) -> Found:
+        """Its P points in frames uint8 [n, H, W, 3]. Raises ConfigError for a robot that it was not trained on."""
+        require(robot in self.robots, f"the detector was not trained on {robot}; it knows {', '.join(self.robots)}")
+        index, points, parts = self.robots.index(robot), len(point_names(SPECS[robot])), []
+        for first in range(0, len(film), BLOCK):
+            part = film[first : first + BLOCK]
+            filled = np.concatenate([part, np.repeat(part[-1:], BLOCK - len(part), 0)])
+            found = self._watch(self.weights, filled, index)
+            parts.append([np.asarray(x)[: len(part), :points] for x in found])
+        return Found(*(np.concatenate(x) for x in zip(*parts, strict=True)))
+
+    def save(self, path: Path) -> None:
+        content = io.BytesIO()
+        arrays = {name: np.asarray(x, np.float16) for name, x in self.weights.items()}
+        np.savez_compressed(content, robots=np.array(self.robots), **arrays)
+        write_file(path, content.getvalue())
+
+    @classmethod
+    def load(cls, path: Path) -> Detector:
+        """Raises ConfigError where there is none."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                weights = {name: jnp.asarray(file[name], jnp.float32) for name in file.files if name != "robots"}
+                return cls(weights, [str(name) for name in file["robots"]])
+        except (OSError, ValueError, KeyError) as error:
+            raise ConfigError(
+                f"{path} is no detector ({error}); make one with python -m experiments.applications.detector RUN"
+            ) from error
+
+
+def batches(scenes: Sequence[Scenes], seed: int, count: int, size: int) -> Iterator[tuple]:
+    """What `points_loss` takes, of random frames of random robots, with noise."""
+    rng = np.random.default_rng(seed)
+    points, side = max(own.there.shape[-1] for own in scenes), scenes[0].images.shape[1]
+    for _ in range(count):
+        images, robots = np.zeros((size, side, side, 3), np.float32), rng.integers(len(scenes), size=size)
+        position, known = np.zeros((size, points, 2), np.float32), np.zeros((size, points), np.float32)
+        there = np.zeros((size, points), np.float32)
+        for i, robot in enumerate(robots):
+            own = scenes[robot]
+            k, p = rng.integers(len(own.images)), own.there.shape[-1]
+            images[i] = own.images[k] + rng.uniform(0, NOISE) * rng.standard_normal((side, side, 3), np.float32)
+            position[i, :p], there[i, :p], known[i, :p] = own.position[k], own.there[k], 1
+        yield images, robots, position, there, known
+
+
+def train_detector(
+    scenes: Mapping[str, Scenes],
+    *,
+    steps: int = STEPS,
+    size: int = BATCH,
+    seed: int = 0,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Detector:
+    """Raises ConfigError without scenes, or where training diverges."""
+    require(bool(scenes), "there is no robot to train a detector on")
+    own = list(scenes.values())
+    weights = init_detector(jax.random.key(seed), len(own), max(x.there.shape[-1] for x in own))
+    schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, min(100, steps // 4), steps)
+    optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(schedule, weight_decay=1e-3))
+
+    @partial(jax.jit, donate_argnums=(0, 1))
+    def update(weights, state, batch):
+        loss, gradient = jax.value_and_grad(points_loss)(weights, *batch)
+        change, state = optimizer.update(gradient, state, weights)
+        return optax.apply_updates(weights, change), state, loss
+
+    state = optimizer.init(weights)
+    for i, batch in enumerate(batches(own, seed, steps, size)):
+        weights, state, loss = update(weights, state, batch)
+        progress(i + 1, steps)
+    require(bool(jnp.isfinite(loss)), "the detector's loss is not finite; lower RATE")
+    return Detector(weights, list(scenes))
+
+
+def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
+    """How far off it is on each kind of point of a robot, and how often it sees what is not there."""
+    position, confidence = detector.watch(robot, scenes.images)
+    off = np.linalg.norm(position - scenes.position, axis=-1)
+    names, rows = point_names(SPECS[robot]), []
+    for kind, prefix in (("tool", "tool"), ("object", "colour")):
+        mine = [i for i, name in enumerate(names) if name.startswith(prefix)]
+        there, sure = scenes.there[:, mine], confidence[:, mine] >= SURE
+        far = off[:, mine][there]
+        near = {f"within_{r:g}px": float(np.mean((far <= r) & sure[there])) for r in NEAR}
+        rows.append({
+            "robot": robot, "what": kind, "frames": int(there.sum()), "median_px": float(np.median(far)),
+            "p90_px": float(np.quantile(far, 0.9)), **near, "found": float(np.mean(sure[there])),
+            "ghosts": float(np.mean(sure[~there])) if (~there).any() else float("nan"),
+        })  # fmt: skip
+    return rows
+
+
+def write_errors(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    content = io.StringIO()
+    writer = csv.DictWriter(content, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
+    write_file(path, content.getvalue())
+
+
+def shown_by(tokenizer, images: np.ndarray) -> np.ndarray:
+    """Frames uint8 [n, H, W, 3] as a tokenizer shows them."""
+    whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
+    filled = np.concatenate([images, np.repeat(images[-1:], -len(images) % BLOCK, 0)])
+    parts = [np.asarray(whole(filled[i : i + BLOCK])) for i in range(0, len(filled), BLOCK)]
+    return np.concatenate(parts)[: len(images)]
+
+
+def as_shown(tokenizer, scenes: Scenes, every: int = 1) -> Scenes:
+    """With every n-th frame as the tokenizer shows it."""
+    images = scenes.images.copy()
+    images[::every] = shown_by(tokenizer, images[::every])
+    return scenes._replace(images=images)
+
+
+def known_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
+    """Those whose truth the suite knows. Raises ConfigError if there are none."""
+    known = {name: robot for name, robot in robots.items() if name in SPECS and robot.stride == 1}
+    require(bool(known), "no robot of the suite at its native rate: nobody knows where its tools are")
+    return known
+
+
+def main() -> None:
+    from experiments.applications.simulators import load_simulator
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=OUT)
+    arguments = parser.parse_args()
+    simulator = load_simulator(arguments.run)
+    robots, tokenizer = known_robots(simulator.robots), simulator.tokenizer
+    with step("true frames") as update:
+        train, held = {}, {}
+        for i, name in enumerate(robots):
+            drawn = draw_scenes(SPECS[name], "train", EPISODES, PER_EPISODE, 0, MISSING)
+            train[name] = as_shown(tokenizer, drawn, every=2)
+            held[name] = draw_scenes(SPECS[name], "val", *HELD_OUT, 1)
+            update(i + 1, len(robots), name)
+    with step("train the detector") as update:
+        detector = train_detector(train, progress=lambda done, total: update(done, total, ""))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    detector.save(arguments.out / WEIGHTS)
+    detector, rows = Detector.load(arguments.out / WEIGHTS), []  # as it was saved
+    for name, scenes in held.items():
+        for frames, seen in (("true", scenes), ("tokenizer", as_shown(tokenizer, scenes))):
+            rows += [{"frames_of": frames} | row for row in errors(detector, name, seen)]
+    write_errors(arguments.out / ERRORS, rows)
+    for row in rows:
+        print(" ".join(f"{v:.3f}" if isinstance(v, float) else f"{v}" for v in row.values()))
+    then = f"python -m experiments.applications.endurance {arguments.run}"
+    wrote(arguments.out / WEIGHTS, arguments.out / ERRORS, then=then)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""Question: how long does a learned simulator hold?
+Command: python -m experiments.applications.endurance RUN --minutes 10 --out DIR
+Cost: ten minutes of eight robots, 20 minutes of one core for each variant.
+Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
+
+Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped. Writes
+DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every variant, a sheet of frames, the
+truth above. A detector is needed (experiments.applications.detector).
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from data_pipelines.suite.simulator import SPECS
+from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.detector import WEIGHTS, Detector, known_robots
+from experiments.applications.endurance.drives import Kind, make_drive
+from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
+from experiments.applications.endurance.films import Film, load_films, make_films, save_films
+from experiments.applications.endurance.tables import Row, over_robots, rows_of, write_rows
+from experiments.applications.simulators import load_simulator
+from experiments.progress import console, step
+from experiments.wrote import wrote
+from hma_jax.config import ExecutionConfig, require
+from hma_jax.simulator.folder import find_decode
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "shipped": {},
+    "streaming": {"slide": "streaming"},
+    "likeliest": {"temperature": 0.0},
+    "temperature_0.4": {"temperature": 0.4},
+    "temperature_1": {"temperature": 1.0},
+    "confidence": {"order": "confidence"},
+    "steps_2": {"unmask_steps": 2},
+    "steps_16": {"unmask_steps": 16},
+}
+"""What is changed of the way in which RUN/decode.json fills frames."""
+
+KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
+TABLE = "endurance.csv"
+SAID = (
+    "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves",
+    "true_follows", "true_tool_close", "true_object_close", "histogram",
+)  # fmt: skip
+"""Measures that are printed."""
+
+
+def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float, which: int) -> Path:
+    return out / "films" / f"{name}-{variant}-{kind}-{minutes:g}-{which}.npz"
+
+
+def run_variant(
+    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int, update
+) -> dict[str, Film]:
+    """All robots of a run that the suite knows, each from its start number `which` on, in one batch."""
+    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
+    robots = known_robots(simulator.robots)
+    decode = replace(find_decode(run), **VARIANTS[variant])
+    options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
+    simulator = load_simulator(run, **options)
+    drives = []
+    for name, robot in robots.items():
+        starts = [s for s in simulator.starts if s.robot == name and s.seed is not None]
+        require(which < len(starts), f"{name} has {len(starts)} starts in the true simulator, no number {which}")
+        drives.append(make_drive(robot, starts[which], round(60 * minutes * robot.hz), kind, seed=which))
+    return make_films(simulator, detector, drives, update)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
+    parser.add_argument("--minutes", type=float, default=10.0, help="of simulated time")
+    parser.add_argument("--starts", type=int, default=1, help="of each robot")
+    parser.add_argument("--variants", nargs="+", default=["shipped"], choices=list(VARIANTS), metavar="NAME")
+    parser.add_argument("--drives", nargs="+", default=["behaviour"], choices=KINDS)
+    parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
+    parser.add_argument("--name", default="model", help="of the run, in file names and the table")
+    parser.add_argument("--table", default=TABLE, help="file in DIR; curves of the same name")
+    parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
+    asked = parser.parse_args()
+    require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
+    detector, rows = Detector.load(asked.detector), []
+    for kind in asked.drives:
+        for variant in asked.variants:
+            new: list[Row] = []
+            for which in range(asked.starts):
+                path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which)
+                if not path.exists():
+                    with step(f"{variant}, {kind}, {asked.minutes:g} min, start {which}") as update:
+                        made = run_variant(asked.run, detector, variant, kind, asked.minutes, which, update)
+                    save_films(made, path)
+                films = load_films(path)
+                hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
+                new += rows_of(f"{asked.name}/{variant}", kind, which, films, hz, tools, asked.every)
+            show(new)
+            rows += new
+            draw_sheet(films, asked.out / f"{asked.name}-{variant}-{kind}.png")
+            console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
+    table, curves = asked.out / asked.table, (asked.out / asked.table).with_suffix(".png")
+    write_rows(table, rows)
+    draw_curves([row for row in rows if row["drive"] == asked.drives[0]], curves)
+    wrote(table, curves)
+
+
+def show(rows: list[Row]) -> None:
+    """Means over robots of the first part, the last one, and some between."""
+    parts = sorted({row["part"] for row in rows})
+    for part in dict.fromkeys([parts[0], parts[len(parts) // 2], parts[-1]]):
+        mine = [row for row in rows if row["part"] == part]
+        words = [f"{n} {over_robots(mine, n)[0]:.3f}±{over_robots(mine, n)[1]:.3f}" for n in SAID]
+        console.print(f"{mine[0]['variant']} {mine[0]['drive']} part {part}: " + ", ".join(words), soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""What a robot is told for minutes, and what truly happens then: from one start, in the true simulator alone.
+
+The suite's behaviour sees the true state, and the model gets the same actions; two other kinds are unlike anything that
+was recorded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.behaviour import Behaviour
+from data_pipelines.suite.render import render_frames
+from data_pipelines.suite.simulator import SPECS
+from data_pipelines.suite.spec import EmbodimentSpec
+from data_pipelines.suite.world import World
+from experiments.applications.scenes import Points, points_of
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import Start
+
+Kind = Literal["behaviour", "extremes", "alternation"]
+"""`behaviour`: as recorded, begun anew every `AGAIN` seconds; `extremes`: one action value after the other held at an
+end of its range for `HOLD` seconds, the others at rest; `alternation`: all values jump from end to end every frame."""
+
+AGAIN, HOLD = 12.0, 2.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """n frames after a start. The state at t = 0 is the start's last frame."""
+
+    robot: Robot
+    start: Start
+    actions: np.ndarray  # float32 [n, A], raw and within the range
+    q: np.ndarray  # [n + 1, C]
+    objects: np.ndarray  # [n + 1, K, 2]
+    goals: np.ndarray  # [1, M, 2]
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    @property
+    def spec(self) -> EmbodimentSpec:
+        return SPECS[self.robot.name]
+
+    def frames(self, first: int, stop: int) -> np.ndarray:
+        """True frames uint8 [stop - first, H, W, 3]."""
+        q, objects = self.q[first:stop], self.objects[first:stop]
+        looks = draw_appearance(self.spec, [self.start.seed])
+        return render_frames(self.spec, looks, self.goals, q, objects, np.zeros(len(q), int))
+
+    def points(self) -> Points:
+        """Of all n + 1 states."""
+        return points_of(self.spec, np.full(len(self.q), self.start.seed), self.q, self.objects)
+
+
+def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -> Drive:
+    """A function of its arguments. `start` must have the seed of its episode."""
+    spec = SPECS[robot.name]
+    world = World(spec, [start.seed])
+    for action in start.actions:
+        world.step(action[None].astype(np.float64))
+    q, objects, actions, behaviour = [world.q.copy()], [world.objects.copy()], [], None
+    again = max(round(AGAIN * spec.hz), 1)
+    for t in range(frames):
+        if kind == "behaviour":
+            if t % again == 0:
+                behaviour = Behaviour(world, np.random.default_rng([seed, t]))
+            asked = behaviour.act()[0]
+        else:
+            asked = _unlike(robot, kind, t)
+        action = np.clip(np.asarray(asked, np.float32), np.float32(robot.low), np.float32(robot.high))
+        world.step(action[None].astype(np.float64))
+        actions.append(action)
+        q.append(world.q.copy())
+        objects.append(world.objects.copy())
+    return Drive(robot, start, np.stack(actions), np.concatenate(q), np.concatenate(objects), world.goals)
+
+
+def _unlike(robot: Robot, kind: Kind, t: int) -> np.ndarray:
+    if kind == "alternation":
+        return np.array(robot.high if t % 2 else robot.low)
+    turn = t // max(round(HOLD * robot.hz), 1)
+    which, end = turn // 2 % robot.action_dim, (robot.high, robot.low)[turn % 2]
+    action = np.array(robot.rest)
+    action[which] = end[which]
+    return action

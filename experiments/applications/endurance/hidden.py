@@ -1,0 +1,166 @@
+"""Objects that are hidden or out of view for a while and come back: are they still what and where they were?
+
+Command: python -m experiments.applications.endurance.hidden RUN --out DIR
+Cost: ten minutes of one core.
+Expected: within the model's window what was hidden comes back as often as what was never hidden is still there. Found:
+          after two or three hidden frames in a third of the cases, after four or more never (docs/endurance.md).
+
+Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
+after the start. Beside each stands a control: an object that is seen all the time, judged as long after the start.
+Writes DIR/hidden.csv, a row per event.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.render import render_frames
+from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
+from data_pipelines.suite.simulator import SPECS
+from data_pipelines.suite.spec import EmbodimentSpec
+from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.detector import SURE, WEIGHTS, Detector, known_robots
+from experiments.applications.endurance.tables import CLOSE, Row, write_rows
+from experiments.applications.scenes import SEEN, points_of
+from experiments.applications.simulators import START_FRAMES, load_simulator
+from experiments.progress import console, step
+from experiments.wrote import wrote
+from hma_jax.config import ExecutionConfig
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.simulator.starts import Start
+
+EPISODES, HORIZON = 400, 30
+"""Of each robot that are searched, and frames after the start in which the object must be back."""
+
+WHOLE = 0.6
+"""Share of an object that is seen before and after."""
+
+LEAST = 2
+"""Frames that it is not seen at least."""
+
+PER_ROBOT = 6
+"""Events of each robot, and as many controls."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Point p of an episode is seen until frame `start`, where the model takes over, and judged `lag` frames later."""
+
+    kind: Literal["hidden", "control"]
+    episode: int
+    start: int
+    point: int
+    gone: int  # frames that it is not seen in between
+    lag: int
+
+
+def find_events(share: np.ndarray, lengths: np.ndarray, tools: int, rng: np.random.Generator) -> list[Event]:
+    """Up to `PER_ROBOT` events, at most one of an episode, and a control for each, from shares [n, T, P] that are seen.
+
+    The start is the last frame before the object begins to vanish.
+    """
+    hidden: list[Event] = []
+    for episode in rng.permutation(len(share)):
+        own = share[episode, : lengths[episode]]
+        found = [e for p in range(tools, share.shape[2]) for e in _of(own[:, p], int(episode), p)]
+        if found:
+            hidden.append(max(found, key=lambda e: e.gone))  # the longest are the rarest
+    hidden = hidden[:PER_ROBOT]
+    controls: list[Event] = []
+    for event in hidden:
+        for episode in rng.permutation(len(share)):
+            start, stop = START_FRAMES - 1, START_FRAMES + event.lag
+            whole = (share[episode, :stop] >= WHOLE).all(0)
+            points = [p for p in range(tools, share.shape[2]) if whole[p]]
+            if points and lengths[episode] >= stop:
+                controls.append(Event("control", int(episode), start, points[0], 0, event.lag))
+                break
+    return hidden + controls
+
+
+def _of(share: np.ndarray, episode: int, point: int) -> list[Event]:
+    events, t = [], START_FRAMES - 1
+    while t < len(share) - 1:
+        if share[t] >= WHOLE and share[t + 1] < WHOLE:
+            back = next((s for s in range(t + 1, min(t + 1 + HORIZON, len(share))) if share[s] >= WHOLE), None)
+            if back is None:
+                break
+            gone = int((share[t:back] < SEEN).sum())
+            if gone >= LEAST:
+                events.append(Event("hidden", episode, t, point, gone, back - t))
+            t = back
+        else:
+            t += 1
+    return events
+
+
+def judge(
+    simulator: Simulator, detector: Detector, spec: EmbodimentSpec, rollout: Rollout, events: list[Event]
+) -> list[Row]:
+    """The model's frame at the end of each event, all of one robot in one batch."""
+    robot, last = simulator.robots[spec.name], max(e.lag for e in events)
+    starts, actions, true = [], [], []
+    for e in events:
+        seeds, part = rollout.seeds[e.episode : e.episode + 1], slice(0, e.start + e.lag + 1)
+        q, objects = rollout.q[e.episode, part], rollout.objects[e.episode, part]
+        goals = rollout.goals[e.episode : e.episode + 1]
+        images = render_frames(spec, draw_appearance(spec, seeds), goals, q, objects, np.zeros(len(q), int))
+        told = rollout.actions[e.episode]
+        starts.append(Start(spec.name, images[: e.start + 1], told[: e.start], int(seeds[0])))
+        actions.append(np.clip(told[e.start : e.start + last], np.float32(robot.low), np.float32(robot.high)))
+        true.append((images[-1], points_of(spec, np.repeat(seeds, len(q)), q, objects)))
+    films = [simulator.reset(starts, seeds=0).copy()]
+    for t in range(last):  # all of them until the last is judged: other numbers of episodes would be compiled anew
+        films.append(simulator.step([a[min(t, len(a) - 1)] for a in actions]).copy())
+    film, rows = np.stack(films), []
+    for b, (e, (image, points)) in enumerate(zip(events, true, strict=True)):
+        row: Row = {"robot": spec.name, "kind": e.kind, "gone": e.gone, "lag": e.lag}
+        for name, seen in (("", film[e.lag, b]), ("true_", image)):
+            found = detector.watch(spec.name, seen[None])
+            off = float(np.linalg.norm(found.position[0, e.point] - points.position[-1, e.point]))
+            sure = float(found.confidence[0, e.point])
+            row |= {f"{name}confidence": sure, f"{name}px": off, f"{name}close": float(sure >= SURE and off <= CLOSE)}
+            row |= {f"{name}found": float(sure >= SURE)}
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
+    parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
+    asked = parser.parse_args()
+    detector, rows = Detector.load(asked.detector), []
+    simulator = load_simulator(asked.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
+    with step("objects that come back") as update:
+        robots = known_robots(simulator.robots)
+        for i, name in enumerate(robots):
+            spec, rng = SPECS[name], np.random.default_rng([0, i])
+            rollout = simulate(spec, episode_seeds(spec, EPISODES, 0, "val"))
+            n, steps = rollout.q.shape[:2]
+            flat = (x.reshape(-1, *x.shape[2:]) for x in (rollout.q, rollout.objects))
+            share = points_of(spec, np.repeat(rollout.seeds, steps), *flat).share.reshape(n, steps, -1)
+            events = find_events(share, rollout.lengths, len(spec.body.tools), rng)
+            if events:
+                # episodes that are left over play the first event again
+                judged = (events * (2 * PER_ROBOT))[: 2 * PER_ROBOT]
+                rows += judge(simulator, detector, spec, rollout, judged)[: len(events)]
+            update(i + 1, len(robots), name)
+    write_rows(asked.out / "hidden.csv", rows)
+    for kind in ("hidden", "control"):
+        mine = [row for row in rows if row["kind"] == kind]
+        names = ("gone", "lag", "found", "close", "true_found", "true_close")
+        means = {k: np.mean([float(r[k]) for r in mine]) for k in names}
+        console.print(f"{kind}: {len(mine)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
+    wrote(asked.out / "hidden.csv")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""What films come to: a row per robot and minute, and their means over robots with intervals."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from experiments.analysis.intervals import critical
+from experiments.applications.detector import NEAR, SURE
+from experiments.applications.endurance.films import Film
+from experiments.applications.scenes import SEEN
+
+CLOSE = NEAR[1]
+"""Pixels of a 64-pixel frame, 2 of a frame of 32: what is found within them of the truth is where it should be."""
+
+STILL = 1e-3
+"""Pixels: what varies less does not move."""
+
+Row = dict[str, object]
+
+MEASURES = (
+    "psnr", "psnr_still", "tool_found", "tool_close", "tool_px", "object_found", "object_close", "object_px", "follows",
+    "moves", "true_tool_close", "true_object_close", "true_follows", "true_moves", "level", "variance", "histogram",
+)  # fmt: skip
+
+
+def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
+    """`MEASURES` of the frames `part` of a film whose first `tools` points are tools, of what is seen in truth."""
+    found: dict[str, float] = {"psnr": film.psnr[part].mean(), "psnr_still": film.still[part].mean()}
+    there = film.true_share[part] >= SEEN
+    for name, position, confidence in (
+        ("", film.position, film.confidence), ("true_", film.seen_position, film.seen_confidence),
+    ):  # fmt: skip
+        off = np.linalg.norm(position[part] - film.true_position[part], axis=-1)
+        sure = confidence[part] >= SURE
+        for kind, which in (("tool", slice(None, tools)), ("object", slice(tools, None))):
+            mine = there[:, which]
+            far, known = off[:, which][mine], sure[:, which][mine]
+            found |= {
+                f"{name}{kind}_found": known.mean(), f"{name}{kind}_close": (known & (far <= CLOSE)).mean(),
+                f"{name}{kind}_px": np.median(far),
+            }  # fmt: skip
+    for name, position in (("", film.position), ("true_", film.seen_position)):
+        found |= motion(film.true_position[part, :tools], position[part, :tools], there[:, :tools], name)
+    found |= {name: getattr(film, name)[part].mean() for name in ("level", "variance", "histogram")}
+    return {name: float(found[name]) for name in MEASURES}
+
+
+def motion(true: np.ndarray, seen: np.ndarray, there: np.ndarray, prefix: str) -> dict[str, float]:
+    """How the motion of tools [n, M, 2] that is seen follows what the commands do in the true simulator, from frame to
+    frame where a tool is in view: `follows`, Pearson's correlation of displacements across and down, their mean, and
+    `moves`, of how far they go alone, which does not mind that a robot stands otherwise than in truth."""
+    both = there[1:] & there[:-1]
+    asked, done = np.diff(true, axis=0)[both], np.diff(seen, axis=0)[both]
+    pairs = {"follows": [(asked[:, a], done[:, a]) for a in (0, 1)]}
+    pairs["moves"] = [(np.linalg.norm(asked, axis=-1), np.linalg.norm(done, axis=-1))]
+    return {prefix + name: float(np.mean([_correlation(*pair) for pair in some])) for name, some in pairs.items()}
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's of what was asked and done, in pixels; nan where nothing was asked, 0 where nothing was done."""
+    if len(a) < 3 or a.std() < STILL:
+        return float("nan")
+    return float(np.corrcoef(a, b)[0, 1]) if b.std() >= STILL else 0.0
+
+
+def rows_of(
+    variant: str, drive: str, start: int, films: Mapping[str, Film], hz: Mapping[str, float], tools: Mapping[str, int],
+    seconds: float,
+) -> list[Row]:  # fmt: skip
+    """A row per robot and `seconds` of its film; what is left at the end counts if it is half as long."""
+    rows: list[Row] = []
+    for robot, film in films.items():
+        size = max(round(seconds * hz[robot]), 1)
+        for i, first in enumerate(range(0, len(film.psnr), size)):
+            part = slice(first, min(first + size, len(film.psnr)))
+            if 2 * (part.stop - part.start) >= size:
+                names = {"variant": variant, "drive": drive, "robot": robot, "start": start}
+                rows.append(names | {"part": i + 1, "seconds": seconds} | measure(film, part, tools[robot]))
+    return rows
+
+
+def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
+    """(mean, half of the 95 % interval by Student's t, n) over robots, of the mean over each one's starts: robots are a
+    sample here, and others would differ."""
+    rows = [row for row in rows if np.isfinite(float(row[name]))]
+    robots = dict.fromkeys(row["robot"] for row in rows)
+    values = np.array([np.mean([float(row[name]) for row in rows if row["robot"] == robot]) for robot in robots])
+    half = critical(len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
+    return float(values.mean()), float(half), len(values)
+
+
+def write_rows(path: Path, rows: Sequence[Row]) -> None:
+    content = io.StringIO()
+    writer = csv.DictWriter(content, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, content.getvalue())
+
+
+def read_rows(path: Path) -> list[Row]:
+    """What `write_rows` wrote."""
+
+    def value(name: str, text: str) -> object:
+        if name in ("variant", "drive", "robot", "kind"):
+            return text
+        return float(text)
+
+    with path.open(newline="") as file:
+        return [{name: value(name, text) for name, text in row.items()} for row in csv.DictReader(file)]

@@ -1,0 +1,77 @@
+"""True frames of the suite's robots with what is to be seen in them: where tools and objects are, these by colour."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.render import positions_of, render_frames
+from data_pipelines.suite.rollout import episode_seeds, simulate
+from data_pipelines.suite.spec import IMAGE_SIZE, EmbodimentSpec
+from data_pipelines.suite.visible import object_colours, visible_shares
+
+SEEN = 0.25
+"""Share of a thing that must be seen for it to be there."""
+
+AWAY = 9.0
+"""Where an object is put that is to be missing, world units."""
+
+
+class Points(NamedTuple):
+    """P points in F frames: tools, then objects by colour of the palette.
+
+    position float32 [F, P, 2] in pixels (column, row), 0 where there is none; share float32 [F, P] of it that is seen.
+    """
+
+    position: np.ndarray
+    share: np.ndarray
+
+    @property
+    def there(self) -> np.ndarray:
+        return self.share >= SEEN
+
+
+class Scenes(NamedTuple):
+    """n true frames and what is in them."""
+
+    images: np.ndarray  # uint8 [n, H, W, 3]
+    position: np.ndarray  # float32 [n, P, 2]
+    there: np.ndarray  # bool [n, P]
+
+
+def point_names(spec: EmbodimentSpec) -> tuple[str, ...]:
+    tools = tuple(f"tool_{m}" for m in range(len(spec.body.tools)))
+    return (*tools, *(f"colour_{c}" for c in range(len(spec.palette.objects))))
+
+
+def points_of(spec: EmbodimentSpec, seed_F: np.ndarray, q: np.ndarray, objects: np.ndarray) -> Points:
+    """Of configurations q [F, C] with objects [F, K, 2] in the episodes with the seeds [F]."""
+    tools, frames = len(spec.body.tools), np.arange(len(q))
+    true = positions_of(spec, q, objects)
+    position = np.zeros((len(q), len(point_names(spec)), 2), np.float32)
+    share = np.zeros(position.shape[:2], np.float32)
+    position[:, :tools] = true[:, :tools]
+    share[:, :tools] = ((true[:, :tools] > -0.5) & (true[:, :tools] < IMAGE_SIZE - 0.5)).all(-1)
+    seeds, which = np.unique(seed_F, return_inverse=True)
+    colours, seen = object_colours(spec, seeds)[which], visible_shares(spec, q, objects)
+    for k in range(objects.shape[1]):
+        position[frames, tools + colours[:, k]] = true[:, tools + k]
+        share[frames, tools + colours[:, k]] = seen[:, k]
+    return Points(position, share)
+
+
+def draw_scenes(
+    spec: EmbodimentSpec, split: str, episodes: int, per_episode: int, seed: int, missing: float = 0.0
+) -> Scenes:
+    """Frames at random moments of a split's first episodes; each object is missing with probability `missing`."""
+    seeds = episode_seeds(spec, episodes, 0, split)
+    rollout, rng = simulate(spec, seeds), np.random.default_rng([seed, *map(ord, spec.name)])
+    episode = np.repeat(np.arange(episodes), per_episode)
+    when = (rng.random(len(episode)) * rollout.lengths[episode]).astype(int)
+    gone = rng.random((len(episode), rollout.objects.shape[2])) < missing
+    q, objects = rollout.q[episode, when], np.where(gone[..., None], AWAY, rollout.objects[episode, when])
+    points = points_of(spec, seeds[episode], q, objects)
+    images = render_frames(spec, draw_appearance(spec, seeds), rollout.goals, q, objects, episode)
+    return Scenes(images, points.position, points.there)

@@ -1,0 +1,85 @@
+"""What is found, what is close and what follows, on films that are made up."""
+
+import dataclasses
+
+import numpy as np
+
+from experiments.applications.endurance.films import Film, colours_of, load_films, save_films
+from experiments.applications.endurance.hidden import LEAST, find_events
+from experiments.applications.endurance.tables import measure, over_robots, read_rows, rows_of, write_rows
+
+N = 200
+
+
+def film(**changes) -> Film:
+    """A tool and two objects, of which one is never there, all found where they are."""
+    rng = np.random.default_rng(0)
+    true = rng.uniform(5, 60, (N, 3, 2)).astype(np.float32)
+    share = np.tile(np.float32([1, 1, 0]), (N, 1))
+    sure = share * 0.9
+    made = dict(
+        psnr=np.full(N, 20.0), still=np.full(N, 15.0), true_position=true, true_share=share, position=true.copy(),
+        confidence=sure, seen_position=true.copy(), seen_confidence=sure.copy(), level=np.zeros(N), variance=np.ones(N),
+        histogram=np.zeros(N), shown=np.zeros((2, 1, 4, 4, 3), np.uint8),
+    )  # fmt: skip
+    return Film(**(made | changes))
+
+
+def test_found_is_not_close_and_what_is_not_there_does_not_count():
+    whole, right = slice(0, N), film()
+    found = measure(right, whole, tools=1)
+    assert found["tool_close"] == found["object_close"] == found["object_found"] == found["true_object_close"] == 1
+    off = right.position.copy()
+    off[::2, 1] += 3.0  # by 4.2 pixels
+    off[:, 2] += 30.0  # of what is not there
+    moved = measure(film(position=off), whole, tools=1)
+    assert moved["object_found"] == 1 and moved["object_close"] == 0.5 and moved["tool_close"] == 1
+    unsure = right.confidence.copy()
+    unsure[: N // 4, 1] = 0.1
+    lost = measure(film(confidence=unsure), whole, tools=1)
+    assert lost["object_found"] == lost["object_close"] == 0.75
+
+
+def test_motion_follows_or_does_not():
+    def seen(position: np.ndarray) -> tuple[float, float]:
+        found = measure(film(position=position.astype(np.float32)), slice(0, N), 1)
+        return found["follows"], found["moves"]
+
+    true = film().true_position
+    assert min(seen(true + 20.0)) > 0.999  # elsewhere, but moving as told
+    other = np.random.default_rng(1).uniform(5, 60, true.shape)
+    assert max(map(abs, seen(other))) < 0.25
+    follows, moves = seen(64 - true)
+    assert follows < -0.999 and moves > 0.999
+    assert seen(np.full_like(true, 30.0)) == (0.0, 0.0)
+
+
+def test_rows_are_of_whole_parts_and_are_read_again(tmp_path):
+    films = {"a": film(), "b": film(psnr=np.full(N, 24.0))}
+    save_films(films, tmp_path / "x" / "films.npz")
+    again = load_films(tmp_path / "x" / "films.npz")
+    for f in dataclasses.fields(Film):
+        np.testing.assert_allclose(getattr(again["b"], f.name), getattr(films["b"], f.name), rtol=1e-6)
+    rows = rows_of("v", "behaviour", 0, again, {"a": 4.0, "b": 6.0}, {"a": 1, "b": 1}, seconds=10.0)
+    assert [r["part"] for r in rows if r["robot"] == "a"] == [1, 2, 3, 4, 5]
+    assert [r["part"] for r in rows if r["robot"] == "b"] == [1, 2, 3]  # 20 frames of 60 are left: too few
+    write_rows(tmp_path / "rows.csv", rows)
+    mean, half, n = over_robots([r for r in read_rows(tmp_path / "rows.csv") if r["part"] == 1], "psnr")
+    assert (mean, n) == (22.0, 2) and half > 4  # of two robots little is known
+
+
+def test_histograms_are_of_colours():
+    red, blue = (np.broadcast_to(np.uint8(c), (2, 4, 4, 3)) for c in ([255, 0, 0], [0, 0, 255]))
+    assert colours_of(red).sum() == 1 and 0.5 * np.abs(colours_of(red) - colours_of(blue)).sum() == 1
+
+
+def test_events_are_of_what_vanishes_and_comes_back():
+    share = np.ones((4, 20, 2), np.float32)
+    share[0, 6:11, 1] = 0.0  # gone for five frames
+    share[1, 6:, 1] = 0.0  # never back
+    share[2, 6 : 6 + LEAST - 1, 1] = 0.0  # too short
+    events = find_events(share, np.array([20, 20, 20, 20]), 1, np.random.default_rng(0))
+    hidden = [e for e in events if e.kind == "hidden"]
+    assert [(e.episode, e.start, e.gone, e.lag) for e in hidden] == [(0, 5, 5, 6)]
+    (control,) = [e for e in events if e.kind == "control"]
+    assert (control.episode, control.lag) == (3, 6)

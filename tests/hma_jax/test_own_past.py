@@ -1,0 +1,61 @@
+"""A past that the model drew itself: which frames it replaces, and with what."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hma_jax.config import ConfigError, MaskingConfig
+from hma_jax.generation.teacher import next_frame_outputs
+from hma_jax.model.beside import look_beside
+from hma_jax.model.frames import factorise
+from hma_jax.objective import losses
+from hma_jax.objective.losses import noise_keys
+from hma_jax.objective.masking import mask_batch
+from hma_jax.objective.own_past import draw_own_past
+from tests.tiny import TABLE, lively_params, random_batch, shallow_config
+
+TRUE = MaskingConfig(teacher_forcing=True, min_ratio=1.0, max_corrupt_rate=0.0, non_mlm_ratio=0.0)
+OWN = MaskingConfig(teacher_forcing=True, min_ratio=1.0, max_corrupt_rate=0.0, non_mlm_ratio=0.0, own_past=1.0)
+
+
+def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(monkeypatch):
+    config = shallow_config(action_heads=False)
+    declared, params = lively_params(config, scale=0.5)
+    model, rows = declared.merge(params), 128
+    one = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], rows, 0), random_batch(0, config, 1))
+    before, given = one["tokens"][:, :-1], (one["actions"], one["embodiment"])
+    keys = noise_keys(jax.random.key(0), rows)
+    draw = jax.jit(lambda share: draw_own_past(model, before, *given, None, share, keys, given[1]))
+    drawn = np.asarray(draw(1.0))
+    assert (drawn[:, 0] == before[:, 0]).all()
+    replaced = (drawn != np.asarray(before)).any(-1)[:, 1:]
+    assert 0.42 < replaced.mean() < 0.58  # u is uniform: half of all frames
+    assert replaced.mean(1).std() > 0.2  # and drawn for each example
+    # Of a frame that is replaced, each factor is as frequent as the model says after the true past.
+    first = one["tokens"][:1], *(x[:1] for x in given)
+    said = jax.jit(lambda *x: jax.nn.softmax(next_frame_outputs(model, *x)[0, 0]))(*first)
+    own = factorise(jnp.asarray(drawn[replaced[:, 0], 1]), config.factors, config.factor_vocab)
+    frequency = jax.nn.one_hot(own, config.factor_vocab).mean(0)
+    assert np.abs(np.asarray(frequency - said)).max() < 0.2
+    assert np.corrcoef(np.ravel(frequency), np.ravel(said))[0, 1] > 0.8
+    np.testing.assert_array_equal(draw(0.0), before)
+
+    # The loss is that of what follows this past.
+    shown, own = [], before + 1
+    monkeypatch.setattr(losses, "draw_own_past", lambda *_: own)
+    monkeypatch.setattr(losses, "look_beside", lambda model, past, *rest, **how: shown.append(past) or look_beside(
+        model, past, *rest, **how))  # fmt: skip
+
+    def loss(masking: MaskingConfig) -> jax.Array:
+        masked = mask_batch(jax.random.key(0), one["tokens"], one["embodiment"], config, masking, TABLE)
+        return losses.masked_loss(model, masked, one["tokens"], *given, masking, keys).tokens
+
+    jax.eval_shape(lambda: loss(OWN))
+    jax.eval_shape(lambda: loss(TRUE))
+    assert shown[0] is own and shown[1] is not own
+
+
+def test_it_needs_a_past_that_is_shown():
+    with pytest.raises(ConfigError, match="own_past replaces frames of the past .*teacher_forcing"):
+        MaskingConfig(own_past=0.5)
