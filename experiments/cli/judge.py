@@ -78,7 +78,12 @@ def judge(
     write_outcomes(judged.outcomes, out / "outcomes.csv")
     write_summary(summary, out / "agreement.json")
     draw_scatter(summary, out / "scatter.png")
-    page = write_page(judged, summary, out, f"hma judge {run} --robot {robot} --task {task} --out {out}")
+    command = (
+        f"hma judge {run} --robot {robot} --task {task} --starts {starts} --frames {config.task.frames} "
+        f"--demonstrations {demonstrations} --steps {steps} --cloned {cloned} --diffusion {diffusion} --seed {seed} "
+        f"--out {out}"
+    )
+    page = write_page(judged, summary, out, command)
     blind = write_blind(judged, out)
     _say(summary)
     then = f"label the clips of {blind}, and the same command with --labels labels.json"
