@@ -1,0 +1,26 @@
+"""What a picture is worth: how near it is to a picture of the goal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+CELLS = 16
+"""Cells along a side that a picture is averaged to before it is compared: speckle does not count, places do."""
+
+
+def coarse(images: np.ndarray, cells: int = CELLS) -> np.ndarray:
+    """float32 [..., cells, cells, C] in [0, 1]: means over squares of uint8 [..., H, W, C]; H and W are multiples."""
+    *lead, height, width, channels = images.shape
+    split = images.reshape(*lead, cells, height // cells, cells, width // cells, channels)
+    return split.mean((-4, -2), dtype=np.float32) / 255
+
+
+def distance(images: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """float [...]: mean squared difference of coarse pictures uint8 [..., H, W, C] from one goal."""
+    return ((coarse(images) - coarse(goal)) ** 2).mean((-3, -2, -1))
+
+
+def cost_to_goal(frames: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """float [B] of frames uint8 [B, F, H, W, C]: the mean distance over the second half of the horizon, so that being
+    there early counts, and staying."""
+    return distance(frames[:, frames.shape[1] // 2 :], goal).mean(1)
