@@ -18,10 +18,13 @@ class Behaviour:
     a video model must look at the actions.
     """
 
-    def __init__(self, world: World, rng: np.random.Generator):
+    def __init__(self, world: World, rng: np.random.Generator, *, expert: bool = False):
+        """An `expert` has no wishes: it is on the task at every moment, and stays where it is done."""
         n = len(world)
-        self.world, self.rng = world, rng
+        self.world, self.rng, self.expert = world, rng, expert
         self.purpose = world.spec.purpose * rng.uniform(0.0, 2.0, n)  # some only play
+        if expert:
+            self.purpose = np.ones(n)
         self.on_task = rng.random(n) < self.purpose
         self.wish = world.body.random(rng, n)
         self.bias = np.zeros_like(world.q)
@@ -31,7 +34,7 @@ class Behaviour:
         """[n, A] actions for the present state."""
         world, spec, body, rng = self.world, self.world.spec, self.world.body, self.rng
         n = len(world)
-        self.done |= world.success()
+        self.done |= world.success() & (not self.expert)
         change = rng.random(n) < spec.restless * world.dt
         self.on_task = np.where(change, rng.random(n) < self.purpose, self.on_task) & ~self.done
         arrived = np.abs(self.wish - world.q).max(1) < 0.15

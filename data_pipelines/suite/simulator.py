@@ -99,6 +99,10 @@ class SuiteSimulator:
         """By how many frames episode b can be taken back."""
         return len(self._before[b])
 
+    def state(self, b: int) -> State:
+        """A copy of the true state of episode b."""
+        return self._begun(b)[0].get_state()
+
     def success(self) -> np.ndarray:
         """bool [B]: the task's goal is reached now."""
         return np.array([world is not None and world[0].success() for world in self._worlds])

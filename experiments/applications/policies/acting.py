@@ -1,0 +1,88 @@
+"""How networks that see a few frames and plan a few actions act: what they remember of B episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.policy import Counts
+
+STILL = 1e-4
+"""A dimension that varies less than this in the demonstrations is not told apart from one that does not."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Raw actions to normalised ones and back."""
+
+    mean: tuple[float, ...]  # [A]
+    std: tuple[float, ...]
+    low: tuple[float, ...]  # the least that was demonstrated
+    high: tuple[float, ...]
+
+    def normalise(self, actions: np.ndarray) -> np.ndarray:
+        return ((actions - np.array(self.mean)) / np.array(self.std)).astype(np.float32)
+
+    def raw(self, values: np.ndarray) -> np.ndarray:
+        """Within what was demonstrated."""
+        actions = values * np.array(self.std) + np.array(self.mean)
+        return np.clip(actions, self.low, self.high).astype(np.float32)
+
+
+def scale_of(demos: Demonstrations) -> Scale:
+    steps = demos.steps()
+    actions = demos.actions[steps[:, 0], steps[:, 1]].astype(np.float64)
+    std = np.maximum(actions.std(0), STILL)
+    return Scale(*(tuple(x.tolist()) for x in (actions.mean(0), std, actions.min(0), actions.max(0))))
+
+
+def action_chunks(demos: Demonstrations, steps: np.ndarray, chunk: int) -> np.ndarray:
+    """Raw [n, chunk, A]: the actions from each (episode, frame) [n, 2] on; the last one goes on past the end."""
+    at = np.minimum(steps[:, 1:] + np.arange(chunk), demos.lengths[steps[:, 0]][:, None] - 1)
+    return demos.actions[steps[:, :1], at]
+
+
+class ChunkPolicy:
+    """A policy that looks at the last frames, plans normalised actions and executes the first of them.
+
+    Whoever inherits it says what is planned: `plan(frames [n, frames, H, W, 3], seeds, steps)` gives [n, chunk, A].
+    """
+
+    kind = ""
+
+    def __init__(self, frames: int, execute: int, scale: Scale):
+        self.frames, self.execute, self.scale = frames, execute, scale
+        self._counts = Counts()
+        self._seen: np.ndarray | None = None  # [B, frames, H, W, 3]
+        self._fresh: np.ndarray | None = None  # bool [B]: the next image is the first
+        self._left: list[list[np.ndarray]] = []  # planned and not executed
+
+    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
+        self._counts.reset(episodes, seeds)
+        if episodes is None or self._seen is None:
+            self._seen = None
+            return
+        self._fresh[list(episodes)] = True
+        for b in episodes:
+            self._left[b] = []
+
+    def act(self, images: np.ndarray) -> np.ndarray:
+        if self._seen is None or len(self._seen) != len(images):
+            self._seen = np.repeat(images[:, None], self.frames, 1)
+            self._fresh, self._left = np.ones(len(images), bool), [[] for _ in images]
+        self._seen = np.concatenate([self._seen[:, 1:], images[:, None]], 1)
+        self._seen[self._fresh] = images[self._fresh, None]
+        self._fresh[:] = False
+        counted = [self._counts.next(b) for b in range(len(images))]
+        if not all(self._left):  # one call for all: programs are compiled for one size
+            planned = self.scale.raw(self.plan(self._seen, [s for s, _ in counted], [n for _, n in counted]))
+            for b, left in enumerate(self._left):
+                if not left:
+                    left.extend(planned[b, : self.execute])
+        return np.stack([left.pop(0) for left in self._left])
+
+    def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
+        raise NotImplementedError

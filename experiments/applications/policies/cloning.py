@@ -1,0 +1,100 @@
+"""Behaviour cloning: a small network that does what the demonstrations did, by least squares.
+
+Of imprecise actions the mean is learnt, which is precise. It sees the last `frames` images and gives a chunk of
+`chunk` actions, of which `execute` are carried out before it looks again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.applications.policies.acting import ChunkPolicy, Scale, action_chunks, scale_of
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.learning import FitConfig, Report, fit, recent_frames
+from experiments.applications.policies.network import (
+    EncoderConfig,
+    Params,
+    as_floats,
+    beside,
+    encode,
+    features_of,
+    init_encoder,
+    init_mlp,
+    mlp,
+)
+from hma_jax.config import require
+
+
+@dataclass(frozen=True)
+class BcConfig:
+    """A policy and its training."""
+
+    frames: int = 2
+    chunk: int = 1
+    execute: int = 1
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    jitter: float = 0.05  # standard deviation of noise on pixels, in [-1, 1]: frames of a model are never clean
+
+    def __post_init__(self):
+        require(self.frames >= 1, f"a policy sees at least 1 frame, got {self.frames}")
+        require(1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed")
+
+
+def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
+    """float32 parameters that have learnt nothing."""
+    first, second = jax.random.split(jax.random.key(seed))
+    hidden = config.encoder.hidden
+    return {
+        "encoder": init_encoder(first, config.encoder, 3 * config.frames),
+        "mlp": init_mlp(second, (features_of(config.encoder), hidden, hidden, config.chunk * action_dim)),
+    }
+
+
+def apply_bc(params: Params, config: BcConfig, frames: jax.Array) -> jax.Array:
+    """Normalised actions [B, chunk * A] after frames [B, frames, H, W, 3] in [-1, 1]."""
+    return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames)))
+
+
+def train_bc(
+    demos: Demonstrations, config: BcConfig, seed: int = 0, report: Report = lambda done, total, note: None
+) -> dict[int, Params]:
+    """{step: parameters} for `config.fit.keep` and the last step: a ladder from hopeless to as good as it gets.
+
+    A function of its arguments; minutes on one core.
+    """
+    steps, scale = demos.steps(), scale_of(demos)
+    data = {
+        "images": demos.images,
+        "episode": steps[:, 0],
+        "seen": recent_frames(steps, config.frames),
+        "chunk": scale.normalise(action_chunks(demos, steps, config.chunk)).reshape(len(steps), -1),
+    }
+
+    def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
+        frames = as_floats(data["images"][data["episode"][index][:, None], data["seen"][index]])
+        frames = frames + config.jitter * jax.random.normal(key, frames.shape)
+        return jnp.mean((apply_bc(params, config, frames) - data["chunk"][index]) ** 2)
+
+    start = init_bc(config, demos.actions.shape[-1], seed)
+    return fit(start, loss, data, len(steps), config.fit, seed, report)
+
+
+class ClonedPolicy(ChunkPolicy):
+    """What `train_bc` made, acting."""
+
+    kind = "cloned"
+
+    def __init__(self, config: BcConfig, params: Params, scale: Scale):
+        super().__init__(config.frames, config.execute, scale)
+        self.config, self.params = config, params
+        self._apply = jax.jit(lambda params, images: apply_bc(params, config, as_floats(images)))
+
+    def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
+        out = np.asarray(self._apply(self.params, frames))
+        return out.reshape(len(frames), self.config.chunk, -1)

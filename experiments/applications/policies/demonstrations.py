@@ -1,0 +1,144 @@
+"""Recorded episodes as arrays: what policies and success heads are trained on."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.behaviour import Behaviour
+from data_pipelines.suite.render import render_frames
+from data_pipelines.suite.rollout import episode_seeds
+from data_pipelines.suite.world import World
+from experiments.applications.policies.scripted import make_expert, noisy
+from experiments.applications.policies.tasks import Task, held
+from hma_jax.config import ConfigError, require
+
+SPLIT = "demonstrations"
+"""Their seeds are those of no episode that a world model is trained or judged on."""
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """N episodes of up to L frames, padded by zeros. Action t is given at frame t and held until the next.
+
+    images uint8 [N, L, H, W, 3], actions float32 [N, L, A] in raw units, lengths int [N] (frames that count),
+    reached bool [N, L] (the goal is reached at this frame), successes bool [N] (`Task.hold` frames in a row),
+    seeds int64 [N] (with which the suite makes them; -1: it did not).
+    """
+
+    images: np.ndarray
+    actions: np.ndarray
+    lengths: np.ndarray
+    reached: np.ndarray
+    successes: np.ndarray
+    seeds: np.ndarray
+
+    def __post_init__(self):
+        shape = self.images.shape[:2]
+        require(
+            self.images.dtype == np.uint8 and self.actions.shape[:2] == shape and self.reached.shape == shape
+            and len(self.lengths) == len(self.successes) == len(self.seeds) == shape[0],
+            f"demonstrations of different numbers or lengths: images {self.images.shape}, actions {self.actions.shape}, "
+            f"reached {self.reached.shape}",
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """N."""
+        return len(self.images)
+
+    def take(self, rows: np.ndarray | slice | Sequence[int]) -> Demonstrations:
+        """Some of the episodes."""
+        return Demonstrations(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def steps(self) -> np.ndarray:
+        """int [n, 2]: (episode, frame) of all frames that count."""
+        return np.argwhere(np.arange(self.images.shape[1]) < self.lengths[:, None])
+
+
+def record(
+    task: Task,
+    count: int,
+    *,
+    stride: int = 1,
+    image_size: int = 64,
+    noise: float | Sequence[float] = 0.2,
+    play: bool = False,
+    only_successes: bool = False,
+    seed: int = 0,
+) -> Demonstrations:
+    """`count` episodes of the scripted expert, of `task.frames` frames each, a function of the arguments.
+
+    Of several `noise`s every one makes an equal share. The actions are those that were executed, the imprecise ones.
+    `play`: the suite's own restless behaviour instead of the expert. `only_successes` leaves failures out; episodes are
+    then drawn until there are enough. Raises ConfigError if the expert hardly ever succeeds.
+    """
+    noises = [noise] if isinstance(noise, (int, float)) else list(noise)
+    counts = [count // len(noises) + (i < count % len(noises)) for i in range(len(noises))]
+    parts, first = [], 0
+    for level, wanted in zip(noises, counts, strict=True):
+        found = 0
+        for _ in range(50):
+            if found >= wanted:
+                break
+            seeds = episode_seeds(task.spec, first + wanted, seed, SPLIT)[first:]
+            first += wanted
+            made = _drive(task, seeds, stride, image_size, level, play)
+            made = made.take(np.flatnonzero(made.successes)) if only_successes else made
+            parts.append(made.take(slice(wanted - found)))
+            found += len(parts[-1])
+        require(found >= wanted, f"{task.robot}: the expert with noise {level:g} succeeds too rarely to record {wanted} episodes")
+    return join(parts)
+
+
+def join(parts: Sequence[Demonstrations]) -> Demonstrations:
+    """All episodes of several recordings of one robot and length."""
+    return Demonstrations(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Demonstrations)})
+
+
+def _drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool) -> Demonstrations:
+    world = World(noisy(task, noise), seeds)
+    rng = np.random.default_rng([int(seeds[0]), len(seeds), 13])
+    behaviour = Behaviour(world, rng) if play else make_expert(world, int(seeds[0]))
+    q, objects, actions, reached = [], [], [], []
+    for _ in range(task.frames):
+        q.append(world.q.copy())
+        objects.append(world.objects.copy())
+        reached.append(world.success())
+        actions.append(behaviour.act().astype(np.float32))
+        for _ in range(stride):
+            world.step(actions[-1].astype(np.float64))
+    n, frames = len(seeds), task.frames
+    flat = [np.stack(x, 1).reshape(n * frames, *x[0].shape[1:]) for x in (q, objects)]
+    looks = draw_appearance(world.spec, seeds)
+    images = render_frames(world.spec, looks, world.goals, *flat, np.repeat(np.arange(n), frames))
+    if images.shape[1] != image_size:
+        images = np.stack([fit_image(image, image_size) for image in images])
+    done = np.stack(reached, 1)
+    return Demonstrations(
+        images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.full(n, frames), done,
+        held(done, task.hold).any(1), np.asarray(seeds, np.int64),
+    )  # fmt: skip
+
+
+def save_demonstrations(demos: Demonstrations, path: Path) -> None:
+    """Compressed, whole or not at all."""
+    content = io.BytesIO()
+    np.savez_compressed(content, **{f.name: getattr(demos, f.name) for f in fields(demos)})
+    write_file(path, content.getvalue())
+
+
+def load_demonstrations(path: Path) -> Demonstrations:
+    """What `save_demonstrations` wrote. Raises ConfigError for a file that is damaged or something else."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Demonstrations(**{f.name: file[f.name] for f in fields(Demonstrations)})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path} cannot be read as demonstrations ({error}); record them again") from error

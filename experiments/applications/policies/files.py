@@ -1,0 +1,76 @@
+"""Policies on disk: `policy.json` says what it is, `weights.safetensors` holds its parameters."""
+
+from __future__ import annotations
+
+import json
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from data_pipelines.publishing.files import publish, remove
+from experiments.applications.policies.acting import ChunkPolicy, Scale
+from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc
+from hma_jax.config import ConfigError, require
+from hma_jax.config.json import from_dict, to_dict
+
+DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
+KINDS = {ClonedPolicy.kind: (ClonedPolicy, BcConfig, init_bc)}
+
+
+def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] | None = None) -> None:
+    """Replaces `directory`, whole or not at all. `about` is kept beside it: robot, task, step, seed."""
+    making = directory.with_name(f".{directory.name}.{secrets.token_hex(4)}.tmp")
+    making.mkdir(parents=True)
+    try:
+        description = {
+            "kind": policy.kind,
+            "config": to_dict(policy.config),
+            "scale": to_dict(policy.scale),
+            "about": dict(about or {}),
+        }
+        (making / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n")
+        save_file(named(policy.params), making / WEIGHTS)
+        publish(making, directory)
+    finally:
+        remove(making)
+
+
+def load_policy(directory: Path) -> ChunkPolicy:
+    """Raises ConfigError where none is, or a damaged one."""
+    try:
+        description = json.loads((directory / DESCRIPTION).read_text())
+        weights = load_file(directory / WEIGHTS)
+    except (OSError, ValueError, SafetensorError) as error:
+        raise ConfigError(f"{directory} cannot be read as a policy ({error}); train it again") from error
+    kind = description.get("kind")
+    require(kind in KINDS, f"{directory}: a policy of kind {kind!r} is not known; there are {', '.join(KINDS)}")
+    cls, config_type, init = KINDS[kind]
+    config = from_dict(config_type, description["config"], f"{directory}: config")
+    scale = from_dict(Scale, description["scale"], f"{directory}: scale")
+    wanted = jax.eval_shape(lambda: init(config, len(scale.mean), 0))
+    return cls(config, unnamed(weights, wanted, directory), scale)
+
+
+def about_policy(directory: Path) -> dict[str, Any]:
+    """What `save_policy` was told."""
+    return json.loads((directory / DESCRIPTION).read_text())["about"]
+
+
+def named(params: Any) -> dict[str, np.ndarray]:
+    """{path: array}."""
+    return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree.leaves_with_path(params)}
+
+
+def unnamed(arrays: Mapping[str, np.ndarray], like: Any, where: Path) -> Any:
+    """The tree of `like` with these arrays. Raises ConfigError for others than it has."""
+    shapes = {jax.tree_util.keystr(path): x.shape for path, x in jax.tree.leaves_with_path(like)}
+    found = {name: x.shape for name, x in arrays.items()}
+    require(shapes == found, f"{where}: the weights are of another network than its description says; train it again")
+    return jax.tree.map_with_path(lambda path, _: jnp.asarray(arrays[jax.tree_util.keystr(path)]), like)

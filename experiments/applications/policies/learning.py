@@ -1,0 +1,97 @@
+"""How small networks are trained here: one jitted step on arrays in memory, kept at several steps of training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from hma_jax.config import require
+
+Report = Callable[[int, int, str], None]
+"""Called as report(done, total, note)."""
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """AdamW with a warm-up and a cosine decay, float32. Parameters are kept after each of the steps `keep`, and after
+    the last one: their exponential moving average where `ema` > 0."""
+
+    steps: int = 3000
+    batch: int = 64
+    learning_rate: float = 1e-3
+    warmup: int = 50
+    weight_decay: float = 1e-4
+    ema: float = 0.995
+    keep: tuple[int, ...] = ()
+
+    def __post_init__(self):
+        require(self.steps >= 1 and self.batch >= 1, "training needs steps and a batch of at least 1")
+        require(all(0 <= k <= self.steps for k in self.keep), f"steps to keep must lie in 0..{self.steps}, got {self.keep}")
+        require(0 <= self.ema < 1, f"ema must lie in [0, 1), got {self.ema}")
+
+
+def fit(
+    params: Any,
+    loss: Callable[[Any, Mapping[str, jax.Array], jax.Array, jax.Array], jax.Array],
+    data: Mapping[str, np.ndarray],
+    examples: int,
+    config: FitConfig,
+    seed: int,
+    report: Report = lambda done, total, note: None,
+) -> dict[int, Any]:
+    """{step: parameters} of every step that is kept, the last included.
+
+    `loss(params, data, index [B], key)` is the mean over the examples `index` of `data`, which lies whole in memory. Step
+    n draws its batch from `fold_in(key(seed), n)`. The average of parameters takes the plain mean of the first ones.
+    """
+    schedule = optax.warmup_cosine_decay_schedule(0, config.learning_rate, config.warmup, max(config.steps, config.warmup + 1))
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
+    )
+    arrays = {name: jnp.asarray(values) for name, values in data.items()}
+    root = jax.random.key(seed)
+
+    @jax.jit
+    def step(params: Any, average: Any, state: Any, n: jax.Array, arrays: Mapping[str, jax.Array]):
+        draw, noise = jax.random.split(jax.random.fold_in(root, n))
+        index = jax.random.randint(draw, (config.batch,), 0, examples)
+        value, grads = jax.value_and_grad(loss)(params, arrays, index, noise)
+        updates, state = optimizer.update(grads, state, params)
+        params = optax.apply_updates(params, updates)
+        decay = jnp.minimum(config.ema, n / (n + 10.0))
+        average = jax.tree.map(lambda a, p: decay * a + (1 - decay) * p, average, params)
+        return params, average, state, value
+
+    keep, kept = {*config.keep, config.steps}, {}
+    average, state = params, optimizer.init(params)
+    if 0 in keep:
+        kept[0] = jax.device_get(average)
+    losses: list[jax.Array] = []
+    for n in range(config.steps):
+        params, average, state, value = step(params, average, state, jnp.int32(n), arrays)
+        losses.append(value)
+        if n + 1 in keep:
+            kept[n + 1] = jax.device_get(average)
+        if (n + 1) % 50 == 0 or n + 1 == config.steps:
+            recent = float(np.mean([np.asarray(x) for x in losses[-50:]]))
+            require(np.isfinite(recent), f"the loss is not finite after {n + 1} steps; lower the learning rate")
+            losses = []
+            report(n + 1, config.steps, f"loss {recent:.4f}")
+    return kept
+
+
+def ladder(steps: int, rungs: int, first: int = 20) -> tuple[int, ...]:
+    """`rungs` steps of training from `first` to `steps`, each the same factor after the one before."""
+    require(rungs >= 2 and steps > first, f"a ladder from {first} to {steps} steps needs at least 2 rungs")
+    return tuple(sorted({round(first * (steps / first) ** (i / (rungs - 1))) for i in range(rungs)}))
+
+
+def recent_frames(steps: np.ndarray, frames: int) -> np.ndarray:
+    """int [n, frames]: which frames an example (episode, frame) [n, 2] is shown, the first repeated before it."""
+    return np.maximum(steps[:, 1:] - np.arange(frames)[::-1], 0)

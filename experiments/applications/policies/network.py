@@ -1,0 +1,123 @@
+"""Small networks on images, as functions of dictionaries of arrays: what policies and success heads share.
+
+Frames go in as they are, are averaged down to `size`, and become K points (a spatial softmax: where each feature map is
+strongest; Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies") with how strong it is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hma_jax.config import require
+
+Params = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """`size`: pixels of a side that the first convolution sees; the map of points is half as wide."""
+
+    size: int = 32
+    channels: tuple[int, ...] = (16, 32, 32)
+    hidden: int = 128
+
+    def __post_init__(self):
+        require(self.size >= 4 and self.size % 2 == 0, f"size must be even and at least 4, got {self.size}")
+        require(len(self.channels) >= 1, "an encoder needs a convolution")
+
+
+def init_dense(key: jax.Array, inputs: int, outputs: int, gain: float = 2.0) -> Params:
+    return {
+        "w": jax.random.normal(key, (inputs, outputs)) * np.sqrt(gain / inputs),
+        "b": jnp.zeros(outputs),
+    }
+
+
+def dense(params: Params, x: jax.Array) -> jax.Array:
+    return x @ params["w"] + params["b"]
+
+
+def init_mlp(key: jax.Array, widths: tuple[int, ...]) -> list[Params]:
+    """The last layer begins small."""
+    keys, last = jax.random.split(key, len(widths) - 1), len(widths) - 2
+    return [init_dense(k, widths[i], widths[i + 1], 0.1 if i == last else 2.0) for i, k in enumerate(keys)]
+
+
+def mlp(layers: list[Params], x: jax.Array) -> jax.Array:
+    for layer in layers[:-1]:
+        x = jax.nn.relu(dense(layer, x))
+    return dense(layers[-1], x)
+
+
+def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
+    """For images of `inputs` channels; two more say where a pixel is."""
+    widths, kernels = (inputs + 2, *config.channels), (5, *(3,) * (len(config.channels) - 1))
+    keys = jax.random.split(key, len(kernels))
+    convolutions = [
+        {
+            "w": jax.random.normal(k, (side, side, widths[i], widths[i + 1])) * np.sqrt(2 / (side * side * widths[i])),
+            "b": jnp.zeros(widths[i + 1]),
+        }
+        for i, (k, side) in enumerate(zip(keys, kernels, strict=True))
+    ]
+    return {"convolutions": convolutions, "sharpness": jnp.ones(config.channels[-1])}
+
+
+def features_of(config: EncoderConfig) -> int:
+    """How many values `encode` gives for an image: two coordinates and a strength for each point."""
+    return 3 * config.channels[-1]
+
+
+def encode(params: Params, config: EncoderConfig, images: jax.Array) -> jax.Array:
+    """Features [B, 3 K] of images [B, H, W, C] in [-1, 1]; H and W are multiples of `config.size`."""
+    x = shrink(images, config.size)
+    at = jnp.linspace(-1, 1, config.size)
+    where = jnp.broadcast_to(jnp.stack(jnp.meshgrid(at, at), -1), (*x.shape[:3], 2))
+    x = jnp.concatenate([x, where], -1)
+    for i, layer in enumerate(params["convolutions"]):
+        stride = 2 if i == 0 else 1
+        x = jax.lax.conv_general_dilated(
+            x, layer["w"], (stride, stride), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        x = x + layer["b"]
+        x = jax.nn.relu(x) if i < len(params["convolutions"]) - 1 else x
+    return points(x, params["sharpness"])
+
+
+def points(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
+    """[B, 3 K] of maps [B, h, w, K]: mean column and row under a softmax of each map, and its mean under it."""
+    batch, height, width, count = maps.shape
+    flat = maps.reshape(batch, height * width, count)
+    weight = jax.nn.softmax(flat * sharpness, axis=1)
+    rows, columns = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
+    x, y = (jnp.einsum("bpk,p->bk", weight, at.ravel()) for at in (columns, rows))
+    return jnp.concatenate([x, y, jnp.tanh((weight * flat).sum(1) / 4)], -1)
+
+
+def shrink(images: jax.Array, size: int) -> jax.Array:
+    """[B, size, size, C]: means of squares of pixels. Raises ConfigError where they do not divide."""
+    batch, height, width, channels = images.shape
+    require(
+        height % size == 0 == width % size,
+        f"images of {height} x {width} pixels cannot be averaged down to {size} x {size}; choose a size that divides them",
+    )
+    if (height, width) == (size, size):
+        return images
+    return images.reshape(batch, size, height // size, size, width // size, channels).mean((2, 4))
+
+
+def as_floats(images: jax.Array) -> jax.Array:
+    """uint8 [..., H, W, 3] to [-1, 1]."""
+    return images.astype(jnp.float32) / 127.5 - 1
+
+
+def beside(frames: jax.Array) -> jax.Array:
+    """[B, H, W, 3 n] of the last n frames [B, n, H, W, 3]: the newest, then how each before it differs from it."""
+    newest = frames[:, -1:]
+    stacked = jnp.concatenate([newest, newest - frames[:, :-1]], 1)
+    return jnp.moveaxis(stacked, 1, 3).reshape(*stacked.shape[:1], *stacked.shape[2:4], -1)
