@@ -9,7 +9,7 @@ import numpy as np
 
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
-from data_pipelines.suite.tasks import Push, Reach
+from data_pipelines.suite.tasks import Push, Reach, Scene
 from data_pipelines.suite.world import State, World
 from hma_jax.config import require
 
@@ -18,6 +18,16 @@ TASKS = (OWN, REACH)
 
 RADIUS = 0.22
 """Within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own."""
+
+
+@dataclass(frozen=True)
+class ReachMark(Reach):
+    """The tool nearer to the mark than the mark is large, whose size and the episode's start stay what they were."""
+
+    within: float = RADIUS
+
+    def done(self, scene: Scene) -> np.ndarray:
+        return (np.linalg.norm(scene.tools - scene.goals, axis=-1) < self.within).all(1)
 
 
 @dataclass(frozen=True)
@@ -41,7 +51,7 @@ class Task:
         if self.name == OWN:
             return spec
         own = spec.task
-        return replace(spec, task=Reach(RADIUS, own.objects, own.size, own.carries, own.marks_object))
+        return replace(spec, task=ReachMark(own.radius, own.objects, own.size, own.carries, own.marks_object))
 
     @property
     def goal(self) -> str:
