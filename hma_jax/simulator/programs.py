@@ -110,5 +110,7 @@ class Programs:
         self._shapes = jax.eval_shape(lambda weights, at: fresh(weights, at.frames, at), self.weights, empty)
 
     def empty(self) -> Episodes:
-        """The state of episodes of which none has begun."""
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes)
+        """The state of episodes of which none has begun, where the weights lie: programs give it back there, and would
+        be compiled a second time for a state from elsewhere."""
+        place = jax.tree.leaves(self.weights)[0].sharding
+        return jax.device_put(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self._shapes), place)

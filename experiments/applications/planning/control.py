@@ -1,4 +1,4 @@
-"""Planning while acting: some actions are carried out in the true simulator, what they did is seen, and a new plan made."""
+"""Planning while acting: some actions of a plan are carried out, what they did is seen, and a new plan is made."""
 
 from __future__ import annotations
 

@@ -80,8 +80,8 @@ def draw(rng: np.random.Generator, mean: np.ndarray, std: np.ndarray, count: int
 
 
 def shifted(plan: np.ndarray, config: SearchConfig, frames: int) -> np.ndarray:
-    """The mean to begin the next search with, after the first `frames` of `plan` [K, A] were carried out: what is left of
-    it, then its last action."""
+    """The mean to begin the next search with, after the first `frames` of `plan` [K, A] were carried out: what is left
+    of it, then its last action."""
     each = np.repeat(plan, config.hold, axis=0)
     rest = np.concatenate([each[frames:], np.repeat(each[-1:], frames, 0)])[: config.frames]
     return rest[:: config.hold]

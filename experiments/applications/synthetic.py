@@ -1,0 +1,255 @@
+"""What generated trajectories are worth to a policy.
+
+Question: is a policy that was trained on 10 recorded and 90 generated trajectories as good as one on 100 recorded?
+Paper: Table 6.
+Command: python -m experiments.applications.synthetic
+Cost: half an hour of one core; goes on where it was stopped.
+Expected: success grows with the generated trajectories; those of a model that is given other actions do not help.
+
+The 100 trajectories are an expert's, from starts that the world model never saw. For each seed ten of them are kept as
+recorded; of the others the actions are kept, and replayed from their own first frames in the learned simulator.
+Control: the same simulator under another trajectory's actions, so that pictures and actions do not belong together. All
+policies are trained alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
+
+Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md; synthetic.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals, resample
+from experiments.analysis.intervals import Interval
+from experiments.applications.generating.source import replay
+from experiments.applications.generating.trajectories import Trajectory
+from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
+from experiments.applications.policies.closed_loop import run_policy, start_seeds
+from experiments.applications.policies.demonstrations import (
+    Demonstrations,
+    join,
+    load_demonstrations,
+    record,
+    save_demonstrations,
+)
+from experiments.applications.policies.learning import FitConfig
+from experiments.applications.policies.tasks import Task, find_task
+from experiments.applications.simulators import load_simulator
+from experiments.applications.tables import write_table
+from experiments.progress import Pace, step
+from experiments.wrote import wrote
+from hma_jax.evaluation.metrics import psnr
+from hma_jax.simulator.simulator import Simulator
+
+RUN, OUT = Path("experiments/results/simulator"), Path("runs/synthetic")
+
+BATCH, GIVEN = 8, 3
+
+
+class Condition(NamedTuple):
+    """What a policy is trained on: so many recorded trajectories, and so many of the kind `more`."""
+
+    name: str
+    recorded: int
+    generated: int = 0
+    more: str = "generated"
+
+
+CONDITIONS = (
+    Condition("10 recorded", 10),
+    Condition("10 + 10 generated", 10, 10),
+    Condition("10 + 50 generated", 10, 50),
+    Condition("10 + 90 generated", 10, 90),
+    Condition("10 + 90, other actions", 10, 90, "shuffled"),
+    Condition("100 recorded", 100),
+)
+FEW, MOST, CONTROL, ALL = 0, 3, 4, 5
+"""Places in `CONDITIONS` that the share of the gap is made of."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that the results depend on besides the world model."""
+
+    robot: str = "pusher_sand"
+    task: str = "reach"
+    frames: int = 16
+    trajectories: int = 100
+    starts: int = 64
+    seeds: tuple[int, ...] = (0, 1, 2)
+    steps: int = 800  # of training, of every policy
+    batch: int = 32
+
+    def make_task(self) -> Task:
+        return find_task(self.robot, self.task, self.frames)
+
+
+def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
+    """The 100 trajectories as recorded, generated, and generated under shuffled actions; made once, kept in `out`."""
+    sets = {kind: out / f"{kind}.npz" for kind in ("recorded", "generated", "shuffled")}
+    if not sets["recorded"].exists():
+        with step(f"record {settings.trajectories} trajectories"):
+            made = record(settings.make_task(), settings.trajectories, only_successes=True)
+            save_demonstrations(made, sets["recorded"])
+    recorded = load_demonstrations(sets["recorded"])
+    for kind, shift in (("generated", 0), ("shuffled", 1)):
+        if not sets[kind].exists():
+            with step(f"replay actions: {kind}") as update:
+                images = imagine(simulator, settings.robot, recorded, np.roll(recorded.actions, shift, 0), update)
+            save_demonstrations(replace(recorded, images=images), sets[kind])
+    return {kind: load_demonstrations(path) for kind, path in sets.items()}
+
+
+def imagine(simulator: Simulator, robot: str, demos: Demonstrations, actions: np.ndarray, update) -> np.ndarray:
+    """Images as `demos` has them, [N, L, H, W, 3], after the first frames the simulator's under `actions` [N, L, A]."""
+    driven, made = simulator.robot(robot), []
+    for first in range(0, len(demos), len(simulator)):
+        rows = range(first, min(first + len(simulator), len(demos)))
+        batch = [Trajectory(str(i), demos.images[i], np.repeat(actions[i][:, None], driven.stride, 1)) for i in rows]
+        made += replay(simulator, driven, batch, list(rows), GIVEN)
+        update(len(made), len(demos), "trajectories")
+    return np.stack(made)
+
+
+def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int) -> Demonstrations:
+    """What one policy is trained on. For one seed fewer trajectories are among the more."""
+    order = np.random.default_rng([seed, 21]).permutation(len(data["recorded"]))
+    kept, others = order[: condition.recorded], order[condition.recorded : condition.recorded + condition.generated]
+    parts = [data["recorded"].take(kept)]
+    return join([*parts, data[condition.more].take(others)] if len(others) else parts)
+
+
+def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update) -> dict:
+    """Trains one policy and judges it: {success, distance} by start."""
+    demos, task = choose(condition, data, seed), settings.make_task()
+    config = BcConfig(jitter=0.0, fit=FitConfig(steps=settings.steps, batch=settings.batch))
+    params = train_bc(demos, config, seed, update)[settings.steps]
+    policy = ClonedPolicy(config, params, scale_of(demos))
+    found = run_policy(task, policy, start_seeds(task, settings.starts), demos.images.shape[2])
+    return {"success": found.success.astype(int).tolist(), "distance": np.round(found.distance, 4).tolist()}
+
+
+# --- What comes of it --------------------------------------------------------------------------
+
+
+def make_panel(trials: Mapping[tuple[int, int], dict], settings: Settings) -> Panel:
+    """Success of every condition, seed and start."""
+    points = [np.array([trials[i, s]["success"] for s in settings.seeds], float) for i in range(len(CONDITIONS))]
+    names = np.full(settings.starts, settings.robot)
+    return Panel(names, np.arange(settings.starts), tuple(points), (settings.seeds,) * len(points))
+
+
+def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
+    """Which share of the gap between few and all recorded trajectories condition `at` closes; the interval holds 95 %
+    of the draws over seeds and starts."""
+    found = resample(panel, draws)
+
+    def share(points: np.ndarray) -> np.ndarray:
+        gap = points[..., ALL] - points[..., FEW]
+        return (points[..., at] - points[..., FEW]) / np.where(np.abs(gap) < 1e-9, np.nan, gap)
+
+    drawn = share(found.drawn)
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return Interval(float(share(found.value)), float(np.nanstd(drawn)), float(low), float(high))
+
+
+def write_results(settings: Settings, trials: Mapping[tuple[int, int], dict], quality: dict, out: Path) -> None:
+    rows = [
+        [c.name, c.recorded, c.generated, c.more if c.generated else "", s, k, done, away]
+        for i, c in enumerate(CONDITIONS)
+        for s in settings.seeds
+        for k, (done, away) in enumerate(zip(trials[i, s]["success"], trials[i, s]["distance"], strict=True))
+    ]
+    names = ["condition", "recorded", "generated", "kind", "seed", "start", "success", "distance"]
+    write_table(out / "trials.csv", names, rows)
+    panel = make_panel(trials, settings)
+    found = bootstrap_intervals(panel)
+    limited = [(r.mean, max(r.low, 0.0), min(r.high, 1.0)) for r in found]
+    summary = [[c.name, *(f"{x:.4f}" for x in three)] for c, three in zip(CONDITIONS, limited, strict=True)]
+    for name, at in (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL)):
+        share = share_closed(panel, at)
+        summary.append([name, *(f"{x:.4f}" for x in (share.mean, share.low, share.high))])
+    for kind, (mean, low, high) in quality.items():
+        summary.append([f"PSNR {kind}, dB", *(f"{x:.4f}" for x in (mean, low, high))])
+    write_table(out / "summary.csv", ["what", "mean", "low", "high"], summary)
+    lines = ["| trained on | success | 95 % interval |", "|---|---|---|"]
+    lines += [f"| {name} | {float(m):.2f} | {float(a):.2f} to {float(b):.2f} |" for name, m, a, b in summary]
+    write_file(out / "table.md", "\n".join(lines) + "\n")
+    write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
+    draw(found, trials, settings, out / "synthetic.png")
+
+
+def draw(found: Sequence[Interval], trials: Mapping[tuple[int, int], dict], settings: Settings, path: Path) -> None:
+    """Success by condition: a bar with its interval, a dot for every seed."""
+    from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, plt, save
+
+    with plt.rc_context(STYLE):
+        figure, panel = plt.subplots(figsize=(7.2, 3.4), layout="constrained")
+        colours = [COLOURS["delta_psnr"] if i == CONTROL else MUTED if i in (FEW, ALL) else COLOURS["perplexity"]
+                   for i in range(len(CONDITIONS))]  # fmt: skip
+        places = np.arange(len(CONDITIONS))
+        panel.bar(places, [r.mean for r in found], color=colours, width=0.62)
+        low = [r.mean - max(r.low, 0) for r in found]
+        high = [min(r.high, 1) - r.mean for r in found]
+        panel.errorbar(places, [r.mean for r in found], [low, high], fmt="none", color=INK, capsize=3)
+        for i in places:
+            means = [np.mean(trials[i, s]["success"]) for s in settings.seeds]
+            panel.plot(np.full(len(means), i + 0.2), means, "o", color=INK, markersize=3)
+        panel.set_xticks(places, [c.name.replace(" generated", "\ngenerated").replace(", ", ",\n") for c in CONDITIONS])
+        panel.set(ylim=(0, 1), ylabel="success in the true simulator")
+        panel.grid(False, axis="x")
+        save(figure, path)
+
+
+def quality_of(data: Mapping[str, Demonstrations]) -> dict[str, tuple[float, float, float]]:
+    """PSNR in dB against the recording, of the frames after the given ones: mean, low and high over trajectories."""
+    found = {}
+    for kind in ("generated", "shuffled"):
+        means = psnr(data[kind].images[:, GIVEN:], data["recorded"].images[:, GIVEN:]).mean(1)
+        names, each = np.full(len(means), kind), np.arange(len(means))
+        (interval,) = bootstrap_intervals(Panel(names, each, (means[None],), ((0,),)))
+        found[kind] = interval.mean, interval.low, interval.high
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, nargs="?", default=RUN, help="directory of a training run")
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--robot", default=Settings.robot)
+    parser.add_argument("--task", default=Settings.task, help="reach, or own: what the robot's own recordings do")
+    parser.add_argument("--frames", type=int, default=Settings.frames, help="of an episode")
+    parser.add_argument("--starts", type=int, default=Settings.starts)
+    parser.add_argument("--seeds", type=int, default=len(Settings.seeds), help="how many")
+    parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
+    asked = vars(parser.parse_args())
+    run, out, seeds = asked.pop("run"), asked.pop("out"), tuple(range(asked.pop("seeds")))
+    settings = Settings(seeds=seeds, **asked)
+    trials_dir = out / "trials"
+    trials_dir.mkdir(parents=True, exist_ok=True)
+    simulator = load_simulator(run, episodes=BATCH, history=1)
+    data = make_data(settings, simulator, out)
+    trials: dict[tuple[int, int], dict] = {}
+    jobs, pace = [(i, s) for s in settings.seeds for i in range(len(CONDITIONS))], Pace()
+    with step(f"train and judge {len(jobs)} policies") as update:
+        for n, (i, seed) in enumerate(jobs):
+            path = trials_dir / f"{i}-{seed}.json"
+            if not path.exists():
+                note = f"{CONDITIONS[i].name}, seed {seed}{pace(n, len(jobs))}"
+                report = lambda done, total, said, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {said}")
+                write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, seed, report)))
+            trials[i, seed] = json.loads(path.read_text())
+    write_results(settings, trials, quality_of(data), out)
+    wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "synthetic.png")
+
+
+if __name__ == "__main__":
+    main()
