@@ -109,7 +109,7 @@ class StoredTrajectories(Trajectories):
         if episode.frames is not None and episode.frames.shape[1:3] == self._tokenizer.image_shape:
             images = np.array(episode.frames[:: self._every])
         else:
-            images = np.asarray(self._tokenizer.decode_uint8(np.array(episode.tokens[:: self._every])))
+            images = np.asarray(self._tokenizer.decode(np.array(episode.tokens[:: self._every])))
         return _trajectory(self.origin(i), images, episode.actions, self._robot, "")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 CELLS = 16
@@ -9,9 +11,11 @@ CELLS = 16
 
 
 def coarse(images: np.ndarray, cells: int = CELLS) -> np.ndarray:
-    """float32 [..., cells, cells, C] in [0, 1]: means over squares of uint8 [..., H, W, C]; H and W are multiples."""
+    """float32 [..., rows, columns, C] in [0, 1]: means over equal parts of uint8 [..., H, W, C], `cells` along each
+    side or as many of them as divide it."""
     *lead, height, width, channels = images.shape
-    split = images.reshape(*lead, cells, height // cells, cells, width // cells, channels)
+    rows, columns = math.gcd(height, cells), math.gcd(width, cells)
+    split = images.reshape(*lead, rows, height // rows, columns, width // columns, channels)
     return split.mean((-4, -2), dtype=np.float32) / 255
 
 
