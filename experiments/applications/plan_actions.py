@@ -19,9 +19,10 @@ Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and ta
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.intervals import Interval
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
 from experiments.applications.planning.models import CONTEXT, LearnedModel, Model, TrueModel
@@ -59,11 +61,12 @@ RUN, OUT = Path("experiments/results/simulator"), Path("runs/planning")
 PLANNERS: dict[str, tuple[Search, str]] = {
     "CEM in the true simulator": (plan_cem, "true"),
     "CEM in the model": (plan_cem, "learned"),
-    "MPPI in the model": (plan_mppi, "learned"),
     "random shooting in the model": (plan_shooting, "learned"),
+    "MPPI in the model": (plan_mppi, "learned"),
 }
 CLONED, RANDOM = "behaviour cloning", "random actions"
 WAYS = (*PLANNERS, CLONED, RANDOM)
+NAMES = ["way", "start", "success", "distance", "seconds_per_plan"]
 
 
 @dataclass(frozen=True)
@@ -73,7 +76,7 @@ class Settings:
     robot: str = "pusher_sand"
     task: str = "reach"
     frames: int = 16
-    starts: int = 32
+    starts: int = 30
     execute: int = 2  # frames from one plan to the next
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
     search: SearchConfig = field(default_factory=SearchConfig)
@@ -146,42 +149,61 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     ]
 
 
-def write_results(settings: Settings, trials: dict[str, list[dict]], out: Path) -> None:
+def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval, float]]:
+    """Success of each way of acting, and seconds per plan (median over starts)."""
+    points = tuple(np.array([[t["success"] for t in found]], float) for found in trials.values())
+    starts = points[0].shape[1]
+    panel = Panel(np.full(starts, "robot"), np.arange(starts), points, ((0,),) * len(points))
+    seconds = [float(np.median([t["seconds"] for t in found])) for found in trials.values()]
+    return list(zip(trials, bootstrap_intervals(panel), seconds, strict=True))
+
+
+def write_results(settings: Settings, trials: Mapping[str, Sequence[dict]], out: Path) -> None:
     rows = [
-        [way, k, int(t["success"]), f"{t['distance']:.4f}", f"{t['seconds']:.2f}"]
+        [way, k, int(t["success"]), f"{t['distance']:.4f}", f"{t['seconds']:.4f}"]
         for way, found in trials.items()
         for k, t in enumerate(found)
     ]
-    write_table(out / "trials.csv", ["way", "start", "success", "distance", "seconds_per_plan"], rows)
-    points = tuple(np.array([[t["success"] for t in found]], float) for found in trials.values())
-    panel = Panel(np.full(settings.starts, settings.robot), np.arange(settings.starts), points, ((0,),) * len(points))
-    found = bootstrap_intervals(panel)
-    summary: list[list[str]] = []
-    lines = ["| acting | success | 95 % interval | seconds per plan |", "|---|---|---|---|"]
-    for (way, ones), r in zip(trials.items(), found, strict=True):
-        low, high = max(r.low, 0.0), min(r.high, 1.0)
-        seconds = float(np.median([t["seconds"] for t in ones]))
-        summary.append([way, *(f"{x:.4f}" for x in (r.mean, low, high, seconds))])
-        took = f"{seconds:.1f}" if seconds else ""
-        lines.append(f"| {way} | {r.mean:.2f} | {low:.2f} to {high:.2f} | {took} |")
+    write_table(out / "trials.csv", NAMES, rows)
+    found = summarise(trials)
+    summary = [[way, *(f"{x:.4f}" for x in (r.mean, r.low, r.high, seconds))] for way, r, seconds in found]
     write_table(out / "summary.csv", ["way", "mean", "low", "high", "seconds_per_plan"], summary)
-    write_file(out / "table.md", "\n".join(lines) + "\n")
+    write_file(out / "table.md", markdown(found))
     write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
-    draw(summary, out / "planning.png")
+    draw(found, out / "planning.png")
 
 
-def draw(summary: Sequence[Sequence], path: Path) -> None:
+def markdown(found: Sequence[tuple[str, Interval, float]]) -> str:
+    """The table that docs/planning.md shows."""
+    lines = ["| acting | success | 95 % interval | seconds per plan |", "|---|---|---|---|"]
+    for way, r, seconds in found:
+        took = f"{seconds:.1f}" if seconds else ""
+        lines.append(f"| {way} | {r.mean:.2f} | {max(r.low, 0.0):.2f} to {min(r.high, 1.0):.2f} | {took} |")
+    return "\n".join(lines) + "\n"
+
+
+def read_trials(path: Path) -> dict[str, list[dict]]:
+    """What trials.csv says."""
+    trials: dict[str, list[dict]] = {}
+    with open(path, newline="") as file:
+        for row in csv.DictReader(file):
+            success, (distance, seconds) = row["success"] == "1", (float(row[name]) for name in NAMES[3:])
+            trials.setdefault(row["way"], []).append({"success": success, "distance": distance, "seconds": seconds})
+    return trials
+
+
+def draw(found: Sequence[tuple[str, Interval, float]], path: Path) -> None:
     """Success by way of acting, with its interval."""
     from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, plt, save
 
     with plt.rc_context(STYLE):
         figure, panel = plt.subplots(figsize=(6.4, 2.9), layout="constrained")
-        places = np.arange(len(summary))[::-1]
-        mean, low, high = (np.array([float(row[i]) for row in summary]) for i in (1, 2, 3))
-        colours = [COLOURS["perplexity"] if "in the model" in row[0] else MUTED for row in summary]
+        places, mean = np.arange(len(found))[::-1], np.array([r.mean for _, r, _ in found])
+        low, high = (np.clip([getattr(r, end) for _, r, _ in found], 0, 1) for end in ("low", "high"))
+        colours = [COLOURS["perplexity"] if "in the model" in way else MUTED for way, _, _ in found]
         panel.barh(places, mean, color=colours, height=0.62)
         panel.errorbar(mean, places, xerr=[mean - low, high - mean], fmt="none", color=INK, capsize=3)
-        panel.set_yticks(places, [row[0] for row in summary])
+        panel.set_yticks(places, [way for way, _, _ in found])
         panel.set(xlim=(0, 1), xlabel="success in the true simulator")
         panel.grid(False, axis="y")
         save(figure, path)
@@ -209,23 +231,23 @@ def main() -> None:
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = start_seeds(settings.make_task(), settings.starts)
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
-    trials: dict[str, list[dict]] = {way: [] for way in WAYS}
-    pace = Pace()
-    with step(f"act in {settings.starts} episodes, {len(WAYS)} ways") as update:
-        for k, seed in enumerate(seeds.tolist()):
-            for way, (search_by, where) in PLANNERS.items():
+    trials: dict[str, list[dict]] = {}
+    for way in (CLONED, RANDOM):
+        path = out / "trials" / f"{way.replace(' ', '_')}.json"
+        with step(way) as update:
+            if not path.exists():
+                write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
+        trials[way] = json.loads(path.read_text())
+    for way, (search_by, where) in PLANNERS.items():
+        trials[way], pace = [], Pace()
+        with step(f"{way}, {settings.starts} episodes") as update:
+            for k, seed in enumerate(seeds.tolist()):
                 path = out / "trials" / f"{way.replace(' ', '_')}-{k}.json"
                 if not path.exists():
                     write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
                 trials[way].append(json.loads(path.read_text()))
-            update(k + 1, len(seeds), f"starts{pace(k + 1, len(seeds))}")
-        for way in (CLONED, RANDOM):
-            path = out / "trials" / f"{way.replace(' ', '_')}.json"
-            if not path.exists():
-                report = lambda done, total, said: update(len(seeds), len(seeds), f"cloning, step {done}: {said}")
-                write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, report)))
-            trials[way] = json.loads(path.read_text())
-    write_results(settings, trials, out)
+                update(k + 1, len(seeds), f"episodes{pace(k + 1, len(seeds))}")
+        write_results(settings, {name: trials[name] for name in WAYS if name in trials}, out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 
 

@@ -17,6 +17,7 @@ Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md;
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -71,6 +72,8 @@ CONDITIONS = (
     Condition("10 + 90, other actions", 10, 90, "shuffled"),
     Condition("100 recorded", 100),
 )
+NAMES = ["condition", "recorded", "generated", "kind", "seed", "start", "success", "distance"]
+
 FEW, MOST, CONTROL, ALL = 0, 3, 4, 5
 """Places in `CONDITIONS` that the share of the gap is made of."""
 
@@ -161,6 +164,14 @@ def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
     return Interval(float(share(found.value)), float(np.nanstd(drawn)), float(low), float(high))
 
 
+def summarise(trials: Mapping[tuple[int, int], dict], settings: Settings) -> list[tuple[str, Interval]]:
+    """Success of every condition, then which share of the gap 90 generated trajectories close, and 90 of the control."""
+    panel = make_panel(trials, settings)
+    found = [(c.name, r) for c, r in zip(CONDITIONS, bootstrap_intervals(panel), strict=True)]
+    shares = (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL))
+    return found + [(name, share_closed(panel, at)) for name, at in shares]
+
+
 def write_results(settings: Settings, trials: Mapping[tuple[int, int], dict], quality: dict, out: Path) -> None:
     rows = [
         [c.name, c.recorded, c.generated, c.more if c.generated else "", s, k, done, away]
@@ -168,23 +179,35 @@ def write_results(settings: Settings, trials: Mapping[tuple[int, int], dict], qu
         for s in settings.seeds
         for k, (done, away) in enumerate(zip(trials[i, s]["success"], trials[i, s]["distance"], strict=True))
     ]
-    names = ["condition", "recorded", "generated", "kind", "seed", "start", "success", "distance"]
-    write_table(out / "trials.csv", names, rows)
-    panel = make_panel(trials, settings)
-    found = bootstrap_intervals(panel)
-    limited = [(r.mean, max(r.low, 0.0), min(r.high, 1.0)) for r in found]
-    summary = [[c.name, *(f"{x:.4f}" for x in three)] for c, three in zip(CONDITIONS, limited, strict=True)]
-    for name, at in (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL)):
-        share = share_closed(panel, at)
-        summary.append([name, *(f"{x:.4f}" for x in (share.mean, share.low, share.high))])
-    for kind, (mean, low, high) in quality.items():
-        summary.append([f"PSNR {kind}, dB", *(f"{x:.4f}" for x in (mean, low, high))])
+    write_table(out / "trials.csv", NAMES, rows)
+    found = summarise(trials, settings)
+    measured = [(name, r.mean, r.low, r.high) for name, r in found]
+    measured += [(f"PSNR {kind}, dB", *three) for kind, three in quality.items()]
+    summary = [[name, *(f"{x:.4f}" for x in three)] for name, *three in measured]
     write_table(out / "summary.csv", ["what", "mean", "low", "high"], summary)
-    lines = ["| trained on | success | 95 % interval |", "|---|---|---|"]
-    lines += [f"| {name} | {float(m):.2f} | {float(a):.2f} to {float(b):.2f} |" for name, m, a, b in summary]
-    write_file(out / "table.md", "\n".join(lines) + "\n")
+    write_file(out / "table.md", markdown(found))
     write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
-    draw(found, trials, settings, out / "synthetic.png")
+    draw([r for _, r in found[: len(CONDITIONS)]], trials, settings, out / "synthetic.png")
+
+
+def markdown(found: Sequence[tuple[str, Interval]]) -> str:
+    """The table that docs/generating.md shows; an interval of a share of episodes ends at 0 and 1."""
+    lines = ["| trained on | success | 95 % interval |", "|---|---|---|"]
+    for name, r in found:
+        low, high = (r.low, r.high) if name.startswith("share") else (max(r.low, 0.0), min(r.high, 1.0))
+        lines.append(f"| {name} | {r.mean:.2f} | {low:.2f} to {high:.2f} |")
+    return "\n".join(lines) + "\n"
+
+
+def read_trials(path: Path) -> dict[tuple[int, int], dict]:
+    """What trials.csv says: {(place of the condition, seed): {success, distance} by start}."""
+    places, trials = {c.name: i for i, c in enumerate(CONDITIONS)}, {}
+    with open(path, newline="") as file:
+        for row in csv.DictReader(file):
+            one = trials.setdefault((places[row["condition"]], int(row["seed"])), {"success": [], "distance": []})
+            one["success"].append(int(row["success"]))
+            one["distance"].append(float(row["distance"]))
+    return trials
 
 
 def draw(found: Sequence[Interval], trials: Mapping[tuple[int, int], dict], settings: Settings, path: Path) -> None:
