@@ -165,7 +165,7 @@ def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
 
 
 def summarise(trials: Mapping[tuple[int, int], dict], settings: Settings) -> list[tuple[str, Interval]]:
-    """Success of every condition, then which share of the gap 90 generated trajectories close, and 90 of the control."""
+    """Success of every condition; which share of the gap 90 generated trajectories close, and 90 of the control."""
     panel = make_panel(trials, settings)
     found = [(c.name, r) for c, r in zip(CONDITIONS, bootstrap_intervals(panel), strict=True)]
     shares = (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL))
