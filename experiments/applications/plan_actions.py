@@ -1,7 +1,7 @@
 """What a learned simulator is worth to a planner.
 
 Question: does a planner that looks ahead in the model reach goals in the true simulator?
-Paper: left for later there (section 6).
+Paper: left for later there.
 Command: python -m experiments.applications.plan_actions
 Cost: half an hour of one core; goes on where it was stopped.
 Expected: planning in the model comes near to planning in the true simulator, and both are above cloned and random
