@@ -37,6 +37,7 @@ from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.intervals import Interval
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
+from experiments.applications.planning.goals import to_picture
 from experiments.applications.planning.models import CONTEXT, LearnedModel, Model, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
 from experiments.applications.planning.search import SearchConfig
@@ -103,7 +104,8 @@ def run_planner(search: Search, model: Model, robot: Robot, settings: Settings, 
     """One episode, until it is decided: {success, distance then, seconds of a plan}."""
     task, seen = settings.make_task(), Environment(settings.make_task().spec)
     seen.reset(seed)
-    planner = Planner(search, settings.search, model, robot, goal_picture(task, seed, size), seed % 2**32)
+    cost = to_picture(goal_picture(task, seed, size))
+    planner = Planner(search, settings.search, model, robot, cost, seed % 2**32)
     images, actions, reached, seconds = [fit_image(seen.render(), size)], [], [seen.success()], []
     left: list[np.ndarray] = []
     while not decided(reached, task):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.applications.planning.goals import cost_to_goal
+from experiments.applications.planning.goals import Cost
 from experiments.applications.planning.models import Model
 from experiments.applications.planning.search import Found, Score, SearchConfig, over_frames, shifted
 from hma_jax.simulator.robots import Robot
@@ -36,10 +36,10 @@ class Units:
 class Planner:
     """One episode's: remembers what is left of the last plan."""
 
-    def __init__(self, search: Search, config: SearchConfig, model: Model, robot: Robot, goal: np.ndarray, seed: int):
-        """`goal`: a picture uint8 [H, W, 3]. What is random depends on `seed` and on how many plans were made."""
+    def __init__(self, search: Search, config: SearchConfig, model: Model, robot: Robot, cost: Cost, seed: int):
+        """What is random depends on `seed` and on how many plans were made."""
         self._search, self._config, self._model, self._units = search, config, model, Units.of(robot)
-        self._goal, self._seed, self._plans = goal, seed, 0
+        self._cost, self._seed, self._plans = cost, seed, 0
         self._mean = np.repeat(self._units.rest[None], config.knots, 0)
 
     def plan(self, execute: int) -> np.ndarray:
@@ -47,7 +47,7 @@ class Planner:
 
         def score(candidates: np.ndarray) -> np.ndarray:
             actions = self._units.raw(over_frames(candidates, self._config))
-            return cost_to_goal(self._model.imagine(actions), self._goal)
+            return self._cost(self._model.imagine(actions))
 
         rng = np.random.default_rng([self._seed, self._plans])
         found = self._search(score, self._config, self._mean, rng)

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
+
+Cost = Callable[[np.ndarray], np.ndarray]
+"""What each of B futures costs, float [B], by its frames uint8 [B, F, H, W, C]: less is better. The judgement of a
+success head is another such function."""
 
 CELLS = 16
 """Cells along a side that a picture is averaged to before it is compared: speckle does not count, places do."""
@@ -24,7 +29,7 @@ def distance(images: np.ndarray, goal: np.ndarray) -> np.ndarray:
     return ((coarse(images) - coarse(goal)) ** 2).mean((-3, -2, -1))
 
 
-def cost_to_goal(frames: np.ndarray, goal: np.ndarray) -> np.ndarray:
-    """float [B] of frames uint8 [B, F, H, W, C]: the mean distance over the second half of the horizon, so that being
-    there early counts, and staying."""
-    return distance(frames[:, frames.shape[1] // 2 :], goal).mean(1)
+def to_picture(goal: np.ndarray) -> Cost:
+    """The mean distance from a picture uint8 [H, W, C] over the second half of the horizon: being there early counts,
+    and staying."""
+    return lambda frames: distance(frames[:, frames.shape[1] // 2 :], goal).mean(1)

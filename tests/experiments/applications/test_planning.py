@@ -8,7 +8,7 @@ import pytest
 from data_pipelines.suite.environment import Environment
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Units
-from experiments.applications.planning.goals import cost_to_goal
+from experiments.applications.planning.goals import to_picture
 from experiments.applications.planning.models import LearnedModel, TrueModel
 from experiments.applications.planning.mppi import plan_mppi
 from experiments.applications.planning.search import SearchConfig, over_frames, shifted
@@ -88,7 +88,7 @@ def test_a_planner_in_the_true_simulator_goes_where_the_picture_says():
     goal, there = seen.render(), seen.positions()[0]
     seen.set_state(began)
     model = TrueModel(task.spec, robot, 64)
-    planner = Planner(plan_cem, SearchConfig(), model, robot, goal, seed=1)
+    planner = Planner(plan_cem, SearchConfig(), model, robot, to_picture(goal), seed=1)
     away = np.linalg.norm(seen.positions()[0] - there)
     for _ in range(4):
         model.begin([], [], seen.get_state())
@@ -112,4 +112,4 @@ def test_the_learned_model_imagines_again_from_the_same_present(monkeypatch):
     np.testing.assert_array_equal(imagined[0], imagined[1])  # candidates share their seed
     assert (model.imagine(other) != imagined).any()
     np.testing.assert_array_equal(model.imagine(first), imagined)
-    assert (cost_to_goal(imagined, imagined[0, -1]) < cost_to_goal(imagined, 255 - imagined[0, -1])).all()
+    assert (to_picture(imagined[0, -1])(imagined) < to_picture(255 - imagined[0, -1])(imagined)).all()
