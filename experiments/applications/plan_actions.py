@@ -142,7 +142,7 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     policy: Policy = RandomPolicy(robot)
     if way == CLONED:
         demos = record(task, settings.trajectories, stride=robot.stride, image_size=size, only_successes=True)
-        config = BcConfig(jitter=0.0, fit=FitConfig(steps=settings.steps, batch=settings.batch))
+        config = BcConfig(fit=FitConfig(steps=settings.steps, batch=settings.batch))
         policy = ClonedPolicy(config, train_bc(demos, config, 0, report)[settings.steps], scale_of(demos))
     found = run_policy(task, policy, seeds, size, robot.stride)
     return [

@@ -133,7 +133,7 @@ def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int) 
 def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update) -> dict:
     """Trains one policy and judges it: {success, distance} by start."""
     demos, task = choose(condition, data, seed), settings.make_task()
-    config = BcConfig(jitter=0.0, fit=FitConfig(steps=settings.steps, batch=settings.batch))
+    config = BcConfig(fit=FitConfig(steps=settings.steps, batch=settings.batch))
     params = train_bc(demos, config, seed, update)[settings.steps]
     policy = ClonedPolicy(config, params, scale_of(demos))
     found = run_policy(task, policy, start_seeds(task, settings.starts), demos.images.shape[2])

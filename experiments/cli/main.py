@@ -21,6 +21,7 @@ from experiments.cli.data import app as data
 from experiments.cli.evaluate import evaluate
 from experiments.cli.fit import fit
 from experiments.cli.generate import generate
+from experiments.cli.judge import judge
 from experiments.cli.plan import plan
 from experiments.cli.play import play
 from experiments.cli.tokenize import tokenize
@@ -49,6 +50,7 @@ app.command(name="plan")(plan)
 app.command(name="play")(play)
 app.command(name="check")(check)
 app.command(name="generate")(generate)
+app.command(name="judge")(judge)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -22,10 +22,11 @@ from experiments.applications.policies.network import (
     as_floats,
     beside,
     encode,
-    features_of,
     init_encoder,
     init_mlp,
+    lit,
     mlp,
+    shrink_bytes,
 )
 from hma_jax.config import require
 
@@ -39,7 +40,7 @@ class BcConfig:
     execute: int = 1
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-    jitter: float = 0.05  # standard deviation of noise on pixels, in [-1, 1]: frames of a model are never clean
+    light: float = 0.03  # standard deviation by which the light of a training example differs, in [-1, 1]
 
     def __post_init__(self):
         require(self.frames >= 1, f"a policy sees at least 1 frame, got {self.frames}")
@@ -52,7 +53,7 @@ def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),
-        "mlp": init_mlp(second, (features_of(config.encoder), hidden, hidden, config.chunk * action_dim)),
+        "mlp": init_mlp(second, (hidden, hidden, config.chunk * action_dim)),
     }
 
 
@@ -70,7 +71,7 @@ def train_bc(
     """
     steps, scale = demos.steps(), scale_of(demos)
     data = {
-        "images": demos.images,
+        "images": shrink_bytes(demos.images, config.encoder.size),
         "episode": steps[:, 0],
         "seen": recent_frames(steps, config.frames),
         "chunk": scale.normalise(action_chunks(demos, steps, config.chunk)).reshape(len(steps), -1),
@@ -78,8 +79,8 @@ def train_bc(
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
         frames = as_floats(data["images"][data["episode"][index][:, None], data["seen"][index]])
-        frames = frames + config.jitter * jax.random.normal(key, frames.shape)
-        return jnp.mean((apply_bc(params, config, frames) - data["chunk"][index]) ** 2)
+        planned = apply_bc(params, config, lit(frames, key, config.light))
+        return jnp.mean((planned - data["chunk"][index]) ** 2)
 
     start = init_bc(config, demos.actions.shape[-1], seed)
     return fit(start, loss, data, len(steps), config.fit, seed, report)

@@ -71,13 +71,15 @@ def record(
     image_size: int = 64,
     noise: float | Sequence[float] = 0.2,
     play: bool = False,
+    after: int | None = None,
     only_successes: bool = False,
     seed: int = 0,
 ) -> Demonstrations:
     """`count` episodes of the scripted expert, of `task.frames` frames each, a function of the arguments.
 
     Of several `noise`s every one makes an equal share. The actions are those that were executed, the imprecise ones.
-    `play`: the suite's own restless behaviour instead of the expert. `only_successes` leaves failures out; episodes are
+    `play`: the suite's own restless behaviour instead of the expert. `after`: so many frames after it succeeded an episode
+    ends (None: at its full length). `only_successes` leaves failures out; episodes are
     then drawn until there are enough. Raises ConfigError if the expert hardly ever succeeds.
     """
     noises = [noise] if isinstance(noise, (int, float)) else list(noise)
@@ -90,7 +92,7 @@ def record(
                 break
             seeds = episode_seeds(task.spec, first + wanted, seed, SPLIT)[first:]
             first += wanted
-            made = _drive(task, seeds, stride, image_size, level, play)
+            made = _drive(task, seeds, stride, image_size, level, play, after)
             made = made.take(np.flatnonzero(made.successes)) if only_successes else made
             parts.append(made.take(slice(wanted - found)))
             found += len(parts[-1])
@@ -103,7 +105,9 @@ def join(parts: Sequence[Demonstrations]) -> Demonstrations:
     return Demonstrations(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Demonstrations)})
 
 
-def _drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool) -> Demonstrations:
+def _drive(
+    task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool, after: int | None
+) -> Demonstrations:
     world = World(noisy(task, noise), seeds)
     rng = np.random.default_rng([int(seeds[0]), len(seeds), 13])
     behaviour = Behaviour(world, rng) if play else make_expert(world, int(seeds[0]))
@@ -121,11 +125,14 @@ def _drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: f
     images = render_frames(world.spec, looks, world.goals, *flat, np.repeat(np.arange(n), frames))
     if images.shape[1] != image_size:
         images = np.stack([fit_image(image, image_size) for image in images])
-    done = np.stack(reached, 1)
-    return Demonstrations(
-        images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.full(n, frames), done,
-        held(done, task.hold).any(1), np.asarray(seeds, np.int64),
-    )  # fmt: skip
+    images, acted, done = images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.stack(reached, 1)
+    solved = held(done, task.hold)
+    lengths = np.full(n, frames)
+    if after is not None:
+        lengths = np.minimum(lengths, np.where(solved.any(1), solved.argmax(1) + 1 + after, frames))
+        gone = np.arange(frames) >= lengths[:, None]
+        images[gone], acted[gone], done[gone] = 0, 0, False
+    return Demonstrations(images, acted, lengths, done, solved.any(1), np.asarray(seeds, np.int64))
 
 
 def save_demonstrations(demos: Demonstrations, path: Path) -> None:

@@ -17,11 +17,15 @@ from safetensors.numpy import load_file, save_file
 from data_pipelines.publishing.files import publish, remove
 from experiments.applications.policies.acting import ChunkPolicy, Scale
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc
+from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, init_diffusion
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 
 DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
-KINDS = {ClonedPolicy.kind: (ClonedPolicy, BcConfig, init_bc)}
+KINDS = {
+    ClonedPolicy.kind: (ClonedPolicy, BcConfig, init_bc),
+    DiffusionPolicy.kind: (DiffusionPolicy, DiffusionConfig, init_diffusion),
+}
 
 
 def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] | None = None) -> None:

@@ -1,7 +1,6 @@
 """Small networks on images, as functions of dictionaries of arrays: what policies and success heads share.
 
-Frames go in as they are, are averaged down to `size`, and become K points (a spatial softmax: where each feature map is
-strongest; Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies") with how strong it is there.
+Frames are averaged down to `size`; convolutions of stride 2 and a dense layer make features of them.
 """
 
 from __future__ import annotations
@@ -20,15 +19,18 @@ Params = dict[str, Any]
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """`size`: pixels of a side that the first convolution sees; the map of points is half as wide."""
+    """`size`: pixels of a side that the first convolution sees; each convolution halves it."""
 
     size: int = 32
-    channels: tuple[int, ...] = (16, 32, 32)
-    hidden: int = 128
+    channels: tuple[int, ...] = (16, 32, 64)
+    hidden: int = 128  # features, and the width of what follows
 
     def __post_init__(self):
-        require(self.size >= 4 and self.size % 2 == 0, f"size must be even and at least 4, got {self.size}")
-        require(len(self.channels) >= 1, "an encoder needs a convolution")
+        fold = 2 ** len(self.channels)
+        require(
+            len(self.channels) >= 1 and self.size % fold == 0,
+            f"{len(self.channels)} convolutions of stride 2 need a size that {fold} divides, got {self.size}",
+        )
 
 
 def init_dense(key: jax.Array, inputs: int, outputs: int, gain: float = 2.0) -> Params:
@@ -57,7 +59,7 @@ def mlp(layers: list[Params], x: jax.Array) -> jax.Array:
 def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
     """For images of `inputs` channels; two more say where a pixel is."""
     widths, kernels = (inputs + 2, *config.channels), (5, *(3,) * (len(config.channels) - 1))
-    keys = jax.random.split(key, len(kernels))
+    last, *keys = jax.random.split(key, len(kernels) + 1)
     convolutions = [
         {
             "w": jax.random.normal(k, (side, side, widths[i], widths[i + 1])) * np.sqrt(2 / (side * side * widths[i])),
@@ -65,38 +67,20 @@ def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
         }
         for i, (k, side) in enumerate(zip(keys, kernels, strict=True))
     ]
-    return {"convolutions": convolutions, "sharpness": jnp.ones(config.channels[-1])}
-
-
-def features_of(config: EncoderConfig) -> int:
-    """How many values `encode` gives for an image: two coordinates and a strength for each point."""
-    return 3 * config.channels[-1]
+    side = config.size // 2 ** len(kernels)
+    return {"convolutions": convolutions, "out": init_dense(last, side * side * widths[-1], config.hidden)}
 
 
 def encode(params: Params, config: EncoderConfig, images: jax.Array) -> jax.Array:
-    """Features [B, 3 K] of images [B, H, W, C] in [-1, 1]; H and W are multiples of `config.size`."""
+    """Features [B, hidden] of images [B, H, W, C] in [-1, 1]; H and W are multiples of `config.size`."""
     x = shrink(images, config.size)
     at = jnp.linspace(-1, 1, config.size)
     where = jnp.broadcast_to(jnp.stack(jnp.meshgrid(at, at), -1), (*x.shape[:3], 2))
     x = jnp.concatenate([x, where], -1)
-    for i, layer in enumerate(params["convolutions"]):
-        stride = 2 if i == 0 else 1
-        x = jax.lax.conv_general_dilated(
-            x, layer["w"], (stride, stride), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
-        )
-        x = x + layer["b"]
-        x = jax.nn.relu(x) if i < len(params["convolutions"]) - 1 else x
-    return points(x, params["sharpness"])
-
-
-def points(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
-    """[B, 3 K] of maps [B, h, w, K]: mean column and row under a softmax of each map, and its mean under it."""
-    batch, height, width, count = maps.shape
-    flat = maps.reshape(batch, height * width, count)
-    weight = jax.nn.softmax(flat * sharpness, axis=1)
-    rows, columns = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
-    x, y = (jnp.einsum("bpk,p->bk", weight, at.ravel()) for at in (columns, rows))
-    return jnp.concatenate([x, y, jnp.tanh((weight * flat).sum(1) / 4)], -1)
+    for layer in params["convolutions"]:
+        x = jax.lax.conv_general_dilated(x, layer["w"], (2, 2), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        x = jax.nn.relu(x + layer["b"])
+    return jax.nn.relu(dense(params["out"], x.reshape(len(x), -1)))
 
 
 def shrink(images: jax.Array, size: int) -> jax.Array:
@@ -109,6 +93,21 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
     if (height, width) == (size, size):
         return images
     return images.reshape(batch, size, height // size, size, width // size, channels).mean((2, 4))
+
+
+def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
+    """`shrink` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
+    height, width = images.shape[-3:-1]
+    require(height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}")
+    parts = images.reshape(*images.shape[:-3], size, height // size, size, width // size, images.shape[-1])
+    return np.round(parts.mean((-4, -2), dtype=np.float32)).astype(np.uint8)
+
+
+def lit(frames: jax.Array, key: jax.Array, strength: float) -> jax.Array:
+    """Frames [B, n, H, W, 3] in [-1, 1] of episodes each under another light: colours scaled and moved a little."""
+    shape = (len(frames), 1, 1, 1, 3)
+    gain, offset = strength * jax.random.normal(key, (2, *shape))
+    return frames * (1 + gain) + offset
 
 
 def as_floats(images: jax.Array) -> jax.Array:

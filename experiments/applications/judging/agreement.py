@@ -1,0 +1,98 @@
+"""How well success in the learned simulator tells success in the true one.
+
+Rates are compared over P policies: Pearson, Spearman (ties averaged), and the mean maximum rank violation, the largest
+difference of true rates between a policy and one that the other world ranks otherwise, averaged (Li et al. 2024,
+"Evaluating Real-World Robot Manipulation Policies in Simulation"; here a tie of the learned rates counts for both).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import rankdata
+
+from experiments.analysis.intervals import LEVEL, Interval
+
+DRAWS = 2000
+
+Measure = Callable[[np.ndarray, np.ndarray], float]
+
+
+def pearson(true: np.ndarray, learned: np.ndarray) -> float:
+    """nan where one of them does not vary."""
+    a, b = true - true.mean(), learned - learned.mean()
+    scale = math.sqrt(float((a * a).sum() * (b * b).sum()))
+    return float((a * b).sum() / scale) if scale > 0 else math.nan
+
+
+def spearman(true: np.ndarray, learned: np.ndarray) -> float:
+    return pearson(rankdata(true), rankdata(learned))
+
+
+def rank_violation(true: np.ndarray, learned: np.ndarray) -> float:
+    """Mean maximum rank violation; 0 where both order the policies alike."""
+    gap = np.abs(true[:, None] - true[None])
+    wrong = np.sign(true[:, None] - true[None]) != np.sign(learned[:, None] - learned[None])
+    return float(np.where(wrong, gap, 0.0).max(1).mean())
+
+
+def bias(true: np.ndarray, learned: np.ndarray) -> float:
+    """By how much the learned rates are higher, on average."""
+    return float((learned - true).mean())
+
+
+MEASURES: dict[str, Measure] = {
+    "pearson": pearson,
+    "spearman": spearman,
+    "rank violation": rank_violation,
+    "bias": bias,
+}
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Measures of two worlds' success rates, with intervals over other policies of the kind and other starts."""
+
+    measures: dict[str, Interval]
+    over_starts: dict[str, Interval]  # these policies, other starts
+
+
+def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed: int = 0) -> Agreement:
+    """From successes bool [P, M] of P policies at the same M starts.
+
+    Intervals are quantiles of `draws` bootstrap resamples of policies and starts, and of starts alone. A start drawn is
+    drawn in both worlds and for all policies. Draws in which a measure is not defined are left out.
+    """
+    rng = np.random.default_rng(seed)
+    policies, starts = true_PM.shape
+    found: tuple[dict[str, list[float]], ...] = ({name: [] for name in MEASURES}, {name: [] for name in MEASURES})
+    for _ in range(draws):
+        columns = rng.integers(starts, size=starts)
+        rows = rng.integers(policies, size=policies)
+        rates = true_PM[:, columns].mean(1), learned_PM[:, columns].mean(1)
+        for kept, which in zip(found, (rows, slice(None)), strict=True):
+            for name, measure in MEASURES.items():
+                kept[name].append(measure(rates[0][which], rates[1][which]))
+    value = {name: measure(true_PM.mean(1), learned_PM.mean(1)) for name, measure in MEASURES.items()}
+    size = {"n": policies * starts, "episodes": starts}
+    both, alone = ({name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in found)
+    return Agreement(both, alone)
+
+
+def _interval(value: float, drawn: np.ndarray, size: dict[str, int]) -> Interval:
+    known = drawn[np.isfinite(drawn)]
+    if len(known) < 2:
+        return Interval(value, math.nan, math.nan, math.nan, **size)
+    low, high = np.quantile(known, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Interval(value, float(known.std(ddof=1)), float(low), float(high), **size)
+
+
+def rate_interval(successes: np.ndarray) -> Interval:
+    """Of a success rate: Wilson's score interval, which holds at 0 and 1 too (Wilson 1927, JASA 22)."""
+    n, rate, z = len(successes), float(np.mean(successes)), 1.959964
+    centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    return Interval(rate, math.sqrt(rate * (1 - rate) / n), centre - half, centre + half, n, n)

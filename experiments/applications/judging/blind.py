@@ -1,0 +1,121 @@
+"""A page on which a person labels successes without knowing the policy or the world, and what the labels say."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from data_pipelines.publishing.files import write_file
+from experiments.analysis.intervals import Interval
+from experiments.applications.judging.agreement import rate_interval
+from experiments.applications.judging.judge import Judged
+from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, Outcome
+from experiments.report.pieces import data_uri
+from hma_jax.config import ConfigError, require
+
+ENLARGED = 3
+SHOW_MS, HOLD_MS = 200, 1200
+
+SCRIPT = """
+const labels = {};
+let at = 0;
+const clips = [...document.querySelectorAll('img')];
+function show() {
+  clips.forEach((clip, i) => { clip.hidden = i !== at; });
+  const done = Object.keys(labels).length;
+  document.getElementById('where').textContent = `${at + 1} of ${clips.length}, ${done} labelled: ` +
+    ({true: 'success', false: 'failure'}[labels[clips[at].dataset.clip]] ?? 'not labelled');
+}
+function label(value) { labels[clips[at].dataset.clip] = value; move(1); }
+function move(by) { at = Math.min(Math.max(at + by, 0), clips.length - 1); show(); }
+document.addEventListener('keydown', (event) => {
+  const does = {s: () => label(true), f: () => label(false), ArrowLeft: () => move(-1), ArrowRight: () => move(1)}[event.key];
+  if (does) { does(); event.preventDefault(); }
+});
+document.getElementById('success').onclick = () => label(true);
+document.getElementById('failure').onclick = () => label(false);
+document.getElementById('back').onclick = () => move(-1);
+document.getElementById('save').onclick = () => {
+  const link = document.createElement('a');
+  link.href = URL.createObjectURL(new Blob([JSON.stringify({page: document.body.dataset.page, labels}, null, 1)]));
+  link.download = 'labels.json';
+  link.click();
+};
+show();
+"""
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 34rem; margin: 2rem auto; padding: 0 1rem; }
+img { width: 100%; max-width: 24rem; image-rendering: pixelated; display: block; } img[hidden] { display: none; }
+button { font: inherit; padding: .5rem 1rem; margin: .6rem .4rem 0 0; }
+"""
+
+
+def choose(judged: Judged, clips: int, seed: int = 0) -> list[tuple[str, str, int]]:
+    """(policy, world, start) of `clips` episodes, drawn from all of the true and the learned world, shuffled."""
+    every = [(p, w, m) for p in judged.policies for w in (TRUE, LEARNED) for m in range(judged.config.starts)]
+    drawn = np.random.default_rng([seed, 15]).permutation(len(every))[:clips]
+    return [every[i] for i in drawn]
+
+
+def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
+    """OUT/blind.html: clips by number alone. Which number is which episode stands in OUT/blind.json."""
+    chosen, pictures = choose(judged, clips), []
+    for number, (policy, world, start) in enumerate(chosen):
+        film = judged.rollouts(policy, world).images[start]
+        pictures.append(f'<img hidden alt="clip {number}" data-clip="{number}" src="{data_uri(_film(film), "webp")}">')
+    page = f"{judged.config.task.robot}-{judged.config.task.name}-{judged.config.seed}-{clips}"
+    content = (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, '
+        f'initial-scale=1"><title>Success or not?</title><style>{STYLE}</style></head><body data-page="{page}">'
+        f"<h1>Is the task done?</h1><p>The goal: {html.escape(judged.config.task.goal)}, for "
+        f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows to go back and on.</p>"
+        f"{''.join(pictures)}<p id=where></p><button id=success>success</button><button id=failure>failure</button>"
+        f"<button id=back>back</button><button id=save>save labels.json</button><script>{SCRIPT}</script></body></html>\n"
+    )
+    write_file(out / "blind.json", json.dumps({"page": page, "clips": chosen}) + "\n")
+    write_file(out / "blind.html", content)
+    return out / "blind.html"
+
+
+def _film(images: np.ndarray) -> bytes:
+    frames = [Image.fromarray(image) for image in images]
+    larger = [f.resize((ENLARGED * f.width, ENLARGED * f.height), Image.Resampling.NEAREST) for f in frames]
+    buffer = io.BytesIO()
+    larger[0].save(
+        buffer, "WEBP", save_all=True, append_images=larger[1:], quality=70, method=2, loop=0,
+        duration=[SHOW_MS] * (len(larger) - 1) + [HOLD_MS],
+    )  # fmt: skip
+    return buffer.getvalue()
+
+
+def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
+    """{(policy, world, start): a person calls it success}. Raises ConfigError for labels of another page."""
+    try:
+        said: dict[str, Any] = json.loads(path.read_text())
+        key: dict[str, Any] = json.loads((out / "blind.json").read_text())
+        labels = {int(number): bool(value) for number, value in said["labels"].items()}
+        clips: Sequence[Any] = key["clips"]
+    except (OSError, ValueError, KeyError, AttributeError) as error:
+        raise ConfigError(f"{path} cannot be read as labels of {out / 'blind.html'} ({error})") from error
+    require(said.get("page") == key["page"], f"{path} has labels of another page ({said.get('page')}, not {key['page']})")
+    require(bool(labels) and all(0 <= n < len(clips) for n in labels), f"{path} labels clips that the page has not, or none")
+    return {(clips[n][0], clips[n][1], int(clips[n][2])): value for n, value in labels.items()}
+
+
+def compare_labels(labels: dict[tuple[str, str, int], bool], outcomes: Sequence[Outcome]) -> dict[str, Interval]:
+    """How often a person and a judge agree: with the head in each world, with the state in the true one."""
+    said = {(o.policy, o.world, o.start, o.judge): o.success for o in outcomes}
+    found = {}
+    for world, judge in ((LEARNED, HEAD), (TRUE, HEAD), (TRUE, STATE)):
+        same = [said[p, w, m, judge] == label for (p, w, m), label in labels.items() if w == world]
+        if same:
+            found[f"{judge}, {world} world"] = rate_interval(np.array(same))
+    return found

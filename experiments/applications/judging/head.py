@@ -1,0 +1,171 @@
+"""The success head: from the present frame, how probable it is that the goal is reached. Trained on recorded frames
+that the simulator's state labels; some of them as the model's tokenizer would show them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
+
+from data_pipelines.publishing.files import write_file
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.files import named, unnamed
+from experiments.applications.policies.learning import FitConfig, Report, fit
+from experiments.applications.policies.network import (
+    EncoderConfig,
+    Params,
+    as_floats,
+    beside,
+    encode,
+    init_encoder,
+    init_mlp,
+    lit,
+    mlp,
+    shrink_bytes,
+)
+from hma_jax.config import ConfigError, require
+from hma_jax.config.json import from_dict, to_dict
+from hma_jax.simulator.interface import AnySimulator
+
+DESCRIPTION, WEIGHTS = "head.json", "head.safetensors"
+PIECE = 256
+"""Frames that are looked at in one call."""
+
+RECONSTRUCTED = 4
+
+
+@dataclass(frozen=True)
+class HeadConfig:
+    """A head and its training. An episode has succeeded when the probability is above `threshold` at `hold` frames in
+    a row: the number that the task asks of the state."""
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=3000, learning_rate=2e-3))
+    light: float = 0.03
+    threshold: float = 0.5
+
+    def __post_init__(self):
+        require(0 < self.threshold < 1, f"a threshold lies between 0 and 1, got {self.threshold}")
+
+
+def init_head(config: HeadConfig, seed: int) -> Params:
+    first, second = jax.random.split(jax.random.key(seed))
+    hidden = config.encoder.hidden
+    return {
+        "encoder": init_encoder(first, config.encoder, 3),
+        "mlp": init_mlp(second, (hidden, hidden, 1)),
+    }
+
+
+def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Array:
+    """Logits [B] of frames [B, H, W, 3] in [-1, 1]."""
+    return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames[:, None])))[:, 0]
+
+
+class SuccessHead:
+    """A trained head. `measured` is what it is worth on recorded episodes that it was not trained on."""
+
+    def __init__(self, config: HeadConfig, params: Params, measured: Mapping[str, float] | None = None):
+        self.config, self.params, self.measured = config, params, dict(measured or {})
+        self._apply = jax.jit(lambda params, frames: jax.nn.sigmoid(apply_head(params, config, as_floats(frames))))
+
+    def probabilities(self, images: np.ndarray) -> np.ndarray:
+        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each."""
+        flat = shrink_bytes(images, self.config.encoder.size).reshape(-1, *(self.config.encoder.size,) * 2, 3)
+        found = []
+        for first in range(0, len(flat), PIECE):
+            part = flat[first : first + PIECE]
+            padded = np.zeros((PIECE, *part.shape[1:]), np.uint8)
+            padded[: len(part)] = part
+            found.append(np.asarray(self._apply(self.params, padded))[: len(part)])
+        return np.concatenate(found).reshape(images.shape[:-3])
+
+    def reached(self, images: np.ndarray) -> np.ndarray:
+        """bool [...]: it is taken for reached."""
+        return self.probabilities(images) > self.config.threshold
+
+
+def train_head(
+    demos: Demonstrations,
+    config: HeadConfig,
+    seed: int = 0,
+    reconstruct: Callable[[np.ndarray], np.ndarray] | None = None,
+    report: Report = lambda done, total, note: None,
+) -> SuccessHead:
+    """A function of its arguments. Positive and negative frames are drawn equally often.
+
+    `reconstruct` gives uint8 [n, H, W, 3] as the model's tokenizer shows them: every `RECONSTRUCTED`-th is learnt so.
+    Raises ConfigError where all frames have one label.
+    """
+    steps = demos.steps()
+    images = demos.images[steps[:, 0], steps[:, 1]]
+    labels = demos.reached[steps[:, 0], steps[:, 1]]
+    require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
+    if reconstruct is not None:
+        images[::RECONSTRUCTED] = reconstruct(images[::RECONSTRUCTED])
+    weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
+    data = {"images": shrink_bytes(images, config.encoder.size), "label": labels.astype(np.float32), "weight": weight}
+
+    def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
+        frames = lit(as_floats(data["images"][index])[:, None], key, config.light)[:, 0]
+        errors = optax.sigmoid_binary_cross_entropy(apply_head(params, config, frames), data["label"][index])
+        return jnp.mean(errors * data["weight"][index])
+
+    kept = fit(init_head(config, seed), loss, data, len(steps), config.fit, seed, report)
+    return SuccessHead(config, kept[config.fit.steps])
+
+
+def auroc(score: np.ndarray, label: np.ndarray) -> float:
+    """The probability that a positive scores higher than a negative, ties half; nan where one kind is missing."""
+    from scipy.stats import rankdata
+
+    positive = label.astype(bool)
+    n, m = int(positive.sum()), int((~positive).sum())
+    if not n or not m:
+        return float("nan")
+    return float((rankdata(score)[positive].sum() - n * (n + 1) / 2) / (n * m))
+
+
+def save_head(head: SuccessHead, directory: Path) -> None:
+    """The description is written last: a directory holds a whole head or none."""
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / DESCRIPTION).unlink(missing_ok=True)
+    write_file(directory / WEIGHTS, save(named(head.params)))
+    write_file(directory / DESCRIPTION, json.dumps({"config": to_dict(head.config), "measured": head.measured}, indent=1) + "\n")
+
+
+def load_head(directory: Path) -> SuccessHead:
+    """Raises ConfigError where none is, or a damaged one."""
+    try:
+        description: dict[str, Any] = json.loads((directory / DESCRIPTION).read_text())
+        weights = load_file(directory / WEIGHTS)
+    except (OSError, ValueError, SafetensorError) as error:
+        raise ConfigError(f"{directory} cannot be read as a success head ({error}); train it again") from error
+    config = from_dict(HeadConfig, description["config"], f"{directory}: config")
+    like = jax.eval_shape(lambda: init_head(config, 0))
+    return SuccessHead(config, unnamed(weights, like, directory), description["measured"])
+
+
+class HeadJudge:
+    """A `Judge` of the simulators' Gymnasium environments: 1 and the end once the head has seen success at `hold`
+    frames in a row. Frames of an episode that begins anew are no success, which is how it forgets the one before."""
+
+    def __init__(self, head: SuccessHead, hold: int = 1):
+        self.head, self.hold = head, hold
+        self._count: np.ndarray | None = None
+
+    def __call__(self, simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:
+        reached = self.head.reached(simulator.images)
+        count = np.zeros(len(reached), int) if self._count is None else self._count
+        self._count = np.where(reached, count + 1, 0)
+        done = self._count >= self.hold
+        return done.astype(float), done

@@ -1,0 +1,77 @@
+"""The policies that are judged: from hopeless to as good as they get, all of them on images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
+from experiments.applications.policies.files import DESCRIPTION, load_policy, save_policy
+from experiments.applications.policies.learning import FitConfig, Report, ladder
+from experiments.applications.policies.network import EncoderConfig
+from experiments.applications.policies.policy import Policy, RandomPolicy
+from hma_jax.simulator.robots import Robot
+
+RANDOM = "random"
+
+
+@dataclass(frozen=True)
+class LadderConfig:
+    """How many checkpoints of which policy; the random one comes on top."""
+
+    cloned: int = 6
+    diffusion: int = 3
+    steps: int = 6000
+    first: int = 60  # the step of the first checkpoint
+    batch: int = 64
+    learning_rate: float = 1e-3
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+
+    def fit(self, rungs: int) -> FitConfig:
+        keep = ladder(self.steps, rungs, self.first) if rungs > 1 else (self.steps,)
+        return FitConfig(steps=self.steps, batch=self.batch, learning_rate=self.learning_rate, keep=keep)
+
+
+def names(config: LadderConfig) -> list[str]:
+    """Of all policies, in the order of their training."""
+    found = [RANDOM]
+    for kind, rungs in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
+        found += [f"{kind}-{step}" for step in config.fit(rungs).keep] if rungs else []
+    return found
+
+
+def train_ladder(
+    directory: Path,
+    demos: Callable[[], Demonstrations],
+    config: LadderConfig,
+    seed: int,
+    about: dict[str, str],
+    reports: Callable[[str], Report],
+) -> None:
+    """Trains what is not in `directory` yet: all checkpoints of a kind, or none. `demos` are recorded if needed."""
+    recorded: Demonstrations | None = None
+    for kind, rungs in ((ClonedPolicy.kind, config.cloned), (DiffusionPolicy.kind, config.diffusion)):
+        steps: Sequence[int] = config.fit(rungs).keep if rungs else ()
+        if all((directory / f"{kind}-{step}" / DESCRIPTION).exists() for step in steps):
+            continue
+        recorded = demos() if recorded is None else recorded
+        scale, fit = scale_of(recorded), config.fit(rungs)
+        if kind == ClonedPolicy.kind:
+            bc = BcConfig(encoder=config.encoder, fit=fit)
+            params = train_bc(recorded, bc, seed, reports(kind))
+            made = {step: ClonedPolicy(bc, p, scale) for step, p in params.items()}
+        else:
+            dp = DiffusionConfig(encoder=config.encoder, fit=fit)
+            params = train_diffusion(recorded, dp, seed, reports(kind))
+            made = {step: DiffusionPolicy(dp, p, scale) for step, p in params.items()}
+        for step, policy in made.items():
+            save_policy(policy, directory / f"{kind}-{step}", about | {"step": step, "seed": seed})
+
+
+def find_policy(directory: Path, name: str, robot: Robot) -> Policy:
+    """Raises ConfigError where it is not, or damaged."""
+    return RandomPolicy(robot) if name == RANDOM else load_policy(directory / name)

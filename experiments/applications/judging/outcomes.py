@@ -1,0 +1,78 @@
+"""The table of what came of every episode: one row per policy, start, world and judge."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from experiments.applications.judging.head import SuccessHead
+from experiments.applications.judging.rollouts import Rollout
+from experiments.applications.policies.tasks import Task, held
+from hma_jax.config import ConfigError
+
+TRUE, LEARNED, SHUFFLED = "true", "learned", "shuffled"
+WORLDS = (TRUE, LEARNED, SHUFFLED)
+"""SHUFFLED: the learned one, in which an episode executes what the policy does in another."""
+
+STATE, HEAD = "state", "head"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one judge says of one episode. `start` counts the starts, `number` is the suite's seed of it."""
+
+    policy: str
+    start: int
+    number: int
+    seed: int
+    world: str
+    judge: str
+    success: bool
+
+
+def judge_rollout(
+    rollout: Rollout, head: SuccessHead, task: Task, policy: str, world: str, numbers: Sequence[int], seeds: Sequence[int]
+) -> list[Outcome]:
+    """By the head in every world, by the state in the true one. The start itself does not count."""
+    found = {HEAD: held(head.reached(rollout.images[:, 1:]), task.hold).any(1)}
+    if world == TRUE:
+        found[STATE] = held(rollout.reached[:, 1:], task.hold).any(1)
+    return [
+        Outcome(policy, i, int(numbers[i]), int(seeds[i]), world, judge, bool(success))
+        for judge, each in found.items()
+        for i, success in enumerate(each)
+    ]
+
+
+def successes(outcomes: Iterable[Outcome], policies: Sequence[str], world: str, judge: str) -> np.ndarray:
+    """bool [P, M] in the order of `policies` and starts."""
+    rows = [[o for o in outcomes if (o.policy, o.world, o.judge) == (name, world, judge)] for name in policies]
+    return np.array([[o.success for o in sorted(row, key=lambda o: o.start)] for row in rows])
+
+
+def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([f.name for f in dataclasses.fields(Outcome)])
+    for o in outcomes:
+        writer.writerow([*dataclasses.astuple(o)[:-1], int(o.success)])
+    write_file(path, text.getvalue())
+
+
+def read_outcomes(path: Path) -> list[Outcome]:
+    """Raises ConfigError for a file that is damaged or something else."""
+    try:
+        with open(path, newline="") as file:
+            return [
+                Outcome(r["policy"], int(r["start"]), int(r["number"]), int(r["seed"]), r["world"], r["judge"], r["success"] == "1")
+                for r in csv.DictReader(file)
+            ]
+    except (OSError, ValueError, KeyError) as error:
+        raise ConfigError(f"{path} cannot be read as outcomes ({error}); run `hma judge` again") from error

@@ -1,0 +1,104 @@
+"""The page of a judgement: scatter plot, tables, clips side by side. Self-contained HTML."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from experiments.applications.judging.judge import Judged
+from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, successes
+from experiments.applications.judging.summary import COLUMNS, shown
+from experiments.report.clips import animate
+from experiments.report.pieces import data_uri, picture, section, table
+from experiments.report.plot_style import INK, MUTED, STYLE, save
+from experiments.report.style import CSS
+
+CLIPS = 9
+"""Episodes that are shown."""
+
+
+def draw_scatter(summary: dict[str, Any], path: Path) -> None:
+    """Success in the true world against success in the learned one, and in the control, a point for each policy."""
+    with plt.rc_context(STYLE):
+        figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.7), sharex=True, sharey=True)
+        for panel, column, title in zip(
+            panels, ("learned, by head", "shuffled, by head"), ("learned model", "control: actions of other episodes"), strict=True
+        ):
+            panel.plot([0, 1], [0, 1], color=MUTED, linewidth=1, zorder=1)
+            for name, rates in summary["policies"].items():
+                x, y = rates["true, by state"], rates[column]
+                spread = [[x["mean"] - x["low"]], [x["high"] - x["mean"]]], [[y["mean"] - y["low"]], [y["high"] - y["mean"]]]
+                colour = {"cloned": "#2b5c8a", "diffusion": "#b3541e"}.get(name.split("-")[0], MUTED)
+                panel.errorbar(
+                    x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
+                    color=colour, elinewidth=0.8, markersize=5,
+                )  # fmt: skip
+                panel.annotate(name, (x["mean"], y["mean"]), (4, 4), textcoords="offset points", fontsize=7, color=INK)
+            panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), title=title, xlabel="success in the true simulator, by its state")
+        panels[0].set_ylabel("success in the model, by the head")
+        figure.tight_layout()
+        save(figure, path)
+
+
+def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str) -> Path:
+    """OUT/judge.html, from the figures drawn already."""
+    head = summary["head"]
+    lines = [[html.escape(name), *(shown(rates[c]) for c in COLUMNS)] for name, rates in summary["policies"].items()]
+    measures = list(next(iter(summary["agreement"].values()))["starts"])
+    agreed = [
+        [html.escape(name), html.escape(over), *(shown(found[over][m]) for m in measures)]
+        for name, found in summary["agreement"].items()
+        for over in found
+    ]
+    rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
+    body = [
+        f"<h1>{html.escape(summary['robot'])}: {html.escape(summary['task'])}</h1>",
+        f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode succeeds "
+        f"when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
+        picture(out / "scatter.png", "success in both worlds"),
+        section("Success by policy", table(["policy", *COLUMNS], lines)),
+        section(
+            "Agreement with the true simulator",
+            table(["compared", "interval over other", *measures], agreed, text=2),
+            f"<p>Of single episodes the model and the truth agree in {shown(summary['episodes alike'])}.</p>",
+        ),
+        section(
+            "The success head",
+            f"<p>On {head.get('episodes', 0):.0f} recorded true episodes that it was not trained on: accuracy of frames "
+            f"{head.get('frame accuracy', float('nan')):.3f}, AUROC {head.get('frame AUROC', float('nan')):.3f}, accuracy of "
+            f"episodes {head.get('episode accuracy', float('nan')):.3f}.</p><p>Episodes per second, this machine as loaded as "
+            f"it was: {html.escape(rates)}.</p>",
+        ),
+        section("The same start, the true world on the left, the model on the right", _clips(judged)),
+        section("How to repeat it", f"<pre>{html.escape(command)}</pre>"),
+    ]
+    path = out / "judge.html"
+    write_file(path, (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+        f'content="width=device-width, initial-scale=1"><title>hma judge: {html.escape(summary["robot"])}</title>'
+        f"<style>{CSS}</style></head>\n<body><main>{''.join(body)}</main></body></html>\n"
+    ))  # fmt: skip
+    return path
+
+
+def _clips(judged: Judged) -> str:
+    """Of policies spread over the ladder, one start each, and what the judges said."""
+    chosen = np.unique(np.linspace(0, len(judged.policies) - 1, CLIPS).round().astype(int))
+    state = successes(judged.outcomes, judged.policies, TRUE, STATE)
+    head = successes(judged.outcomes, judged.policies, LEARNED, HEAD)
+    figures = []
+    for rank, p in enumerate(chosen):
+        name, start = judged.policies[p], rank % judged.config.starts
+        clips = [judged.rollouts(name, world).images[start] for world in (TRUE, LEARNED)]
+        said = [("success" if x[p, start] else "failure") for x in (state, head)]
+        figures.append(
+            f"<figure class=trio><figcaption>{html.escape(name)}, start {start}</figcaption>"
+            f'<img alt="" src="{data_uri(animate(clips, 1), "webp")}">'
+            f"<div><span>true: {said[0]} by state</span><span>model: {said[1]} by head</span></div></figure>"
+        )
+    return f"<div class=trios>{''.join(figures)}</div>"

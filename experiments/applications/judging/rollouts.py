@@ -1,0 +1,129 @@
+"""One policy in one world: the same starts and seeds in each, images and what the state says of them."""
+
+from __future__ import annotations
+
+import io
+import time
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.suite.simulator import SuiteSimulator, suite_starts
+from experiments.applications.policies.policy import Policy
+from experiments.applications.policies.tasks import Task, reached
+from hma_jax.config import ConfigError, require
+from hma_jax.simulator.interface import AnySimulator
+from hma_jax.simulator.starts import Start
+
+START_FRAMES = 3
+"""Frames that an episode begins with: enough to see what moves."""
+
+STARTS_SEED = 2
+"""Of the suite whose held-out episodes are the starts: neither trained on (0) nor used by `ship` (1)."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """M episodes of L frames, the first of them the last of the start.
+
+    images uint8 [M, L, H, W, 3]; reached bool [M, L] by state, all False where there is no state; seconds: of the steps
+    alone, without the policy; actions float32 [M, L - 1, A].
+    """
+
+    images: np.ndarray
+    actions: np.ndarray
+    reached: np.ndarray
+    seconds: np.ndarray
+
+
+def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
+    """`count` beginnings of held-out episodes of the task's robot at which its goal is not reached yet."""
+    chosen: list[Start] = []
+    asked = 2 * count
+    while len(chosen) < count:
+        found = suite_starts(task.robot, asked, START_FRAMES, stride=stride, seed=STARTS_SEED)
+        simulator = SuiteSimulator([_robot(task, stride)], episodes=len(found))
+        simulator.reset(found)
+        done = reached(task.spec, [simulator.state(b) for b in range(len(found))])
+        chosen = [start for start, already in zip(found, done, strict=True) if not already]
+        asked *= 2
+        require(asked < 64 * count, f"{task.robot}: hardly a held-out episode begins without its goal reached")
+    return [
+        Start(s.robot, np.stack([fit_image(i, size) for i in s.images]), s.actions, s.seed) for s in chosen[:count]
+    ]
+
+
+def _robot(task: Task, stride: int):
+    from data_pipelines.suite.simulator import suite_robot
+
+    wide = [1.0] * task.spec.action_dim
+    return suite_robot(task.robot, [-x for x in wide], wide, [0.0] * len(wide), stride)
+
+
+def run(
+    simulator: AnySimulator,
+    policy: Policy,
+    starts: Sequence[Start],
+    seeds: Sequence[int],
+    task: Task,
+    *,
+    shuffled: bool = False,
+    report=lambda done, total, note: None,
+) -> Rollout:
+    """Every start once, as many at a time as the simulator has episodes.
+
+    `shuffled`: what the policy does in one episode is executed in the next one of the same batch, a control that
+    should succeed no more often than chance.
+    """
+    parts, batch = [], len(simulator)
+    require(len(starts) % batch == 0, f"{len(starts)} starts cannot be run {batch} at a time")
+    for first in range(0, len(starts), batch):
+        part = slice(first, first + batch)
+        parts.append(_run(simulator, policy, starts[part], seeds[part], task, shuffled))
+        report(first + batch, len(starts), "")
+    whole = [np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Rollout)]
+    return Rollout(*whole)
+
+
+def _run(simulator, policy: Policy, starts, seeds, task: Task, shuffled: bool) -> Rollout:
+    policy.reset(seeds=seeds)
+    images = [simulator.reset(list(starts), seeds=list(seeds)).copy()]
+    states = [_reached(simulator, task)]
+    acted, seconds = [], 0.0
+    for _ in range(task.frames):
+        actions = policy.act(images[-1])
+        executed = np.roll(actions, 1, axis=0) if shuffled else actions
+        acted.append(executed)
+        began = time.perf_counter()
+        images.append(simulator.step(list(executed)).copy())
+        seconds += time.perf_counter() - began
+        states.append(_reached(simulator, task))
+    shown, done = np.stack(images, 1), np.stack(states, 1)
+    return Rollout(shown, np.stack(acted, 1), done, np.full(len(shown), seconds / len(shown)))
+
+
+def _reached(simulator: AnySimulator, task: Task) -> np.ndarray:
+    if not isinstance(simulator, SuiteSimulator):
+        return np.zeros(len(simulator), bool)
+    return reached(task.spec, [simulator.state(b) for b in range(len(simulator))])
+
+
+def save_rollout(rollout: Rollout, path: Path) -> None:
+    """Whole or not at all."""
+    content = io.BytesIO()
+    np.savez_compressed(content, **{f.name: getattr(rollout, f.name) for f in fields(rollout)})
+    write_file(path, content.getvalue())
+
+
+def load_rollout(path: Path) -> Rollout:
+    """Raises ConfigError for a damaged file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Rollout(**{f.name: file[f.name] for f in fields(Rollout)})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command makes it again") from error

@@ -1,0 +1,143 @@
+"""Diffusion Policy, small: a chunk of actions is drawn by denoising, given what is seen (Chi et al. 2023).
+
+The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps. Training
+adds noise of one of `levels` strengths (squared-cosine schedule) and predicts it; acting takes `samples` steps of DDIM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.applications.policies.acting import ChunkPolicy, Scale, action_chunks, scale_of
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.learning import FitConfig, Report, fit, recent_frames
+from experiments.applications.policies.network import (
+    EncoderConfig,
+    Params,
+    as_floats,
+    beside,
+    encode,
+    init_encoder,
+    init_mlp,
+    lit,
+    mlp,
+    shrink_bytes,
+)
+from hma_jax.config import require
+
+EMBEDDED = 32
+"""Values that a noise level is given as: sines and cosines."""
+
+CLIP = 3.0
+"""Standard deviations beyond which no action is denoised to."""
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """A policy and its training."""
+
+    frames: int = 2
+    chunk: int = 4
+    execute: int = 2
+    levels: int = 100
+    samples: int = 10
+    width: int = 256
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    light: float = 0.03
+
+    def __post_init__(self):
+        require(1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed")
+        require(1 <= self.samples <= self.levels, f"{self.samples} denoising steps do not fit {self.levels} levels")
+
+
+def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:
+    first, second = jax.random.split(jax.random.key(seed))
+    out, width = config.chunk * action_dim, config.width
+    inputs = config.encoder.hidden + EMBEDDED + out
+    return {
+        "encoder": init_encoder(first, config.encoder, 3 * config.frames),
+        "denoiser": init_mlp(second, (inputs, width, width, out)),
+    }
+
+
+def signal(levels: int) -> np.ndarray:
+    """float32 [levels]: the share of variance that is signal, from nearly all to nearly none (squared cosine)."""
+    at = (np.arange(levels + 1) / levels + 0.008) / 1.008
+    kept = np.cos(at * np.pi / 2) ** 2
+    return np.clip(kept[1:] / kept[0], 1e-4, 0.9999).astype(np.float32)
+
+
+def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array) -> jax.Array:
+    """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, hidden]."""
+    rate = jnp.exp(-jnp.log(1000.0) * jnp.arange(EMBEDDED // 2) / (EMBEDDED // 2))
+    angle = level[:, None] * rate
+    return mlp(params["denoiser"], jnp.concatenate([seen, jnp.sin(angle), jnp.cos(angle), noised], -1))
+
+
+def draw(params: Params, config: DiffusionConfig, frames: jax.Array, start: jax.Array) -> jax.Array:
+    """Normalised chunks [B, chunk * A] from Gaussian `start` of that shape, by DDIM without new noise."""
+    kept = jnp.asarray(signal(config.levels))
+    seen = encode(params["encoder"], config.encoder, beside(frames))
+    visited = np.linspace(config.levels - 1, 0, config.samples).round().astype(int)
+    following = np.append(visited[1:], -1)
+
+    def step(x: jax.Array, at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        now, then = at
+        noise = denoise(params, seen, x, jnp.full(len(x), now, jnp.float32))
+        clean = jnp.clip((x - jnp.sqrt(1 - kept[now]) * noise) / jnp.sqrt(kept[now]), -CLIP, CLIP)
+        noise = (x - jnp.sqrt(kept[now]) * clean) / jnp.sqrt(1 - kept[now])
+        left = jnp.where(then < 0, 1.0, kept[then])
+        return jnp.sqrt(left) * clean + jnp.sqrt(1 - left) * noise, None
+
+    return jax.lax.scan(step, start, (jnp.asarray(visited), jnp.asarray(following)))[0]
+
+
+def train_diffusion(
+    demos: Demonstrations, config: DiffusionConfig, seed: int = 0, report: Report = lambda done, total, note: None
+) -> dict[int, Params]:
+    """{step: parameters} for `config.fit.keep` and the last step; a function of its arguments."""
+    steps, scale = demos.steps(), scale_of(demos)
+    kept = jnp.asarray(signal(config.levels))
+    data = {
+        "images": shrink_bytes(demos.images, config.encoder.size),
+        "episode": steps[:, 0],
+        "seen": recent_frames(steps, config.frames),
+        "chunk": scale.normalise(action_chunks(demos, steps, config.chunk)).reshape(len(steps), -1),
+    }
+
+    def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
+        light, level_key, noise_key = jax.random.split(key, 3)
+        frames = as_floats(data["images"][data["episode"][index][:, None], data["seen"][index]])
+        seen = encode(params["encoder"], config.encoder, beside(lit(frames, light, config.light)))
+        chunk = jnp.clip(data["chunk"][index], -CLIP, CLIP)
+        level = jax.random.randint(level_key, (len(index),), 0, config.levels)
+        noise = jax.random.normal(noise_key, chunk.shape)
+        share = kept[level][:, None]
+        noised = jnp.sqrt(share) * chunk + jnp.sqrt(1 - share) * noise
+        return jnp.mean((denoise(params, seen, noised, level.astype(jnp.float32)) - noise) ** 2)
+
+    start = init_diffusion(config, demos.actions.shape[-1], seed)
+    return fit(start, loss, data, len(steps), config.fit, seed, report)
+
+
+class DiffusionPolicy(ChunkPolicy):
+    """What `train_diffusion` made, acting. What it draws is a function of the episode's seed and step."""
+
+    kind = "diffusion"
+
+    def __init__(self, config: DiffusionConfig, params: Params, scale: Scale):
+        super().__init__(config.frames, config.execute, scale)
+        self.config, self.params = config, params
+        self._draw = jax.jit(lambda params, images, start: draw(params, config, as_floats(images), start))
+
+    def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
+        size = self.config.chunk * len(self.scale.mean)
+        start = [np.random.default_rng([s, n, 14]).standard_normal(size) for s, n in zip(seeds, steps, strict=True)]
+        out = np.asarray(self._draw(self.params, frames, np.asarray(start, np.float32)))
+        return out.reshape(len(frames), self.config.chunk, -1)
