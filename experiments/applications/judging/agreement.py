@@ -78,7 +78,9 @@ def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed:
                 kept[name].append(measure(rates[0][which], rates[1][which]))
     value = {name: measure(true_PM.mean(1), learned_PM.mean(1)) for name, measure in MEASURES.items()}
     size = {"n": policies * starts, "episodes": starts}
-    both, alone = ({name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in found)
+    both, alone = (
+        {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in found
+    )
     return Agreement(both, alone)
 
 

@@ -36,7 +36,8 @@ function show() {
 function label(value) { labels[clips[at].dataset.clip] = value; move(1); }
 function move(by) { at = Math.min(Math.max(at + by, 0), clips.length - 1); show(); }
 document.addEventListener('keydown', (event) => {
-  const does = {s: () => label(true), f: () => label(false), ArrowLeft: () => move(-1), ArrowRight: () => move(1)}[event.key];
+  const keys = {s: () => label(true), f: () => label(false), ArrowLeft: () => move(-1), ArrowRight: () => move(1)};
+  const does = keys[event.key];
   if (does) { does(); event.preventDefault(); }
 });
 document.getElementById('success').onclick = () => label(true);
@@ -73,12 +74,13 @@ def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
         pictures.append(f'<img hidden alt="clip {number}" data-clip="{number}" src="{data_uri(_film(film), "webp")}">')
     page = f"{judged.config.task.robot}-{judged.config.task.name}-{judged.config.seed}-{clips}"
     content = (
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, '
-        f'initial-scale=1"><title>Success or not?</title><style>{STYLE}</style></head><body data-page="{page}">'
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
+        f'content="width=device-width, initial-scale=1"><title>Success or not?</title><style>{STYLE}</style></head><body data-page="{page}">'
         f"<h1>Is the task done?</h1><p>The goal: {html.escape(judged.config.task.goal)}, for "
-        f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows to go back and on.</p>"
+        f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows back and on.</p>"
         f"{''.join(pictures)}<p id=where></p><button id=success>success</button><button id=failure>failure</button>"
-        f"<button id=back>back</button><button id=save>save labels.json</button><script>{SCRIPT}</script></body></html>\n"
+        f"<button id=back>back</button><button id=save>save labels.json</button><script>{SCRIPT}</script></body>"
+        "</html>\n"
     )
     write_file(out / "blind.json", json.dumps({"page": page, "clips": chosen}) + "\n")
     write_file(out / "blind.html", content)
@@ -105,8 +107,12 @@ def read_labels(path: Path, out: Path) -> dict[tuple[str, str, int], bool]:
         clips: Sequence[Any] = key["clips"]
     except (OSError, ValueError, KeyError, AttributeError) as error:
         raise ConfigError(f"{path} cannot be read as labels of {out / 'blind.html'} ({error})") from error
-    require(said.get("page") == key["page"], f"{path} has labels of another page ({said.get('page')}, not {key['page']})")
-    require(bool(labels) and all(0 <= n < len(clips) for n in labels), f"{path} labels clips that the page has not, or none")
+    require(
+        said.get("page") == key["page"], f"{path} has labels of another page ({said.get('page')}, not {key['page']})"
+    )
+    require(
+        bool(labels) and all(0 <= n < len(clips) for n in labels), f"{path} labels clips that the page has not, or none"
+    )
     return {(clips[n][0], clips[n][1], int(clips[n][2])): value for n, value in labels.items()}
 
 

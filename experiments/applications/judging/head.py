@@ -62,7 +62,7 @@ def init_head(config: HeadConfig, seed: int) -> Params:
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3),
-        "mlp": init_mlp(second, (hidden, hidden, 1)),
+        "mlp": init_mlp(second, (config.encoder.features, hidden, hidden, 1)),
     }
 
 
@@ -140,7 +140,10 @@ def save_head(head: SuccessHead, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     (directory / DESCRIPTION).unlink(missing_ok=True)
     write_file(directory / WEIGHTS, save(named(head.params)))
-    write_file(directory / DESCRIPTION, json.dumps({"config": to_dict(head.config), "measured": head.measured}, indent=1) + "\n")
+    write_file(
+        directory / DESCRIPTION,
+        json.dumps({"config": to_dict(head.config), "measured": head.measured}, indent=1) + "\n",
+    )
 
 
 def load_head(directory: Path) -> SuccessHead:

@@ -1,10 +1,10 @@
 """`hma judge` from end to end: policies, head, rollouts, table, figures. What is finished is found again.
 
-    OUT/judge.json           what is judged; another command does not go on in the same directory
-    OUT/policies/NAME        checkpoints (`policies.files`)
-    OUT/head                 the success head
-    OUT/rollouts/NAME.WORLD.npz   frames of all episodes
-    OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
+OUT/judge.json           what is judged; another command does not go on in the same directory
+OUT/policies/NAME        checkpoints (`policies.files`)
+OUT/head                 the success head
+OUT/rollouts/NAME.WORLD.npz   frames of all episodes
+OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
 """
 
 from __future__ import annotations
@@ -83,7 +83,13 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
         short = replace(task, frames=config.demonstration_frames)
         with step(f"record {config.demonstrations} demonstrations"):
             return record(
-                short, config.demonstrations, stride=stride, image_size=size, noise=config.noise, after=0, seed=config.seed
+                short,
+                config.demonstrations,
+                stride=stride,
+                image_size=size,
+                noise=config.noise,
+                after=0,
+                seed=config.seed,
             )
 
     about = {"robot": robot.name, "task": task.name}
@@ -109,7 +115,12 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
 
 
 def _collect(
-    out: Path, config: JudgeConfig, head: SuccessHead, policies: Sequence[str], starts: Sequence[Start], seeds: Sequence[int]
+    out: Path,
+    config: JudgeConfig,
+    head: SuccessHead,
+    policies: Sequence[str],
+    starts: Sequence[Start],
+    seeds: Sequence[int],
 ) -> Judged:
     numbers = [start.seed if start.seed is not None else -1 for start in starts]
     outcomes, seconds = [], {}
@@ -144,9 +155,7 @@ def _claim(out: Path, run_directory: Path, config: JudgeConfig) -> None:
 def head_recordings(config: JudgeConfig, size: int, stride: int, episodes: int, seed: int) -> Demonstrations:
     """Episodes of experts of several kinds and of play: successes, failures, and what lies between."""
     play = episodes // 3
-    expert = record(
-        config.task, episodes - play, stride=stride, image_size=size, noise=config.head_noise, seed=seed
-    )
+    expert = record(config.task, episodes - play, stride=stride, image_size=size, noise=config.head_noise, seed=seed)
     return join([expert, record(config.task, play, stride=stride, image_size=size, play=True, seed=seed + 1)])
 
 
@@ -182,4 +191,3 @@ def measure_head(head: SuccessHead, demos: Demonstrations, task: Task) -> dict[s
         "episodes": float(len(demos)),
         "episode accuracy": float((by_head == demos.successes).mean()),
     }
-

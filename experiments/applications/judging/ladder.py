@@ -28,7 +28,7 @@ class LadderConfig:
     steps: int = 6000
     first: int = 60  # the step of the first checkpoint
     batch: int = 64
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def fit(self, rungs: int) -> FitConfig:

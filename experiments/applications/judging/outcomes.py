@@ -38,7 +38,13 @@ class Outcome:
 
 
 def judge_rollout(
-    rollout: Rollout, head: SuccessHead, task: Task, policy: str, world: str, numbers: Sequence[int], seeds: Sequence[int]
+    rollout: Rollout,
+    head: SuccessHead,
+    task: Task,
+    policy: str,
+    world: str,
+    numbers: Sequence[int],
+    seeds: Sequence[int],
 ) -> list[Outcome]:
     """By the head in every world, by the state in the true one. The start itself does not count."""
     found = {HEAD: held(head.reached(rollout.images[:, 1:]), task.hold).any(1)}
@@ -71,7 +77,15 @@ def read_outcomes(path: Path) -> list[Outcome]:
     try:
         with open(path, newline="") as file:
             return [
-                Outcome(r["policy"], int(r["start"]), int(r["number"]), int(r["seed"]), r["world"], r["judge"], r["success"] == "1")
+                Outcome(
+                    r["policy"],
+                    int(r["start"]),
+                    int(r["number"]),
+                    int(r["seed"]),
+                    r["world"],
+                    r["judge"],
+                    r["success"] == "1",
+                )
                 for r in csv.DictReader(file)
             ]
     except (OSError, ValueError, KeyError) as error:

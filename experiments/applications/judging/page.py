@@ -27,19 +27,30 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.7), sharex=True, sharey=True)
         for panel, column, title in zip(
-            panels, ("learned, by head", "shuffled, by head"), ("learned model", "control: actions of other episodes"), strict=True
+            panels,
+            ("learned, by head", "shuffled, by head"),
+            ("learned model", "control: actions of other episodes"),
+            strict=True,
         ):
             panel.plot([0, 1], [0, 1], color=MUTED, linewidth=1, zorder=1)
             for name, rates in summary["policies"].items():
                 x, y = rates["true, by state"], rates[column]
-                spread = [[x["mean"] - x["low"]], [x["high"] - x["mean"]]], [[y["mean"] - y["low"]], [y["high"] - y["mean"]]]
+                spread = (
+                    [[x["mean"] - x["low"]], [x["high"] - x["mean"]]],
+                    [[y["mean"] - y["low"]], [y["high"] - y["mean"]]],
+                )
                 colour = {"cloned": "#2b5c8a", "diffusion": "#b3541e"}.get(name.split("-")[0], MUTED)
                 panel.errorbar(
                     x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
                     color=colour, elinewidth=0.8, markersize=5,
                 )  # fmt: skip
                 panel.annotate(name, (x["mean"], y["mean"]), (4, 4), textcoords="offset points", fontsize=7, color=INK)
-            panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), title=title, xlabel="success in the true simulator, by its state")
+            panel.set(
+                xlim=(-0.03, 1.03),
+                ylim=(-0.03, 1.03),
+                title=title,
+                xlabel="success in the true simulator, by its state",
+            )
         panels[0].set_ylabel("success in the model, by the head")
         figure.tight_layout()
         save(figure, path)
@@ -47,7 +58,7 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
 
 def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str) -> Path:
     """OUT/judge.html, from the figures drawn already."""
-    head = summary["head"]
+    measured = summary["head"]
     lines = [[html.escape(name), *(shown(rates[c]) for c in COLUMNS)] for name, rates in summary["policies"].items()]
     measures = list(next(iter(summary["agreement"].values()))["starts"])
     agreed = [
@@ -58,8 +69,8 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
     rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
     body = [
         f"<h1>{html.escape(summary['robot'])}: {html.escape(summary['task'])}</h1>",
-        f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode succeeds "
-        f"when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
+        f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode "
+        f"succeeds when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
         picture(out / "scatter.png", "success in both worlds"),
         section("Success by policy", table(["policy", *COLUMNS], lines)),
         section(
@@ -69,10 +80,10 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
         ),
         section(
             "The success head",
-            f"<p>On {head.get('episodes', 0):.0f} recorded true episodes that it was not trained on: accuracy of frames "
-            f"{head.get('frame accuracy', float('nan')):.3f}, AUROC {head.get('frame AUROC', float('nan')):.3f}, accuracy of "
-            f"episodes {head.get('episode accuracy', float('nan')):.3f}.</p><p>Episodes per second, this machine as loaded as "
-            f"it was: {html.escape(rates)}.</p>",
+            f"<p>On {measured['episodes']:.0f} recorded true episodes that it was not trained on: accuracy "
+            f"of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of episodes "
+            f"{measured['episode accuracy']:.3f}.</p><p>Episodes per second, this machine as loaded as it was: "
+            f"{html.escape(rates)}.</p>",
         ),
         section("The same start, the true world on the left, the model on the right", _clips(judged)),
         section("How to repeat it", f"<pre>{html.escape(command)}</pre>"),

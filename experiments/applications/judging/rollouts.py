@@ -53,9 +53,7 @@ def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
         chosen = [start for start, already in zip(found, done, strict=True) if not already]
         asked *= 2
         require(asked < 64 * count, f"{task.robot}: hardly a held-out episode begins without its goal reached")
-    return [
-        Start(s.robot, np.stack([fit_image(i, size) for i in s.images]), s.actions, s.seed) for s in chosen[:count]
-    ]
+    return [Start(s.robot, np.stack([fit_image(i, size) for i in s.images]), s.actions, s.seed) for s in chosen[:count]]
 
 
 def _robot(task: Task, stride: int):

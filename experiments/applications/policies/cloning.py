@@ -44,7 +44,9 @@ class BcConfig:
 
     def __post_init__(self):
         require(self.frames >= 1, f"a policy sees at least 1 frame, got {self.frames}")
-        require(1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed")
+        require(
+            1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed"
+        )
 
 
 def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
@@ -53,7 +55,7 @@ def init_bc(config: BcConfig, action_dim: int, seed: int) -> Params:
     hidden = config.encoder.hidden
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),
-        "mlp": init_mlp(second, (hidden, hidden, config.chunk * action_dim)),
+        "mlp": init_mlp(second, (config.encoder.features, hidden, hidden, config.chunk * action_dim)),
     }
 
 

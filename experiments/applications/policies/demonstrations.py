@@ -46,8 +46,8 @@ class Demonstrations:
         require(
             self.images.dtype == np.uint8 and self.actions.shape[:2] == shape and self.reached.shape == shape
             and len(self.lengths) == len(self.successes) == len(self.seeds) == shape[0],
-            f"demonstrations of different numbers or lengths: images {self.images.shape}, actions {self.actions.shape}, "
-            f"reached {self.reached.shape}",
+            f"demonstrations of different numbers or lengths: images {self.images.shape}, "
+            f"actions {self.actions.shape}, reached {self.reached.shape}",
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -78,9 +78,9 @@ def record(
     """`count` episodes of the scripted expert, of `task.frames` frames each, a function of the arguments.
 
     Of several `noise`s every one makes an equal share. The actions are those that were executed, the imprecise ones.
-    `play`: the suite's own restless behaviour instead of the expert. `after`: so many frames after it succeeded an episode
-    ends (None: at its full length). `only_successes` leaves failures out; episodes are
-    then drawn until there are enough. Raises ConfigError if the expert hardly ever succeeds.
+    `play`: the suite's own restless behaviour instead of the expert. `after`: so many frames after it succeeded an
+    episode ends (None: at its full length). `only_successes` leaves failures out; episodes are then drawn until there
+    are enough. Raises ConfigError if the expert hardly ever succeeds.
     """
     noises = [noise] if isinstance(noise, (int, float)) else list(noise)
     counts = [count // len(noises) + (i < count % len(noises)) for i in range(len(noises))]
@@ -96,13 +96,18 @@ def record(
             made = made.take(np.flatnonzero(made.successes)) if only_successes else made
             parts.append(made.take(slice(wanted - found)))
             found += len(parts[-1])
-        require(found >= wanted, f"{task.robot}: the expert with noise {level:g} succeeds too rarely to record {wanted} episodes")
+        require(
+            found >= wanted,
+            f"{task.robot}: the expert with noise {level:g} succeeds too rarely to record {wanted} episodes",
+        )
     return join(parts)
 
 
 def join(parts: Sequence[Demonstrations]) -> Demonstrations:
     """All episodes of several recordings of one robot and length."""
-    return Demonstrations(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Demonstrations)})
+    return Demonstrations(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Demonstrations)}
+    )
 
 
 def _drive(

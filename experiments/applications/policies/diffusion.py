@@ -1,7 +1,8 @@
 """Diffusion Policy, small: a chunk of actions is drawn by denoising, given what is seen (Chi et al. 2023).
 
-The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps. Training
-adds noise of one of `levels` strengths (squared-cosine schedule) and predicts it; acting takes `samples` steps of DDIM.
+The encoder is that of `cloning`; the denoiser is a network on the whole chunk instead of a U-Net over its steps.
+Training adds noise of one of `levels` strengths (squared-cosine schedule) and predicts it; acting takes `samples` steps
+of DDIM.
 """
 
 from __future__ import annotations
@@ -52,14 +53,16 @@ class DiffusionConfig:
     light: float = 0.03
 
     def __post_init__(self):
-        require(1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed")
+        require(
+            1 <= self.execute <= self.chunk, f"of a chunk of {self.chunk} actions {self.execute} cannot be executed"
+        )
         require(1 <= self.samples <= self.levels, f"{self.samples} denoising steps do not fit {self.levels} levels")
 
 
 def init_diffusion(config: DiffusionConfig, action_dim: int, seed: int) -> Params:
     first, second = jax.random.split(jax.random.key(seed))
     out, width = config.chunk * action_dim, config.width
-    inputs = config.encoder.hidden + EMBEDDED + out
+    inputs = config.encoder.features + EMBEDDED + out
     return {
         "encoder": init_encoder(first, config.encoder, 3 * config.frames),
         "denoiser": init_mlp(second, (inputs, width, width, out)),
@@ -74,7 +77,7 @@ def signal(levels: int) -> np.ndarray:
 
 
 def denoise(params: Params, seen: jax.Array, noised: jax.Array, level: jax.Array) -> jax.Array:
-    """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, hidden]."""
+    """The noise in chunks [B, chunk * A] at levels [B], given features of what is seen [B, 3 K]."""
     rate = jnp.exp(-jnp.log(1000.0) * jnp.arange(EMBEDDED // 2) / (EMBEDDED // 2))
     angle = level[:, None] * rate
     return mlp(params["denoiser"], jnp.concatenate([seen, jnp.sin(angle), jnp.cos(angle), noised], -1))

@@ -24,7 +24,7 @@ class FitConfig:
 
     steps: int = 3000
     batch: int = 64
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     warmup: int = 50
     weight_decay: float = 1e-4
     ema: float = 0.995
@@ -32,7 +32,9 @@ class FitConfig:
 
     def __post_init__(self):
         require(self.steps >= 1 and self.batch >= 1, "training needs steps and a batch of at least 1")
-        require(all(0 <= k <= self.steps for k in self.keep), f"steps to keep must lie in 0..{self.steps}, got {self.keep}")
+        require(
+            all(0 <= k <= self.steps for k in self.keep), f"steps to keep must lie in 0..{self.steps}, got {self.keep}"
+        )
         require(0 <= self.ema < 1, f"ema must lie in [0, 1), got {self.ema}")
 
 
@@ -47,13 +49,13 @@ def fit(
 ) -> dict[int, Any]:
     """{step: parameters} of every step that is kept, the last included.
 
-    `loss(params, data, index [B], key)` is the mean over the examples `index` of `data`, which lies whole in memory. Step
-    n draws its batch from `fold_in(key(seed), n)`. The average of parameters takes the plain mean of the first ones.
+    `loss(params, data, index [B], key)` is the mean over the examples `index` of `data`, which lies whole in memory.
+    Step n draws its batch from `fold_in(key(seed), n)`. The average of parameters forgets the first ones sooner.
     """
-    schedule = optax.warmup_cosine_decay_schedule(0, config.learning_rate, config.warmup, max(config.steps, config.warmup + 1))
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
+    schedule = optax.warmup_cosine_decay_schedule(
+        0, config.learning_rate, config.warmup, max(config.steps, config.warmup + 1)
     )
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay))
     arrays = {name: jnp.asarray(values) for name, values in data.items()}
     root = jax.random.key(seed)
 

@@ -1,6 +1,8 @@
 """Small networks on images, as functions of dictionaries of arrays: what policies and success heads share.
 
-Frames are averaged down to `size`; convolutions of stride 2 and a dense layer make features of them.
+Frames are averaged down to `size` and become K points: where each of the last convolution's maps is strongest, by a
+spatial softmax (Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies"), and how strong it is there. What
+finds a mark at one place then finds it at all, which a dense layer on the maps must learn from thousands of episodes.
 """
 
 from __future__ import annotations
@@ -17,20 +19,31 @@ from hma_jax.config import require
 Params = dict[str, Any]
 
 
+HALVING = 2
+"""Convolutions that halve the map; those after them do not."""
+
+SHARPNESS = 3.0
+"""What a map's values are multiplied by before the softmax, at the beginning of training."""
+
+
 @dataclass(frozen=True)
 class EncoderConfig:
-    """`size`: pixels of a side that the first convolution sees; each convolution halves it."""
+    """`size`: pixels of a side that the first convolution sees; `hidden`: width of the layers after the points."""
 
     size: int = 32
-    channels: tuple[int, ...] = (16, 32, 64)
-    hidden: int = 128  # features, and the width of what follows
+    channels: tuple[int, ...] = (16, 32, 32)
+    hidden: int = 128
 
     def __post_init__(self):
-        fold = 2 ** len(self.channels)
         require(
-            len(self.channels) >= 1 and self.size % fold == 0,
-            f"{len(self.channels)} convolutions of stride 2 need a size that {fold} divides, got {self.size}",
+            len(self.channels) >= HALVING and self.size % 2**HALVING == 0,
+            f"an encoder needs {HALVING} convolutions and a size that {2**HALVING} divides, got {self.size}",
         )
+
+    @property
+    def features(self) -> int:
+        """Values that `encode` gives for an image."""
+        return 3 * self.channels[-1]
 
 
 def init_dense(key: jax.Array, inputs: int, outputs: int, gain: float = 2.0) -> Params:
@@ -57,9 +70,9 @@ def mlp(layers: list[Params], x: jax.Array) -> jax.Array:
 
 
 def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
-    """For images of `inputs` channels; two more say where a pixel is."""
-    widths, kernels = (inputs + 2, *config.channels), (5, *(3,) * (len(config.channels) - 1))
-    last, *keys = jax.random.split(key, len(kernels) + 1)
+    """For images of `inputs` channels."""
+    widths, kernels = (inputs, *config.channels), (5, *(3,) * (len(config.channels) - 1))
+    keys = jax.random.split(key, len(kernels))
     convolutions = [
         {
             "w": jax.random.normal(k, (side, side, widths[i], widths[i + 1])) * np.sqrt(2 / (side * side * widths[i])),
@@ -67,20 +80,28 @@ def init_encoder(key: jax.Array, config: EncoderConfig, inputs: int) -> Params:
         }
         for i, (k, side) in enumerate(zip(keys, kernels, strict=True))
     ]
-    side = config.size // 2 ** len(kernels)
-    return {"convolutions": convolutions, "out": init_dense(last, side * side * widths[-1], config.hidden)}
+    return {"convolutions": convolutions, "sharpness": jnp.full(config.channels[-1], SHARPNESS)}
 
 
 def encode(params: Params, config: EncoderConfig, images: jax.Array) -> jax.Array:
-    """Features [B, hidden] of images [B, H, W, C] in [-1, 1]; H and W are multiples of `config.size`."""
+    """Features [B, 3 K] of images [B, H, W, C] in [-1, 1]; H and W are multiples of `config.size`."""
     x = shrink(images, config.size)
-    at = jnp.linspace(-1, 1, config.size)
-    where = jnp.broadcast_to(jnp.stack(jnp.meshgrid(at, at), -1), (*x.shape[:3], 2))
-    x = jnp.concatenate([x, where], -1)
-    for layer in params["convolutions"]:
-        x = jax.lax.conv_general_dilated(x, layer["w"], (2, 2), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
-        x = jax.nn.relu(x + layer["b"])
-    return jax.nn.relu(dense(params["out"], x.reshape(len(x), -1)))
+    for i, layer in enumerate(params["convolutions"]):
+        by = 2 if i < HALVING else 1
+        x = jax.nn.relu(x) if i else x
+        x = jax.lax.conv_general_dilated(x, layer["w"], (by, by), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        x = x + layer["b"]
+    return points(x, params["sharpness"])
+
+
+def points(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
+    """[B, 3 K] of maps [B, h, w, K]: mean column and row under a softmax of each map, and its mean under it."""
+    batch, height, width, count = maps.shape
+    flat = maps.reshape(batch, height * width, count)
+    weight = jax.nn.softmax(flat * sharpness, axis=1)
+    rows, columns = jnp.meshgrid(jnp.linspace(-1, 1, height), jnp.linspace(-1, 1, width), indexing="ij")
+    x, y = (jnp.einsum("bpk,p->bk", weight, at.ravel()) for at in (columns, rows))
+    return jnp.concatenate([x, y, jnp.tanh((weight * flat).sum(1) / 4)], -1)
 
 
 def shrink(images: jax.Array, size: int) -> jax.Array:
@@ -88,7 +109,7 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
     batch, height, width, channels = images.shape
     require(
         height % size == 0 == width % size,
-        f"images of {height} x {width} pixels cannot be averaged down to {size} x {size}; choose a size that divides them",
+        f"images of {height} x {width} pixels cannot be averaged down to {size}; choose a size that divides them",
     )
     if (height, width) == (size, size):
         return images
@@ -98,7 +119,9 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
 def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
     """`shrink` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
     height, width = images.shape[-3:-1]
-    require(height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}")
+    require(
+        height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}"
+    )
     parts = images.reshape(*images.shape[:-3], size, height // size, size, width // size, images.shape[-1])
     return np.round(parts.mean((-4, -2), dtype=np.float32)).astype(np.uint8)
 

@@ -36,7 +36,7 @@ class Task:
 
     robot: str
     name: str
-    frames: int = 24
+    frames: int = 16
     hold: int = 2
 
     def __post_init__(self):
@@ -65,7 +65,7 @@ def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int 
     """A task with its usual length, unless another is given. Raises ConfigError for one that there is not."""
     task = Task(robot, name)
     # A tool that wanders passes over the mark; one that was steered there stays.
-    task = replace(task, hold=6) if name == REACH else task
+    task = replace(task, frames=16, hold=4) if name == REACH else task
     return replace(task, frames=frames or task.frames, hold=hold or task.hold)
 
 
