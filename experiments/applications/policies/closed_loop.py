@@ -12,22 +12,35 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import episode_seeds
 from data_pipelines.suite.world import World
 from experiments.applications.policies.policy import Policy
-from experiments.applications.policies.tasks import Task, held
+from experiments.applications.policies.tasks import ReachMark, Task, held
+from hma_jax.config import require
 
 SPLIT = "closed loop"
 """Starts of these seeds are in no recording."""
+
+MOST_TRIED = 8
+"""Starts that are looked at for each that is far enough from its goal."""
 
 
 class Outcome(NamedTuple):
     """How n episodes went."""
 
     success: np.ndarray  # bool [n]: the goal was held
-    distance: np.ndarray  # float [n]: from tool to mark at the last frame, in halves of the floor's side
+    distance: np.ndarray  # float [n]: from the goal at the last frame, in halves of the floor's side
 
 
-def start_seeds(task: Task, count: int, seed: int = 0) -> np.ndarray:
-    """int64 [count]: of starts that no recording has. More of them begin with the same ones."""
-    return episode_seeds(task.spec, count, seed, SPLIT)
+def start_seeds(task: Task, count: int, seed: int = 0, least: float = 0.0) -> np.ndarray:
+    """int64 [count]: of starts that no recording has, at least so far from the goal. More of them begin with the same
+    ones. Raises ConfigError where there are hardly any."""
+    seeds = episode_seeds(task.spec, MOST_TRIED * count, seed, SPLIT)
+    far = seeds[away_at_start(task, seeds) >= least][:count]
+    require(len(far) == count, f"{task.robot}: hardly a start is {least:g} away from its goal")
+    return far
+
+
+def away_at_start(task: Task, seeds: np.ndarray) -> np.ndarray:
+    """float [n]: how far from the goal the episodes with these seeds begin."""
+    return gap(World(task.spec, seeds))
 
 
 def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, stride: int = 1) -> Outcome:
@@ -49,5 +62,8 @@ def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, s
 
 
 def gap(world: World) -> np.ndarray:
-    """float [n]: how far the farthest tool is from its mark."""
+    """float [n]: how far from the goal, of a robot's own task how far the farthest tool is from its mark."""
+    task = world.spec.task
+    if isinstance(task, ReachMark):
+        return task.away(world)
     return np.linalg.norm(world.tools - world.goals, axis=-1).max(1)

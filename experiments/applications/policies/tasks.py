@@ -13,8 +13,8 @@ from data_pipelines.suite.tasks import Push, Reach, Scene
 from data_pipelines.suite.world import State, World
 from hma_jax.config import require
 
-OWN, REACH = "own", "reach"
-TASKS = (OWN, REACH)
+OWN, REACH, HOVER = "own", "reach", "hover"
+TASKS = (OWN, REACH, HOVER)
 
 RADIUS = 0.22
 """Within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own."""
@@ -27,7 +27,33 @@ class ReachMark(Reach):
     within: float = RADIUS
 
     def done(self, scene: Scene) -> np.ndarray:
-        return (np.linalg.norm(scene.tools - scene.goals, axis=-1) < self.within).all(1)
+        return self.away(scene) < self.within
+
+    def away(self, scene: Scene) -> np.ndarray:
+        """float [n]: how far the farthest tool is from its mark."""
+        return np.linalg.norm(scene.tools - scene.goals, axis=-1).max(1)
+
+
+@dataclass(frozen=True)
+class HoverPuck(ReachMark):
+    """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things. The
+    expert takes small steps, so that its recordings are of the way there."""
+
+    step: float = 0.15  # that the expert moves the tool at once, world units
+
+    def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+        target, move = scene.tools.copy(), self._move(scene)
+        target[:, 0] += move * np.minimum(self.step / np.maximum(np.linalg.norm(move, axis=-1), 1e-9), 1.0)[:, None]
+        return target, np.ones(target.shape[:2])
+
+    def away(self, scene: Scene) -> np.ndarray:
+        """float [n]: how far the tool is from the nearest puck."""
+        return np.linalg.norm(self._move(scene), axis=-1)
+
+    def _move(self, scene: Scene) -> np.ndarray:
+        """[n, 2], from the tool to that puck."""
+        moves = scene.objects - scene.tools[:, :1]
+        return moves[np.arange(len(moves)), np.linalg.norm(moves, axis=-1).argmin(1)]
 
 
 @dataclass(frozen=True)
@@ -50,14 +76,14 @@ class Task:
         spec = SPECS[self.robot]
         if self.name == OWN:
             return spec
-        own = spec.task
-        return replace(spec, task=ReachMark(own.radius, own.objects, own.size, own.carries, own.marks_object))
+        own, kind = spec.task, ReachMark if self.name == REACH else HoverPuck
+        return replace(spec, task=kind(own.radius, own.objects, own.size, own.carries, own.marks_object))
 
     @property
     def goal(self) -> str:
         """In words."""
-        if self.name == REACH:
-            return "the tool on the mark"
+        if self.name != OWN:
+            return "the tool on the mark" if self.name == REACH else "the tool above a puck"
         return "the puck on the mark" if isinstance(SPECS[self.robot].task, Push) else "the puck carried to the mark"
 
 
@@ -65,7 +91,7 @@ def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int 
     """A task with its usual length, unless another is given. Raises ConfigError for one that there is not."""
     task = Task(robot, name)
     # A tool that wanders passes over the mark; one that was steered there stays.
-    task = replace(task, frames=16, hold=4) if name == REACH else task
+    task = replace(task, frames=16, hold=4) if name != OWN else task
     return replace(task, frames=frames or task.frames, hold=hold or task.hold)
 
 
