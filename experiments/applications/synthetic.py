@@ -86,17 +86,18 @@ class Settings:
     robot: str = "gripper_wood"
     task: str = "hover"
     frames: int = 14
-    least: float = 0.35  # from the goal, that an episode begins, in halves of the floor's side
+    hold: int = 6  # frames in a row at the goal, for success
+    least: float = 0.5  # from the goal, that an episode begins, in halves of the floor's side
     noise: float = 0.05  # of the expert
     trajectories: int = 100
-    starts: int = 64
+    starts: int = 200
     seeds: tuple[int, ...] = (0, 1, 2)
-    steps: int = 600  # of training, of every policy
+    steps: int = 2000  # of training, of every policy
     batch: int = 32
     learning_rate: float = 2e-3
 
     def make_task(self) -> Task:
-        return find_task(self.robot, self.task, self.frames)
+        return find_task(self.robot, self.task, self.frames, self.hold)
 
 
 def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
