@@ -10,8 +10,8 @@ Expected: planning in the model comes near to planning in the true simulator, an
 The goal is a picture: the last frame of an expert that began at the same start. Every second frame the planner looks,
 searches and carries out two actions. Cross-entropy method (CEM), MPPI and random shooting look ahead equally often, in
 the learned simulator; the ceiling is CEM that looks ahead in the true one. Success is that of the task, by the true
-simulator's state. The cloned policy was trained on an expert's trajectories with `python -m
-experiments.applications.synthetic`; it sees the mark in the frame instead of a goal's picture.
+simulator's state. The cloned policy was trained on 1000 trajectories of an expert; it sees the mark in the frame and is
+given no picture of the goal.
 
 Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png.
 """
@@ -77,16 +77,18 @@ class Settings:
     robot: str = "pusher_sand"
     task: str = "reach"
     frames: int = 16
+    hold: int = 6  # frames in a row at the goal, for success
     starts: int = 30
     execute: int = 2  # frames from one plan to the next
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
     search: SearchConfig = field(default_factory=SearchConfig)
-    trajectories: int = 100  # that the cloned policy was trained on
-    steps: int = 800
+    trajectories: int = 1000  # that the cloned policy was trained on
+    steps: int = 3000
     batch: int = 32
+    learning_rate: float = 2e-3
 
     def make_task(self) -> Task:
-        return find_task(self.robot, self.task, self.frames)
+        return find_task(self.robot, self.task, self.frames, self.hold)
 
 
 def goal_picture(task: Task, seed: int, size: int) -> np.ndarray:
@@ -142,7 +144,8 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     policy: Policy = RandomPolicy(robot)
     if way == CLONED:
         demos = record(task, settings.trajectories, stride=robot.stride, image_size=size, only_successes=True)
-        config = BcConfig(fit=FitConfig(steps=settings.steps, batch=settings.batch))
+        fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
+        config = BcConfig(frames=1, fit=fit)
         policy = ClonedPolicy(config, train_bc(demos, config, 0, report)[settings.steps], scale_of(demos))
     found = run_policy(task, policy, seeds, size, robot.stride)
     return [
