@@ -11,27 +11,42 @@ recorded; of the others the actions are kept, and replayed from their own first 
 Control: the same simulator under another trajectory's actions, so that pictures and actions do not belong together. All
 policies are trained alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
 
-Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md; synthetic.png.
+The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations.
+
+Writes to OUT: trials.csv, a row per policy and start; errors.csv, one per policy and held-out trajectory; summary.csv
+and table.md; synthetic.png; frames.png.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from data_pipelines.publishing.files import write_file
-from experiments.analysis.bootstrap import Panel, bootstrap_intervals, resample
-from experiments.analysis.intervals import Interval
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.applications.generating.conditions import (
+    ALL,
+    CONDITIONS,
+    CONTROL,
+    ERRORS,
+    FEW,
+    KINDS,
+    TRIALS,
+    Condition,
+    Trials,
+    markdown,
+    summarise,
+    write_tables,
+)
+from experiments.applications.generating.figures import draw_conditions, draw_strips
 from experiments.applications.generating.source import replay
 from experiments.applications.generating.trajectories import Trajectory
-from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.acting import Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
 from experiments.applications.policies.closed_loop import MOST_TRIED, away_at_start, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import (
@@ -42,6 +57,7 @@ from experiments.applications.policies.demonstrations import (
     save_demonstrations,
 )
 from experiments.applications.policies.learning import FitConfig
+from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
@@ -54,29 +70,6 @@ from hma_jax.simulator.simulator import Simulator
 RUN, OUT = Path("experiments/results/simulator"), Path("runs/synthetic")
 
 BATCH, GIVEN = 8, 3
-
-
-class Condition(NamedTuple):
-    """What a policy is trained on: so many recorded trajectories, and so many of the kind `more`."""
-
-    name: str
-    recorded: int
-    generated: int = 0
-    more: str = "generated"
-
-
-CONDITIONS = (
-    Condition("10 recorded", 10),
-    Condition("10 + 10 generated", 10, 10),
-    Condition("10 + 50 generated", 10, 50),
-    Condition("10 + 90 generated", 10, 90),
-    Condition("10 + 90, other actions", 10, 90, "shuffled"),
-    Condition("100 recorded", 100),
-)
-NAMES = ["condition", "recorded", "generated", "kind", "seed", "start", "success", "distance"]
-
-FEW, MOST, CONTROL, ALL = 0, 3, 4, 5
-"""Places in `CONDITIONS` that the share of the gap is made of."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +95,7 @@ class Settings:
 
 def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
     """The 100 trajectories as recorded, generated, and generated under shuffled actions; made once, kept in `out`."""
-    sets = {kind: out / f"{kind}.npz" for kind in ("recorded", "generated", "shuffled")}
+    sets = {kind: out / f"{kind}.npz" for kind in KINDS}
     if not sets["recorded"].exists():
         with step(f"record {settings.trajectories} trajectories"):
             save_demonstrations(record_far(settings), sets["recorded"])
@@ -112,13 +105,17 @@ def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, 
             with step(f"replay actions: {kind}") as update:
                 images = imagine(simulator, settings.robot, recorded, np.roll(recorded.actions, shift, 0), update)
             save_demonstrations(replace(recorded, images=images), sets[kind])
-    return {kind: load_demonstrations(path) for kind, path in sets.items()}
+    held_out = out / "held_out.npz"
+    if not held_out.exists():
+        save_demonstrations(record_far(settings, seed=1), held_out)
+    return {kind: load_demonstrations(path) for kind, path in {**sets, "held_out": held_out}.items()}
 
 
-def record_far(settings: Settings) -> Demonstrations:
+def record_far(settings: Settings, seed: int = 0) -> Demonstrations:
     """Successes of the expert that begin far enough from the goal."""
     task = settings.make_task()
-    made = record(task, MOST_TRIED * settings.trajectories, noise=settings.noise, only_successes=True)
+    count = MOST_TRIED * settings.trajectories
+    made = record(task, count, noise=settings.noise, only_successes=True, seed=seed)
     far = np.flatnonzero(away_at_start(task, made.seeds) >= settings.least)[: settings.trajectories]
     enough = len(far) == settings.trajectories
     require(enough, f"{task.robot}: hardly an episode begins {settings.least:g} from its goal")
@@ -145,7 +142,7 @@ def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int) 
 
 
 def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update) -> dict:
-    """Trains one policy and judges it: {success, distance} by start."""
+    """Trains one policy and judges it: {success, distance} by start, {error} by held-out trajectory."""
     demos, task = choose(condition, data, seed), settings.make_task()
     fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
     config = BcConfig(frames=1, fit=fit)
@@ -153,99 +150,33 @@ def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demon
     policy = ClonedPolicy(config, params, scale_of(demos))
     starts = start_seeds(task, settings.starts, least=settings.least)
     found = run_policy(task, policy, starts, demos.images.shape[2])
-    return {"success": found.success.astype(int).tolist(), "distance": np.round(found.distance, 4).tolist()}
+    errors = action_errors(policy, data["held_out"], scale_of(data["recorded"]))
+    return {
+        "success": found.success.astype(int).tolist(),
+        "distance": np.round(found.distance, 4).tolist(),
+        "error": np.round(errors, 5).tolist(),
+    }
 
 
-# --- What comes of it --------------------------------------------------------------------------
+def action_errors(policy: Policy, demos: Demonstrations, scale: Scale) -> np.ndarray:
+    """float [N]: mean squared difference from the recorded actions of each trajectory, in standard deviations."""
+    policy.reset()
+    acted = np.stack([policy.act(demos.images[:, t]) for t in range(demos.images.shape[1])], 1)
+    return ((scale.normalise(acted) - scale.normalise(demos.actions)) ** 2).mean((1, 2), dtype=np.float64)
 
 
-def make_panel(trials: Mapping[tuple[int, int], dict], settings: Settings) -> Panel:
-    """Success of every condition, seed and start."""
-    points = [np.array([trials[i, s]["success"] for s in settings.seeds], float) for i in range(len(CONDITIONS))]
-    names = np.full(settings.starts, settings.robot)
-    return Panel(names, np.arange(settings.starts), tuple(points), (settings.seeds,) * len(points))
-
-
-def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
-    """Which share of the gap between few and all recorded trajectories condition `at` closes; the interval holds 95 %
-    of the draws over seeds and starts."""
-    found = resample(panel, draws)
-
-    def share(points: np.ndarray) -> np.ndarray:
-        gap = points[..., ALL] - points[..., FEW]
-        return (points[..., at] - points[..., FEW]) / np.where(np.abs(gap) < 1e-9, np.nan, gap)
-
-    drawn = share(found.drawn)
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
-    return Interval(float(share(found.value)), float(np.nanstd(drawn)), float(low), float(high))
-
-
-def summarise(trials: Mapping[tuple[int, int], dict], settings: Settings) -> list[tuple[str, Interval]]:
-    """Success of every condition; which share of the gap 90 generated trajectories close, and 90 of the control."""
-    panel = make_panel(trials, settings)
-    found = [(c.name, r) for c, r in zip(CONDITIONS, bootstrap_intervals(panel), strict=True)]
-    shares = (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL))
-    return found + [(name, share_closed(panel, at)) for name, at in shares]
-
-
-def write_results(settings: Settings, trials: Mapping[tuple[int, int], dict], quality: dict, out: Path) -> None:
-    rows = [
-        [c.name, c.recorded, c.generated, c.more if c.generated else "", s, k, done, away]
-        for i, c in enumerate(CONDITIONS)
-        for s in settings.seeds
-        for k, (done, away) in enumerate(zip(trials[i, s]["success"], trials[i, s]["distance"], strict=True))
-    ]
-    write_table(out / "trials.csv", NAMES, rows)
-    found = summarise(trials, settings)
-    measured = [(name, r.mean, r.low, r.high) for name, r in found]
-    measured += [(f"PSNR {kind}, dB", *three) for kind, three in quality.items()]
-    summary = [[name, *(f"{x:.4f}" for x in three)] for name, *three in measured]
-    write_table(out / "summary.csv", ["what", "mean", "low", "high"], summary)
+def write_results(settings: Settings, trials: Trials, quality: dict, out: Path) -> None:
+    write_tables(trials, settings.seeds, out)
+    found = summarise(trials, settings.seeds)
+    measured = [(f"{what}: {one.name}", getattr(one, what)) for what in ("success", "error") for one in found]
+    lines = [[name, *(f"{x:.4f}" for x in (r.mean, r.low, r.high))] for name, r in measured]
+    lines += [[f"PSNR of {kind}, dB", *(f"{x:.4f}" for x in three)] for kind, three in quality.items()]
+    write_table(out / "summary.csv", ["what", "mean", "low", "high"], lines)
     write_file(out / "table.md", markdown(found))
     write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
-    draw([r for _, r in found[: len(CONDITIONS)]], trials, settings, out / "synthetic.png")
-
-
-def markdown(found: Sequence[tuple[str, Interval]]) -> str:
-    """The table that docs/generating.md shows; an interval of a share of episodes ends at 0 and 1."""
-    lines = ["| trained on | success | 95 % interval |", "|---|---|---|"]
-    for name, r in found:
-        low, high = (r.low, r.high) if name.startswith("share") else (max(r.low, 0.0), min(r.high, 1.0))
-        lines.append(f"| {name} | {r.mean:.2f} | {low:.2f} to {high:.2f} |")
-    return "\n".join(lines) + "\n"
-
-
-def read_trials(path: Path) -> dict[tuple[int, int], dict]:
-    """What trials.csv says: {(place of the condition, seed): {success, distance} by start}."""
-    places, trials = {c.name: i for i, c in enumerate(CONDITIONS)}, {}
-    with open(path, newline="") as file:
-        for row in csv.DictReader(file):
-            one = trials.setdefault((places[row["condition"]], int(row["seed"])), {"success": [], "distance": []})
-            one["success"].append(int(row["success"]))
-            one["distance"].append(float(row["distance"]))
-    return trials
-
-
-def draw(found: Sequence[Interval], trials: Mapping[tuple[int, int], dict], settings: Settings, path: Path) -> None:
-    """Success by condition: a bar with its interval, a dot for every seed."""
-    from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, plt, save
-
-    with plt.rc_context(STYLE):
-        figure, panel = plt.subplots(figsize=(7.2, 3.4), layout="constrained")
-        colours = [COLOURS["delta_psnr"] if i == CONTROL else MUTED if i in (FEW, ALL) else COLOURS["perplexity"]
-                   for i in range(len(CONDITIONS))]  # fmt: skip
-        places = np.arange(len(CONDITIONS))
-        panel.bar(places, [r.mean for r in found], color=colours, width=0.62)
-        low = [r.mean - max(r.low, 0) for r in found]
-        high = [min(r.high, 1) - r.mean for r in found]
-        panel.errorbar(places, [r.mean for r in found], [low, high], fmt="none", color=INK, capsize=3)
-        for i in places:
-            means = [np.mean(trials[i, s]["success"]) for s in settings.seeds]
-            panel.plot(np.full(len(means), i + 0.2), means, "o", color=INK, markersize=3)
-        panel.set_xticks(places, [c.name.replace(" generated", "\ngenerated").replace(", ", ",\n") for c in CONDITIONS])
-        panel.set(ylim=(0, 1), ylabel="success in the true simulator")
-        panel.grid(False, axis="x")
-        save(figure, path)
+    seeds = [[float(np.mean(trials[i, s]["success"])) for s in settings.seeds] for i in range(len(CONDITIONS))]
+    named = {one.name: one.success for one in found[: len(CONDITIONS)]}
+    draw_conditions(named, seeds, {CONTROL}, {FEW, ALL}, out / "synthetic.png")
 
 
 def quality_of(data: Mapping[str, Demonstrations]) -> dict[str, tuple[float, float, float]]:
@@ -276,7 +207,7 @@ def main() -> None:
     trials_dir.mkdir(parents=True, exist_ok=True)
     simulator = load_simulator(run, episodes=BATCH, history=1)
     data = make_data(settings, simulator, out)
-    trials: dict[tuple[int, int], dict] = {}
+    trials: Trials = {}
     jobs, pace = [(i, s) for s in settings.seeds for i in range(len(CONDITIONS))], Pace()
     with step(f"train and judge {len(jobs)} policies") as update:
         for n, (i, seed) in enumerate(jobs):
@@ -287,7 +218,8 @@ def main() -> None:
                 write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
     write_results(settings, trials, quality_of(data), out)
-    wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "synthetic.png")
+    draw_strips([data[kind].images[:2] for kind in KINDS], KINDS, out / "frames.png")
+    wrote(out / TRIALS, out / ERRORS, out / "summary.csv", out / "table.md", out / "synthetic.png", out / "frames.png")
 
 
 if __name__ == "__main__":

@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.applications import plan_actions, synthetic
+from experiments.applications import plan_actions
+from experiments.applications.generating import conditions
+from experiments.applications.generating.conditions import ALL, CONDITIONS, CONTROL, FEW, MOST, share_closed
 from experiments.applications.plan_actions import decided
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.tasks import find_task
-from experiments.applications.synthetic import ALL, CONDITIONS, CONTROL, FEW, MOST, Settings, choose, share_closed
+from experiments.applications.synthetic import Settings, choose
 from hma_jax.config.json import from_dict
 
 ROOT = Path(__file__).parents[3]
@@ -43,22 +45,21 @@ def test_conditions_are_nested_and_no_recording_is_also_generated():
 
 
 def test_the_share_of_the_gap_is_that_of_the_means():
-    settings, rng = Settings(starts=400, seeds=(0, 1, 2)), np.random.default_rng(0)
+    seeds, rng = (0, 1, 2), np.random.default_rng(0)
     rates = (0.2, 0.3, 0.5, 0.7, 0.25, 0.8)
     trials = {
         (i, s): {"success": rng.random(400) < rate, "distance": np.zeros(400)}
         for i, rate in enumerate(rates)
-        for s in settings.seeds
+        for s in seeds
     }
-    panel = synthetic.make_panel(trials, settings)
+    panel = conditions.make_panel(trials, seeds)
     share, control = share_closed(panel, MOST), share_closed(panel, CONTROL)
     assert share.mean == pytest.approx(0.83, abs=0.08) and share.low < 0.83 < share.high < share.low + 0.4
     assert control.high < share.low
 
 
 def test_an_episode_ends_when_nothing_can_change_its_outcome():
-    task = find_task("pusher_sand", "reach", frames=16)
-    assert task.hold == 6
+    task = find_task("pusher_sand", "reach", frames=16, hold=6)
     assert decided([False] * 4 + [True] * 6, task) and not decided([False] * 4 + [True] * 5, task)
     assert decided([False] * 11, task) and not decided([False] * 10, task)
     assert not decided([False] * 10 + [True] * 5, task) and decided([False] * 10 + [True, False], task)
@@ -72,10 +73,10 @@ def from_settings(kind: type, path: Path):
 @pytest.mark.skipif(not (RESULTS / "synthetic").exists(), reason="not run yet")
 def test_the_committed_table_of_generated_trajectories_follows_from_its_trials():
     place = RESULTS / "synthetic"
-    settings, trials = from_settings(Settings, place / "settings.json"), synthetic.read_trials(place / "trials.csv")
+    settings, trials = from_settings(Settings, place / "settings.json"), conditions.read_trials(place)
     assert set(trials) == {(i, s) for i in range(len(CONDITIONS)) for s in settings.seeds}
     assert settings.starts >= 50 and len(settings.seeds) >= 3
-    table = synthetic.markdown(synthetic.summarise(trials, settings))
+    table = conditions.markdown(conditions.summarise(trials, settings.seeds))
     assert table == (place / "table.md").read_text() and table in (ROOT / "docs" / "generating.md").read_text()
 
 
