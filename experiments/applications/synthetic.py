@@ -7,9 +7,10 @@ Cost: half an hour of one core; goes on where it was stopped.
 Expected: success grows with the generated trajectories; those of a model that is given other actions do not help.
 
 The 100 trajectories are an expert's, from starts that the world model never saw. For each seed ten of them are kept as
-recorded; of the others the actions are kept, and replayed from their own first frames in the learned simulator.
-Control: the same simulator under another trajectory's actions, so that pictures and actions do not belong together. All
-policies are trained alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
+recorded; of the others the actions are kept, and replayed from their own first frame in the learned simulator. Policies
+are trained on what it shows, not on that frame. Control: the same simulator under another trajectory's actions, so that
+pictures and actions do not belong together. All policies are trained alike (behaviour cloning, as many steps), and judged
+from the same starts in the true simulator.
 
 The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations.
 
@@ -69,7 +70,9 @@ from hma_jax.simulator.simulator import Simulator
 
 RUN, OUT = Path("experiments/results/simulator"), Path("runs/synthetic")
 
-BATCH, GIVEN = 8, 3
+BATCH = 8
+GIVEN = 1
+"""Recorded frames that a generated trajectory begins with. No policy is trained on them."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +141,17 @@ def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int) 
     order = np.random.default_rng([seed, 21]).permutation(len(data["recorded"]))
     kept, others = order[: condition.recorded], order[condition.recorded : condition.recorded + condition.generated]
     parts = [data["recorded"].take(kept)]
-    return join([*parts, data[condition.more].take(others)] if len(others) else parts)
+    return join([*parts, without_given(data[condition.more].take(others))] if len(others) else parts)
+
+
+def without_given(demos: Demonstrations) -> Demonstrations:
+    """The frames that the simulator made, and their actions: the first ones come from the recording."""
+
+    def later(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x[:, GIVEN:], np.zeros_like(x[:, :GIVEN])], 1)
+
+    shifted = {name: later(getattr(demos, name)) for name in ("images", "actions", "reached")}
+    return replace(demos, lengths=demos.lengths - GIVEN, **shifted)
 
 
 def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update) -> dict:

@@ -49,7 +49,7 @@ def draw_strips(images: Sequence[np.ndarray], names: Sequence[str], path: Path) 
         figure, panels = plt.subplots(count * len(names), 1, figsize=size, layout="constrained", squeeze=False)
         for i, panel in enumerate(panels[:, 0]):
             kind = i % len(names)
-            panel.imshow(np.concatenate(images[kind][i // len(names), chosen], axis=1))
+            panel.imshow(np.concatenate(images[kind][i // len(names), chosen], axis=1), interpolation="nearest")
             panel.set_xticks([])
             panel.set_yticks([])
             panel.set_ylabel(names[kind], rotation=0, ha="right", va="center")

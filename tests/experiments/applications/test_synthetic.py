@@ -24,9 +24,10 @@ RESULTS = ROOT / "experiments" / "results"
 
 def demonstrations(kind: int, count: int = 100) -> Demonstrations:
     """Episodes of one pixel that says of which kind they are, and an action that says which one it is."""
-    images = np.full((count, 1, 1, 1, 3), kind, np.uint8)
-    actions, ones = np.arange(count, dtype=np.float32).reshape(count, 1, 1), np.ones(count, int)
-    return Demonstrations(images, actions, ones, ones[:, None] > 0, ones > 0, ones)
+    images = np.full((count, 3, 1, 1, 3), kind, np.uint8)
+    actions, ones = np.repeat(np.arange(count, dtype=np.float32), 3).reshape(count, 3, 1), np.ones(count, int)
+    images[:, 0] = 0  # the frame that a generated trajectory is given is a recorded one
+    return Demonstrations(images, actions, 3 * ones, np.ones((count, 3), bool), ones > 0, ones)
 
 
 DATA = {"recorded": demonstrations(0), "generated": demonstrations(1), "shuffled": demonstrations(2)}
@@ -38,6 +39,9 @@ def test_conditions_are_nested_and_no_recording_is_also_generated():
     kinds = [np.bincount(d.images[:, 0, 0, 0, 0], minlength=3).tolist() for d in chosen]
     assert kinds == [[10, 0, 0], [10, 10, 0], [10, 50, 0], [10, 90, 0], [10, 0, 90], [100, 0, 0]]
     assert all(len(set(w)) == len(w) for w in which)
+    for d, c in zip(chosen, CONDITIONS, strict=True):  # of a generated trajectory two frames, none of them recorded
+        assert d.lengths.tolist() == [3] * c.recorded + [2] * c.generated
+        assert (d.images[c.recorded :, :2] > 0).all()
     for fewer, more in zip(which[:3], which[1:4], strict=True):
         assert more[: len(fewer)] == fewer
     assert which[MOST] == which[CONTROL] and sorted(which[ALL]) == sorted(which[MOST])
