@@ -9,8 +9,8 @@ Expected: success grows with the generated trajectories; those of a model that i
 The 100 trajectories are an expert's, from starts that the world model never saw. For each seed ten of them are kept as
 recorded; of the others the actions are kept, and replayed from their own first frame in the learned simulator. Policies
 are trained on what it shows, not on that frame. Control: the same simulator under another trajectory's actions, so that
-pictures and actions do not belong together. All policies are trained alike (behaviour cloning, as many steps), and judged
-from the same starts in the true simulator.
+pictures and actions do not belong together. All policies are trained alike (behaviour cloning, as many steps), and
+judged from the same starts in the true simulator.
 
 The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations.
 
