@@ -18,7 +18,7 @@ def judge(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
     robot: Annotated[str, arg(metavar="NAME")],
     out: Annotated[Path, arg(metavar="DIR")],
-    task: Literal["own", "reach"] = "own",
+    task: Literal["own", "reach", "hover"] = "own",
     starts: int = 50,
     batch: Annotated[int | None, UNSET] = None,
     frames: Annotated[int | None, UNSET] = None,
@@ -32,16 +32,17 @@ def judge(
     """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
 
     Policies are trained on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and
-    a random one. Success in the model is told by a head, in the truth by the state; the head looks at true frames too,
-    and a control executes what a policy does in another episode. Writes table, agreement with intervals, a page with
-    clips, and a page on which a person can label successes blindly. Goes on where it was stopped. docs/judging.md says
-    how to read it.
+    a random one; the model itself, where it has action heads. Success in the model is told by a head, in the truth by
+    the state; the head looks at true frames too, and a control executes what a policy does in another episode. Writes
+    table, agreement with intervals, a page with clips, and a page on which a person can label successes blindly. Goes
+    on where it was stopped. docs/judging.md says how to read it.
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.
         robot: Which of its robots; the suite must have it.
         out: Where everything is written.
-        task: The robot's own task (push or carry the puck to the mark), or reaching the mark with the tool.
+        task: The robot's own task (push or carry the puck to the mark), reaching the mark with the tool, or hovering
+            with the tool above a puck.
         starts: Held-out episodes at whose beginning every policy starts.
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's.

@@ -75,7 +75,8 @@ def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
     page = f"{judged.config.task.robot}-{judged.config.task.name}-{judged.config.seed}-{clips}"
     content = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
-        f'content="width=device-width, initial-scale=1"><title>Success or not?</title><style>{STYLE}</style></head><body data-page="{page}">'
+        f'content="width=device-width, initial-scale=1"><title>Success or not?</title>'
+        f'<style>{STYLE}</style></head><body data-page="{page}">'
         f"<h1>Is the task done?</h1><p>The goal: {html.escape(judged.config.task.goal)}, for "
         f"{judged.config.task.hold} frames in a row at some time. Keys: S success, F failure, arrows back and on.</p>"
         f"{''.join(pictures)}<p id=where></p><button id=success>success</button><button id=failure>failure</button>"

@@ -20,7 +20,7 @@ import numpy as np
 from data_pipelines.publishing.files import write_file
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
 from experiments.applications.judging.head import HeadConfig, SuccessHead, auroc, load_head, save_head, train_head
-from experiments.applications.judging.ladder import LadderConfig, find_policy, names, train_ladder
+from experiments.applications.judging.ladder import OWN_HEAD, LadderConfig, find_policy, names, train_ladder
 from experiments.applications.judging.outcomes import SHUFFLED, TRUE, WORLDS, Outcome, judge_rollout
 from experiments.applications.judging.rollouts import Rollout, load_rollout, make_starts, run, save_rollout
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
@@ -77,7 +77,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
     _claim(out, run_directory, config)
     size, stride, task = simulator.tokenizer.image_size, robot.stride, config.task
-    policies = names(config.ladder)
+    policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads
 
     def demonstrations() -> Demonstrations:
         short = replace(task, frames=config.demonstration_frames)
@@ -104,7 +104,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
             path = _place(out, name, world)
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                policy = find_policy(out / "policies", name, robot)
+                policy = find_policy(out / "policies", name, robot, simulator)
                 with step(f"{name} in the {world} world") as report:
                     made = run(
                         true if world == TRUE else simulator, policy, starts, seeds, task,

@@ -13,10 +13,15 @@ from experiments.applications.policies.diffusion import DiffusionConfig, Diffusi
 from experiments.applications.policies.files import DESCRIPTION, load_policy, save_policy
 from experiments.applications.policies.learning import FitConfig, Report, ladder
 from experiments.applications.policies.network import EncoderConfig
+from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
 
 RANDOM = "random"
+
+OWN_HEAD = "hma"
+"""The model itself, where it predicts actions."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,7 @@ class LadderConfig:
     first: int = 60  # the step of the first checkpoint
     batch: int = 64
     learning_rate: float = 2e-3
+    frames: int = 1  # one shows all there is; of two, what was just done can be read, and is then merely done again
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
 
     def fit(self, rungs: int) -> FitConfig:
@@ -61,17 +67,21 @@ def train_ladder(
         recorded = demos() if recorded is None else recorded
         scale, fit = scale_of(recorded), config.fit(rungs)
         if kind == ClonedPolicy.kind:
-            bc = BcConfig(encoder=config.encoder, fit=fit)
+            bc = BcConfig(frames=config.frames, encoder=config.encoder, fit=fit)
             params = train_bc(recorded, bc, seed, reports(kind))
             made = {step: ClonedPolicy(bc, p, scale) for step, p in params.items()}
         else:
-            dp = DiffusionConfig(encoder=config.encoder, fit=fit)
+            dp = DiffusionConfig(frames=config.frames, encoder=config.encoder, fit=fit)
             params = train_diffusion(recorded, dp, seed, reports(kind))
             made = {step: DiffusionPolicy(dp, p, scale) for step, p in params.items()}
         for step, policy in made.items():
             save_policy(policy, directory / f"{kind}-{step}", about | {"step": step, "seed": seed})
 
 
-def find_policy(directory: Path, name: str, robot: Robot) -> Policy:
+def find_policy(directory: Path, name: str, robot: Robot, simulator: Simulator) -> Policy:
     """Raises ConfigError where it is not, or damaged."""
-    return RandomPolicy(robot) if name == RANDOM else load_policy(directory / name)
+    if name == RANDOM:
+        return RandomPolicy(robot)
+    if name == OWN_HEAD:
+        return OwnHeadPolicy(simulator.model, simulator.tokenizer, robot)
+    return load_policy(directory / name)

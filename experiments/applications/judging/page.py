@@ -76,7 +76,9 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
         section(
             "Agreement with the true simulator",
             table(["compared", "interval over other", *measures], agreed, text=2),
-            f"<p>Of single episodes the model and the truth agree in {shown(summary['episodes alike'])}.</p>",
+            "<p>Model and truth say the same of a policy's episode from a start: "
+            + "; ".join(f"{html.escape(name)} {shown(x)}" for name, x in summary["episodes alike"].items())
+            + ".</p>",
         ),
         section(
             "The success head",

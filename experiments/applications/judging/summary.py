@@ -35,7 +35,12 @@ def summarise(judged: Judged) -> dict[str, Any]:
     each = {name: successes(judged.outcomes, judged.policies, *column) for name, column in COLUMNS.items()}
     reference = each["true, by state"]
     compared = {name: agree(reference, each[column]) for name, column in COMPARED.items()}
-    paired = each["learned, by head"] == reference
+    learned = each["learned, by head"]
+    alike = {
+        "all episodes": learned == reference,
+        "those that truly succeed": learned[reference],
+        "those that truly fail": ~learned[~reference],
+    }
     return {
         "robot": judged.config.task.robot,
         "task": judged.config.task.goal,
@@ -53,7 +58,7 @@ def summarise(judged: Judged) -> dict[str, Any]:
             }
             for name, found in compared.items()
         },
-        "episodes alike": _plain(rate_interval(paired.ravel())),
+        "episodes alike": {name: _plain(rate_interval(same.ravel())) for name, same in alike.items() if same.size},
         "head": judged.head.measured,
         "episodes per second": {world: round(1 / s, 3) for world, s in judged.seconds.items()},
     }

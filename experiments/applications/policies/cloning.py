@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -88,6 +89,12 @@ def train_bc(
     return fit(start, loss, data, len(steps), config.fit, seed, report)
 
 
+@partial(jax.jit, static_argnums=1)
+def _act(params: Params, config: BcConfig, images: jax.Array) -> jax.Array:
+    """Compiled once for all checkpoints of a policy."""
+    return apply_bc(params, config, as_floats(images))
+
+
 class ClonedPolicy(ChunkPolicy):
     """What `train_bc` made, acting."""
 
@@ -96,8 +103,7 @@ class ClonedPolicy(ChunkPolicy):
     def __init__(self, config: BcConfig, params: Params, scale: Scale):
         super().__init__(config.frames, config.execute, scale)
         self.config, self.params = config, params
-        self._apply = jax.jit(lambda params, images: apply_bc(params, config, as_floats(images)))
 
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
-        out = np.asarray(self._apply(self.params, frames))
+        out = np.asarray(_act(self.params, self.config, frames))
         return out.reshape(len(frames), self.config.chunk, -1)

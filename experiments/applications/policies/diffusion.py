@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -129,6 +130,12 @@ def train_diffusion(
     return fit(start, loss, data, len(steps), config.fit, seed, report)
 
 
+@partial(jax.jit, static_argnums=1)
+def _act(params: Params, config: DiffusionConfig, images: jax.Array, start: jax.Array) -> jax.Array:
+    """Compiled once for all checkpoints of a policy."""
+    return draw(params, config, as_floats(images), start)
+
+
 class DiffusionPolicy(ChunkPolicy):
     """What `train_diffusion` made, acting. What it draws is a function of the episode's seed and step."""
 
@@ -137,10 +144,9 @@ class DiffusionPolicy(ChunkPolicy):
     def __init__(self, config: DiffusionConfig, params: Params, scale: Scale):
         super().__init__(config.frames, config.execute, scale)
         self.config, self.params = config, params
-        self._draw = jax.jit(lambda params, images, start: draw(params, config, as_floats(images), start))
 
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
         size = self.config.chunk * len(self.scale.mean)
         start = [np.random.default_rng([s, n, 14]).standard_normal(size) for s, n in zip(seeds, steps, strict=True)]
-        out = np.asarray(self._draw(self.params, frames, np.asarray(start, np.float32)))
+        out = np.asarray(_act(self.params, self.config, frames, np.asarray(start, np.float32)))
         return out.reshape(len(frames), self.config.chunk, -1)

@@ -1,8 +1,8 @@
 """Small networks on images, as functions of dictionaries of arrays: what policies and success heads share.
 
 Frames are averaged down to `size` and become K points: where each of the last convolution's maps is strongest, by a
-spatial softmax (Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies"), and how strong it is there. What
-finds a mark at one place then finds it at all, which a dense layer on the maps must learn from thousands of episodes.
+spatial softmax (Levine et al. 2016, "End-to-End Training of Deep Visuomotor Policies"), and how strong it is there.
+What finds a mark at one place then finds it anywhere; a dense layer on the maps learns every place by itself.
 """
 
 from __future__ import annotations

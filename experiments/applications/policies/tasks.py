@@ -36,8 +36,7 @@ class ReachMark(Reach):
 
 @dataclass(frozen=True)
 class HoverPuck(ReachMark):
-    """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things. The
-    expert takes small steps, so that its recordings are of the way there."""
+    """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things."""
 
     within: float = 0.3  # a little more than a puck's radius
     step: float = 0.4  # that the expert moves the tool at once, world units

@@ -1,0 +1,80 @@
+"""HMA itself as a policy: its action head reads the next chunk off the frames it sees, as long as one likes.
+
+Past the model's window the oldest frame and its action are forgotten. Needs a run with `model.action_heads`; the model
+of this repository was trained without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from experiments.applications.policies.policy import Counts
+from hma_jax.config import DecodeConfig, require
+from hma_jax.generation import predict_next_actions
+from hma_jax.simulator.robots import Robot
+from hma_jax.tokenizers.shared import BaseTokenizer
+from hma_jax.training.runs import Model
+
+
+class OwnHeadPolicy:
+    """Acts by the action head of a model. Of a chunk, which is native actions, the mean is done for the whole frame."""
+
+    def __init__(self, model: Model, tokenizer: BaseTokenizer, robot: Robot, decode: DecodeConfig | None = None):
+        """Raises ConfigError for a model that predicts no actions."""
+        require(
+            model.config.action_heads,
+            "the model has no action heads, so it is no policy; train one with model.action_heads=true",
+        )
+        self.tokenizer, self.robot, self.frames = tokenizer, robot, model.config.frames
+        self.width = model.table.action_width
+        self._embodiment, self._params, self._counts = model.table.index(robot.name), model.params, Counts()
+        self._tokens: list[list[np.ndarray]] = []  # of each episode, at most T
+        self._chunks: list[list[np.ndarray]] = []  # between them
+        settings = decode or DecodeConfig()
+
+        def predict(params, frames, actions_BTU, embodiment_B, seed_B):
+            keys = jax.vmap(jax.random.key)(seed_B)
+            return predict_next_actions(model.declared.merge(params), frames, actions_BTU, embodiment_B, keys, settings)
+
+        self._predict = jax.jit(predict)
+
+    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
+        self._counts.reset(episodes, seeds)
+        if episodes is None:
+            self._tokens, self._chunks = [], []
+        for b in episodes or ():
+            if b < len(self._tokens):
+                self._tokens[b], self._chunks[b] = [], []
+
+    def act(self, images: np.ndarray) -> np.ndarray:
+        count = len(images)
+        if len(self._tokens) != count:
+            self._tokens, self._chunks = [[] for _ in images], [[] for _ in images]
+        tokens = self.tokenizer.encode(images)
+        # What follows the newest frame is padding: no frame sees those after it.
+        frames = np.zeros((count, self.frames, *tokens.shape[1:]), tokens.dtype)
+        actions_BTU = np.zeros((count, self.frames, self.width), np.float32)
+        for b in range(count):
+            seen, done = self._tokens[b], self._chunks[b]
+            seen.append(tokens[b])
+            del seen[: -self.frames], done[: len(done) + 1 - len(seen)]
+            frames[b, : len(seen)] = seen
+            if done:
+                actions_BTU[b, : len(done)] = done
+        drawn = [self._counts.next(b) for b in range(count)]
+        seeds = np.array([np.random.default_rng([*pair, 16]).integers(2**32) for pair in drawn], np.uint32)
+        which = np.full(count, self._embodiment, np.int32)
+        out = np.asarray(self._predict(self._params, frames, actions_BTU, which, seeds))
+        newest = out[np.arange(count), [len(seen) - 1 for seen in self._tokens]]
+        stride, dim = self.robot.stride, self.robot.action_dim
+        actions = newest[:, : stride * dim].reshape(count, stride, dim).mean(1)
+        low, high = np.array(self.robot.low, np.float32), np.array(self.robot.high, np.float32)
+        actions = np.clip(actions, low, high)
+        for b, action in enumerate(actions):
+            chunk = np.zeros(self.width, np.float32)
+            chunk[: stride * dim] = np.tile(action, stride)
+            self._chunks[b].append(chunk)
+        return actions.astype(np.float32)

@@ -1,0 +1,39 @@
+"""Measures of how two worlds agree about policies, on cases that are known."""
+
+import numpy as np
+import pytest
+
+from experiments.applications.judging.agreement import agree, pearson, rank_violation, rate_interval, spearman
+from experiments.applications.judging.head import auroc
+
+
+def test_measures_of_known_cases():
+    true, learned = np.array([0.38, 0.52, 0.70, 1.00]), np.array([0.40, 0.45, 0.55, 0.99])
+    assert pearson(true, learned) == pytest.approx(np.corrcoef(true, learned)[0, 1])
+    assert spearman(true, learned) == 1 and rank_violation(true, learned) == 0
+    # 0.5 and 0.6 are exchanged; the others are as they should be.
+    assert rank_violation(np.array([0.1, 0.5, 0.6]), np.array([0.0, 0.9, 0.8])) == pytest.approx(0.2 / 3)
+    assert rank_violation(np.array([0.8, 0.2]), np.array([0.5, 0.5])) == pytest.approx(0.6)
+    assert np.isnan(pearson(true, np.ones(4)))
+
+
+def test_a_faithful_world_has_a_high_interval_and_one_without_relation_has_none():
+    rng = np.random.default_rng(0)
+    rates = np.linspace(0.05, 0.95, 9)
+    true = rng.random((9, 60)) < rates[:, None]
+    faithful = agree(true, rng.random((9, 60)) < rates[:, None], draws=300).measures["pearson"]
+    blind = agree(true, rng.random((9, 60)) < 0.4, draws=300).measures["pearson"]
+    assert faithful.low > 0.7 and faithful.low < faithful.mean < faithful.high
+    assert blind.low < 0 < blind.high
+    starts = agree(true, true, draws=100).over_starts["bias"]
+    assert (starts.mean, starts.low, starts.high) == (0, 0, 0)
+
+
+def test_intervals_of_rates_hold_at_the_ends():
+    none, some = rate_interval(np.zeros(50)), rate_interval(np.arange(50) < 25)
+    assert none.low == pytest.approx(0, abs=1e-12) and none.high == pytest.approx(0.0713, abs=1e-3)
+    assert (some.low, some.high) == (pytest.approx(0.3664, abs=1e-3), pytest.approx(0.6336, abs=1e-3))
+
+
+def test_auroc_counts_ties_half():
+    assert auroc(np.array([0.1, 0.4, 0.4, 0.9]), np.array([0, 0, 1, 1])) == pytest.approx(0.875)

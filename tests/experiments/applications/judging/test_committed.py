@@ -1,0 +1,36 @@
+"""The judgements that are committed: table, summary and docs/judging.md say the same."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments.applications.judging.agreement import pearson, rate_interval, spearman
+from experiments.applications.judging.outcomes import read_outcomes, successes
+from experiments.applications.judging.summary import COLUMNS, COMPARED, shown
+
+ROOT = Path(__file__).parents[4]
+RESULTS = sorted((ROOT / "experiments" / "results").glob("judge-*"))
+
+
+@pytest.mark.parametrize("directory", RESULTS, ids=lambda path: path.name)
+def test_the_summary_is_that_of_the_table_and_of_the_page(directory):
+    summary = json.loads((directory / "agreement.json").read_text())
+    outcomes = read_outcomes(directory / "outcomes.csv")
+    names = list(summary["policies"])
+    each = {column: successes(outcomes, names, *where) for column, where in COLUMNS.items()}
+    page = (ROOT / "docs" / "judging.md").read_text()
+    for i, name in enumerate(names):
+        for column, found in each.items():
+            assert summary["policies"][name][column]["mean"] == pytest.approx(rate_interval(found[i]).mean, abs=1e-4)
+        cells = " | ".join(f"{summary['policies'][name][column]['mean']:.2f}" for column in COLUMNS)
+        assert f"| {name} | {cells} |" in page, name
+    true = each["true, by state"].mean(1)
+    for kind, column in COMPARED.items():
+        agreed = summary["agreement"][kind]["policies and starts"]
+        rates = each[column].mean(1)
+        if agreed["pearson"]["mean"] is not None:
+            assert agreed["pearson"]["mean"] == pytest.approx(pearson(true, rates), abs=1e-4)
+            assert agreed["spearman"]["mean"] == pytest.approx(spearman(true, rates), abs=1e-4)
+        cells = " | ".join(shown(agreed[name]) for name in ("pearson", "spearman", "rank violation"))
+        assert f"| {kind} | {cells} |" in page, kind

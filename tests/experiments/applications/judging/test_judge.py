@@ -1,0 +1,117 @@
+"""`hma judge` with a model that has learnt nothing: what it writes, and how it goes on."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
+from experiments.applications.judging.head import HeadConfig, HeadJudge, load_head
+from experiments.applications.judging.judge import JudgeConfig, judge_run
+from experiments.applications.judging.ladder import LadderConfig, names
+from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, read_outcomes, write_outcomes
+from experiments.applications.judging.page import draw_scatter, write_page
+from experiments.applications.judging.summary import COLUMNS, summarise
+from experiments.applications.policies import find_task
+from experiments.applications.policies.learning import FitConfig
+from experiments.applications.policies.network import EncoderConfig
+from experiments.progress import step
+from hma_jax.config import ConfigError, TrainConfig
+from hma_jax.convert.run_directory import write_run
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.model.hma import declare_model
+from hma_jax.tokenizers.io import save_tokenizer
+from hma_jax.training.runs import Run
+from tests.hma_jax.simulator.small import CONFIG, parts
+
+SMALL = EncoderConfig(8, (4, 4, 4), 8)
+ASKED = JudgeConfig(
+    find_task("gripper_wood", frames=2, hold=1),
+    starts=4,
+    batch=2,
+    demonstrations=4,
+    demonstration_frames=4,
+    ladder=LadderConfig(cloned=2, diffusion=0, steps=3, first=1, batch=2, encoder=SMALL),
+    head=HeadConfig(encoder=SMALL, fit=FitConfig(steps=2, batch=4)),
+    head_episodes=12,
+)
+
+
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory):
+    root, tokenizer = tmp_path_factory.mktemp("study"), parts()[1]
+    save_tokenizer(tokenizer, root / "tokenizer")
+    table = EmbodimentTable((Embodiment("gripper_wood", 4, 1, (0.0,) * 4, (0.2,) * 4),))
+    run = Run(CONFIG, TrainConfig(), table, declare_model(CONFIG, table).init(0), 0, {"tokenizer": tokenizer.identity})
+    write_run(run, root / "model")
+    return root, judge_run(root / "model", root / "out", ASKED, step)
+
+
+def test_every_policy_is_judged_at_every_start_in_every_world(judged):
+    _, found = judged
+    assert found.policies == ("random", "cloned-1", "cloned-3", "hma") == (*names(ASKED.ladder), "hma")
+    rows = {(o.policy, o.start, o.world, o.judge) for o in found.outcomes}
+    assert len(rows) == len(found.outcomes) == 4 * 4 * 4
+    assert {o.world for o in found.outcomes if o.judge == STATE} == {TRUE}
+    a, b = (found.rollouts("cloned-3", world) for world in (TRUE, LEARNED))
+    assert a.images.shape == b.images.shape == (4, 3, 8, 8, 3)
+    assert not np.array_equal(a.images[:, 1:], b.images[:, 1:])
+    control = found.rollouts("random", "shuffled")
+    np.testing.assert_array_equal(control.actions[[1, 0]], found.rollouts("random", TRUE).actions[:2])
+
+
+def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged):
+    root, found = judged
+    lost = root / "out" / "rollouts" / "cloned-3.learned.npz"
+    kept = root / "out" / "rollouts" / "random.learned.npz"
+    before, images = kept.stat().st_mtime_ns, found.rollouts("cloned-3", LEARNED).images
+    lost.unlink()
+    again = judge_run(root / "model", root / "out", ASKED, step)
+    assert kept.stat().st_mtime_ns == before
+    np.testing.assert_array_equal(again.rollouts("cloned-3", LEARNED).images, images)
+    assert again.outcomes == found.outcomes
+    with pytest.raises(ConfigError, match="other judgements .config.starts: 4 -> 2"):
+        judge_run(root / "model", root / "out", replace(ASKED, starts=2), step)
+
+
+def test_table_summary_and_page(judged):
+    root, found = judged
+    out = root / "out"
+    write_outcomes(found.outcomes, out / "outcomes.csv")
+    assert read_outcomes(out / "outcomes.csv") == list(found.outcomes)
+    summary = summarise(found)
+    assert list(summary["policies"]["random"]) == list(COLUMNS)
+    head = summary["agreement"]["the head alone, on true frames"]["starts"]["bias"]
+    assert head["low"] <= head["mean"] <= head["high"]
+    draw_scatter(summary, out / "scatter.png")
+    page = write_page(found, summary, out, "hma judge").read_text()
+    assert page.count("<figure") == 4 and "cloned-3" in page and "http" not in page
+
+
+def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path):
+    root, found = judged
+    page = write_blind(found, root / "out", clips=10).read_text()
+    assert page.count("<img") == 10 and not any(name in page for name in ("cloned", "random", LEARNED))
+    key = json.loads((root / "out" / "blind.json").read_text())
+    said = {(o.policy, o.world, o.start): o.success for o in found.outcomes if o.judge == HEAD}
+    labels = {str(n): said[tuple(clip)] for n, clip in enumerate(key["clips"])}
+    path = tmp_path / "labels.json"
+    path.write_text(json.dumps({"page": key["page"], "labels": labels}))
+    agreed = compare_labels(read_labels(path, root / "out"), found.outcomes)
+    assert agreed["head, learned world"].mean == 1 == agreed["head, true world"].mean
+    path.write_text(json.dumps({"page": "another", "labels": labels}))
+    with pytest.raises(ConfigError, match="labels of another page"):
+        read_labels(path, root / "out")
+
+
+def test_the_head_judges_environments_and_forgets_with_them(judged):
+    head = load_head(judged[0] / "out" / "head")
+    assert set(head.measured) >= {"frame accuracy", "frame AUROC", "episode accuracy"}
+    judge = HeadJudge(head, hold=2)
+    head.reached = lambda images: images[:, 0, 0, 0] > 0
+    frames = [[1, 0], [1, 1], [1, 0], [0, 1], [1, 1]]
+    images = [np.broadcast_to(np.array(f)[:, None, None, None], (2, 8, 8, 3)) for f in frames]
+    done = [judge(SimpleNamespace(images=each))[1] for each in images]
+    assert [d.tolist() for d in done] == [[False, False], [True, False], [True, False], [False, False], [False, True]]

@@ -1,0 +1,39 @@
+"""HMA as a policy, past its window."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.applications.policies.own_head import OwnHeadPolicy
+from hma_jax.config import ConfigError
+from tests.hma_jax.simulator.small import ROBOTS, parts
+
+
+def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
+    model, tokenizer = parts()
+    frames = np.random.default_rng(0).integers(0, 256, (7, 2, 8, 8, 3), np.uint8)
+    policy = OwnHeadPolicy(model, tokenizer, ROBOTS[1])
+    acted = np.stack([policy.act(images) for images in frames])
+    low, high = np.array(ROBOTS[1].low, np.float32), np.array(ROBOTS[1].high, np.float32)
+    assert acted.shape == (7, 2, 7) and ((acted >= low) & (acted <= high)).all()
+    assert not np.array_equal(acted[0, 0], acted[0, 1])
+
+    # An episode begun at frame 0 of other images, with what it saw and did in its last window put in its place.
+    other = OwnHeadPolicy(model, tokenizer, ROBOTS[1])
+    other.act(frames[0, ::-1])
+    other._tokens = [list(tokens[:-1]) for tokens in policy._tokens]
+    other._chunks = [list(chunks[:-1]) for chunks in policy._chunks]
+    np.testing.assert_allclose(other.act(frames[6]), acted[6], rtol=1e-5)
+
+    policy.reset([0])
+    again = policy.act(np.stack([frames[0, 0], frames[0, 1]]))
+    np.testing.assert_allclose(again[0], acted[0, 0], rtol=1e-5)
+    assert not np.array_equal(again[1], acted[0, 1])
+
+
+def test_a_model_without_action_heads_is_no_policy():
+    model, tokenizer = parts()
+    without = replace(model, run=replace(model.run, model=replace(model.config, action_heads=False)))
+    with pytest.raises(ConfigError, match="model.action_heads=true"):
+        OwnHeadPolicy(without, tokenizer, ROBOTS[0])

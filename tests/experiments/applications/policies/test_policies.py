@@ -1,0 +1,154 @@
+"""Recorded demonstrations, and policies that are trained on them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from data_pipelines.suite.simulator import SuiteSimulator, suite_robot
+from experiments.applications.judging.rollouts import make_starts, run
+from experiments.applications.policies import RandomPolicy, diffusion, find_task, load_policy, record, save_policy
+from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, init_bc, train_bc
+from experiments.applications.policies.demonstrations import load_demonstrations, save_demonstrations
+from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, init_diffusion
+from experiments.applications.policies.learning import FitConfig, ladder
+from experiments.applications.policies.network import EncoderConfig
+from experiments.applications.policies.scripted import ScriptedPolicy
+from experiments.applications.policies.tasks import held
+from hma_jax.config import ConfigError
+from hma_jax.simulator import Start
+
+SMALL = EncoderConfig(8, (4, 4, 4), 16)
+TASK = find_task("gripper_wood", frames=8)
+ROBOT = suite_robot("gripper_wood", [-2.0] * 4, [2.0] * 4, [0.0] * 4, 1)
+
+
+@pytest.fixture(scope="module")
+def demos():
+    return record(TASK, 24, noise=(0.0, 0.4), image_size=8, after=1, seed=3)
+
+
+def test_demonstrations_are_what_the_simulator_does_under_their_actions():
+    demos = record(TASK, 3, noise=0.2, seed=1)
+    simulator = SuiteSimulator([ROBOT], episodes=3)
+    nothing = np.zeros((0, 4), np.float32)
+    starts = [Start("gripper_wood", demos.images[i, :1], nothing, int(demos.seeds[i])) for i in range(3)]
+    seen = [simulator.reset(starts)]
+    for t in range(TASK.frames - 1):
+        seen.append(simulator.step(list(demos.actions[:, t])))
+    np.testing.assert_array_equal(np.stack(seen, 1), demos.images)
+    assert demos.successes.tolist() == held(demos.reached, TASK.hold).any(1).tolist()
+
+
+def test_experts_succeed_more_often_than_play_and_their_episodes_end_soon_after(demos):
+    play = record(TASK, 24, image_size=8, play=True)
+    assert len(demos) == 24 and demos.successes.mean() > play.successes.mean() + 0.3
+    done = np.flatnonzero(demos.successes)
+    first = held(demos.reached, TASK.hold).argmax(1)
+    assert (demos.lengths[done] == np.minimum(first[done] + 2, TASK.frames)).all()
+    shorter = int(done[demos.lengths[done].argmin()])
+    assert not demos.images[shorter, demos.lengths[shorter] :].any()
+
+
+def test_only_successes_are_recorded_where_that_is_asked(demos):
+    found = record(TASK, 10, noise=0.4, image_size=8, only_successes=True, seed=3)
+    assert len(found) == 10 == len(set(found.seeds.tolist())) and found.successes.all()
+
+
+def test_demonstrations_are_kept_in_a_file(demos, tmp_path):
+    path = tmp_path / "demos.npz"
+    save_demonstrations(demos, path)
+    np.testing.assert_array_equal(load_demonstrations(path).images, demos.images)
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(ConfigError, match="record them again"):
+        load_demonstrations(path)
+
+
+def test_the_scripted_expert_acts_on_the_true_state_and_its_actions_elsewhere_fail():
+    simulator, starts = SuiteSimulator([ROBOT], episodes=6), make_starts(TASK, 6, 64, 1)
+    policy = ScriptedPolicy(TASK, simulator, noise=0.0)
+    good = run(simulator, policy, starts, range(6), TASK)
+    simulator.reset(starts)
+    policy.reset()
+    elsewhere = run(simulator, policy, starts, range(6), TASK, shuffled=True)
+    assert good.reached.any(1).mean() > 0.6 > 0.4 > elsewhere.reached.any(1).mean()
+    assert not good.reached[:, 0].any() and good.images.shape == (6, 9, 64, 64, 3)
+
+
+def test_cloning_learns_and_is_a_function_of_its_seed(demos):
+    config = BcConfig(encoder=SMALL, fit=FitConfig(steps=150, batch=16, keep=(1, 50), learning_rate=5e-3))
+    losses = {}
+    kept = train_bc(demos, config, 1, lambda done, total, note: losses.update({done: float(note.split()[1])}))
+    assert sorted(kept) == [1, 50, 150]
+    assert losses[150] < 0.8 * losses[50]
+    short = BcConfig(encoder=SMALL, fit=FitConfig(steps=1, batch=16))
+    one, again, other = (train_bc(demos, short, seed)[1]["mlp"][0]["w"] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("kind", ["cloned", "diffusion"])
+def test_saved_policies_do_the_same_and_damaged_ones_are_refused(kind, demos, tmp_path):
+    if kind == "cloned":
+        config = BcConfig(encoder=SMALL, chunk=2)
+        policy = ClonedPolicy(config, init_bc(config, 4, 0), scale_of(demos))
+    else:
+        config = DiffusionConfig(encoder=SMALL, samples=2)
+        policy = DiffusionPolicy(config, init_diffusion(config, 4, 0), scale_of(demos))
+    save_policy(policy, tmp_path / "one", {"robot": "gripper_wood"})
+    loaded, images = load_policy(tmp_path / "one"), demos.images[:2, 0]
+    for each in (policy, loaded):
+        each.reset(seeds=[5, 6])
+    first = policy.act(images)
+    np.testing.assert_array_equal(first, loaded.act(images))
+    assert first.shape == (2, 4) and first.dtype == np.float32
+    (tmp_path / "one" / "weights.safetensors").write_bytes(b"x")
+    with pytest.raises(ConfigError, match="train it again"):
+        load_policy(tmp_path / "one")
+
+
+def test_an_episode_that_begins_anew_forgets_its_past_and_the_others_keep_theirs(demos):
+    config = BcConfig(encoder=SMALL, chunk=3, execute=3)
+    policy = ClonedPolicy(config, init_bc(config, 4, 0), scale_of(demos))
+    policy.reset()
+    policy.act(demos.images[:2, 0])
+    policy.reset([0])
+    policy.act(demos.images[:2, 3])
+    np.testing.assert_array_equal(policy._seen[0], demos.images[[0, 0], 3])
+    np.testing.assert_array_equal(policy._seen[1], demos.images[1, [0, 3]])
+    assert [len(left) for left in policy._left] == [2, 1]
+
+
+def test_random_actions_depend_on_the_seed_of_an_episode_alone():
+    policy, images = RandomPolicy(ROBOT, hold=2), np.zeros((2, 8, 8, 3), np.uint8)
+    policy.reset(seeds=[1, 2])
+    first = [policy.act(images) for _ in range(3)]
+    policy.reset(seeds=[2, 1])
+    np.testing.assert_array_equal(policy.act(images), first[0][::-1])
+    np.testing.assert_array_equal(first[0], first[1])
+    assert not np.array_equal(first[1], first[2])
+
+
+def test_denoising_with_the_true_noise_gives_the_chunk(monkeypatch, demos):
+    config = DiffusionConfig(encoder=SMALL, samples=10)
+    params, wanted = init_diffusion(config, 4, 0), jnp.linspace(-1, 1, 16)
+    kept = jnp.asarray(diffusion.signal(config.levels))
+
+    def exact(params, seen, noised, level):
+        share = kept[level.astype(int)][:, None]
+        return (noised - jnp.sqrt(share) * wanted) / jnp.sqrt(1 - share)
+
+    monkeypatch.setattr(diffusion, "denoise", exact)
+    frames = jnp.zeros((2, 2, 8, 8, 3))
+    drawn = diffusion.draw(params, config, frames, jnp.ones((2, 16)))
+    np.testing.assert_allclose(drawn, np.broadcast_to(wanted, (2, 16)), atol=1e-4)
+
+
+def test_a_ladder_has_its_first_and_last_rung():
+    assert ladder(1000, 4, 1) == (1, 10, 100, 1000)
+
+
+@pytest.mark.parametrize("name", ["reach", "hover"])
+def test_another_task_changes_no_frame_and_no_start(name):
+    other, own = (record(find_task("gripper_wood", task, 4), 2) for task in (name, "own"))
+    np.testing.assert_array_equal(other.images[:, 0], own.images[:, 0])
