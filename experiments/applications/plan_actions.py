@@ -243,15 +243,16 @@ def main() -> None:
             if not path.exists():
                 write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
         trials[way] = json.loads(path.read_text())
-    for way, (search_by, where) in PLANNERS.items():
-        trials[way], pace = [], Pace()
-        with step(f"{way}, {settings.starts} episodes") as update:
+    for ways in (tuple(PLANNERS)[:3], tuple(PLANNERS)[3:]):  # those that are compared, start by start; then MPPI
+        trials, pace = trials | {way: [] for way in ways}, Pace()
+        with step(f"{', '.join(ways)}: {settings.starts} episodes each") as update:
             for k, seed in enumerate(seeds.tolist()):
-                path = out / "trials" / f"{way.replace(' ', '_')}-{k}.json"
-                if not path.exists():
-                    write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
-                trials[way].append(json.loads(path.read_text()))
-                update(k + 1, len(seeds), f"episodes{pace(k + 1, len(seeds))}")
+                for way in ways:
+                    path, (search_by, where) = out / "trials" / f"{way.replace(' ', '_')}-{k}.json", PLANNERS[way]
+                    if not path.exists():
+                        write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
+                    trials[way].append(json.loads(path.read_text()))
+                update(k + 1, len(seeds), f"starts{pace(k + 1, len(seeds))}")
         write_results(settings, {name: trials[name] for name in WAYS if name in trials}, out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 

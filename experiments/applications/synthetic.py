@@ -37,6 +37,7 @@ from experiments.applications.generating.conditions import (
     ERRORS,
     FEW,
     KINDS,
+    MOST,
     TRIALS,
     Condition,
     Trials,
@@ -187,7 +188,8 @@ def write_results(settings: Settings, trials: Trials, quality: dict, out: Path) 
     write_table(out / "summary.csv", ["what", "mean", "low", "high"], lines)
     write_file(out / "table.md", markdown(found))
     write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
-    seeds = [[float(np.mean(trials[i, s]["success"])) for s in settings.seeds] for i in range(len(CONDITIONS))]
+    places = range(len(CONDITIONS))
+    seeds = [[float(np.mean(trials[i, s]["success"])) for s in settings.seeds if (i, s) in trials] for i in places]
     named = {one.name: one.success for one in found[: len(CONDITIONS)]}
     draw_conditions(named, seeds, {CONTROL}, {FEW, ALL}, out / "synthetic.png")
 
@@ -221,7 +223,8 @@ def main() -> None:
     simulator = load_simulator(run, episodes=BATCH, history=1)
     data = make_data(settings, simulator, out)
     trials: Trials = {}
-    jobs, pace = [(i, s) for s in settings.seeds for i in range(len(CONDITIONS))], Pace()
+    first = sorted(range(len(CONDITIONS)), key=lambda i: i not in (FEW, ALL, MOST, CONTROL))  # what counts most
+    jobs, pace = [(i, s) for i in first for s in settings.seeds], Pace()
     with step(f"train and judge {len(jobs)} policies") as update:
         for n, (i, seed) in enumerate(jobs):
             path = trials_dir / f"{i}-{seed}.json"

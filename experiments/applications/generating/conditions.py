@@ -46,9 +46,10 @@ FEW, MOST, CONTROL, ALL = 0, 3, 4, 5
 
 def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") -> Panel:
     """Success of every condition, seed and start, or the error by held-out trajectory."""
-    points = [np.array([trials[i, s][what] for s in seeds], float) for i in range(len(CONDITIONS))]
+    own = [tuple(s for s in seeds if (i, s) in trials) for i in range(len(CONDITIONS))]  # a run may be under way
+    points = [np.array([trials[i, s][what] for s in found], float) for i, found in enumerate(own)]
     each = np.arange(points[0].shape[1])
-    return Panel(np.full(len(each), "robot"), each, tuple(points), (seeds,) * len(points))
+    return Panel(np.full(len(each), "robot"), each, tuple(points), tuple(own))
 
 
 def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
@@ -89,6 +90,7 @@ def write_tables(trials: Trials, seeds: tuple[int, ...], out: Path) -> None:
             [c.name, s, k, *(round(value, 5) for value in values)]
             for i, c in enumerate(CONDITIONS)
             for s in seeds
+            if (i, s) in trials
             for k, values in enumerate(zip(*(trials[i, s][name] for name in what), strict=True))
         ]
         write_table(out / path, names, rows)
