@@ -83,7 +83,7 @@ class Settings:
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
     search: SearchConfig = field(default_factory=SearchConfig)
     trajectories: int = 1000  # that the cloned policy was trained on
-    steps: int = 3000
+    steps: int = 2000
     batch: int = 32
     learning_rate: float = 2e-3
 
