@@ -72,8 +72,6 @@ from hma_jax.simulator.simulator import Simulator
 RUN, OUT = Path("experiments/results/simulator"), Path("runs/synthetic")
 
 BATCH = 8
-GIVEN = 1
-"""Recorded frames that a generated trajectory begins with. No policy is trained on them."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +90,8 @@ class Settings:
     steps: int = 2000  # of training, of every policy
     batch: int = 32
     learning_rate: float = 2e-3
+    given: int = 1  # recorded frames that a generated trajectory begins with
+    with_given: bool = False  # policies are trained on these, too
 
     def make_task(self) -> Task:
         return find_task(self.robot, self.task, self.frames, self.hold)
@@ -107,7 +107,8 @@ def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, 
     for kind, shift in (("generated", 0), ("shuffled", 1)):
         if not sets[kind].exists():
             with step(f"replay actions: {kind}") as update:
-                images = imagine(simulator, settings.robot, recorded, np.roll(recorded.actions, shift, 0), update)
+                actions = np.roll(recorded.actions, shift, 0)
+                images = imagine(simulator, settings.robot, recorded, actions, settings.given, update)
             save_demonstrations(replace(recorded, images=images), sets[kind])
     held_out = out / "held_out.npz"
     if not held_out.exists():
@@ -126,38 +127,42 @@ def record_far(settings: Settings, seed: int = 0) -> Demonstrations:
     return made.take(far)
 
 
-def imagine(simulator: Simulator, robot: str, demos: Demonstrations, actions: np.ndarray, update) -> np.ndarray:
-    """Images as `demos` has them, [N, L, H, W, 3], after the first frames the simulator's under `actions` [N, L, A]."""
+def imagine(
+    simulator: Simulator, robot: str, demos: Demonstrations, actions: np.ndarray, given: int, update
+) -> np.ndarray:
+    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under `actions` [N, L, A]."""
     driven, made = simulator.robot(robot), []
     for first in range(0, len(demos), len(simulator)):
         rows = range(first, min(first + len(simulator), len(demos)))
         batch = [Trajectory(str(i), demos.images[i], np.repeat(actions[i][:, None], driven.stride, 1)) for i in rows]
-        made += replay(simulator, driven, batch, list(rows), GIVEN)
+        made += replay(simulator, driven, batch, list(rows), given)
         update(len(made), len(demos), "trajectories")
     return np.stack(made)
 
 
-def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int) -> Demonstrations:
-    """What one policy is trained on. For one seed fewer trajectories are among the more."""
+def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int, dropped: int) -> Demonstrations:
+    """What one policy is trained on, of generated trajectories without the first `dropped` frames. For one seed fewer
+    trajectories are among the more."""
     order = np.random.default_rng([seed, 21]).permutation(len(data["recorded"]))
     kept, others = order[: condition.recorded], order[condition.recorded : condition.recorded + condition.generated]
     parts = [data["recorded"].take(kept)]
-    return join([*parts, without_given(data[condition.more].take(others))] if len(others) else parts)
+    return join([*parts, without_first(data[condition.more].take(others), dropped)] if len(others) else parts)
 
 
-def without_given(demos: Demonstrations) -> Demonstrations:
-    """The frames that the simulator made, and their actions: the first ones come from the recording."""
+def without_first(demos: Demonstrations, frames: int) -> Demonstrations:
+    """What follows the first frames."""
 
     def later(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x[:, GIVEN:], np.zeros_like(x[:, :GIVEN])], 1)
+        return np.concatenate([x[:, frames:], np.zeros_like(x[:, :frames])], 1)
 
     shifted = {name: later(getattr(demos, name)) for name in ("images", "actions", "reached")}
-    return replace(demos, lengths=demos.lengths - GIVEN, **shifted)
+    return replace(demos, lengths=demos.lengths - frames, **shifted)
 
 
 def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update) -> dict:
     """Trains one policy and judges it: {success, distance} by start, {error} by held-out trajectory."""
-    demos, task = choose(condition, data, seed), settings.make_task()
+    dropped, task = 0 if settings.with_given else settings.given, settings.make_task()
+    demos = choose(condition, data, seed, dropped)
     fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
     config = BcConfig(frames=1, fit=fit)
     params = train_bc(demos, config, seed, update)[settings.steps]
@@ -194,11 +199,11 @@ def write_results(settings: Settings, trials: Trials, quality: dict, out: Path) 
     draw_conditions(named, seeds, {CONTROL}, {FEW, ALL}, out / "synthetic.png")
 
 
-def quality_of(data: Mapping[str, Demonstrations]) -> dict[str, tuple[float, float, float]]:
+def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tuple[float, float, float]]:
     """PSNR in dB against the recording, of the frames after the given ones: mean, low and high over trajectories."""
     found = {}
     for kind in ("generated", "shuffled"):
-        means = psnr(data[kind].images[:, GIVEN:], data["recorded"].images[:, GIVEN:]).mean(1)
+        means = psnr(data[kind].images[:, given:], data["recorded"].images[:, given:]).mean(1)
         names, each = np.full(len(means), kind), np.arange(len(means))
         (interval,) = bootstrap_intervals(Panel(names, each, (means[None],), ((0,),)))
         found[kind] = interval.mean, interval.low, interval.high
@@ -215,6 +220,8 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=Settings.starts)
     parser.add_argument("--seeds", type=int, default=len(Settings.seeds), help="how many")
     parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
+    parser.add_argument("--given", type=int, default=Settings.given, help="recorded frames that others begin with")
+    parser.add_argument("--with-given", action="store_true", help="train on these, too")
     asked = vars(parser.parse_args())
     run, out, seeds = asked.pop("run"), asked.pop("out"), tuple(range(asked.pop("seeds")))
     settings = Settings(seeds=seeds, **asked)
@@ -233,7 +240,7 @@ def main() -> None:
                 report = lambda done, total, said, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {said}")
                 write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
-    write_results(settings, trials, quality_of(data), out)
+    write_results(settings, trials, quality_of(data, settings.given), out)
     draw_strips([data[kind].images[:2] for kind in KINDS], KINDS, out / "frames.png")
     wrote(out / TRIALS, out / ERRORS, out / "summary.csv", out / "table.md", out / "synthetic.png", out / "frames.png")
 

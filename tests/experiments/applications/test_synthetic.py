@@ -34,7 +34,7 @@ DATA = {"recorded": demonstrations(0), "generated": demonstrations(1), "shuffled
 
 
 def test_conditions_are_nested_and_no_recording_is_also_generated():
-    chosen = [choose(c, DATA, seed=3) for c in CONDITIONS]
+    chosen = [choose(c, DATA, 3, 1) for c in CONDITIONS]
     which = [d.actions[:, 0, 0].astype(int).tolist() for d in chosen]
     kinds = [np.bincount(d.images[:, 0, 0, 0, 0], minlength=3).tolist() for d in chosen]
     assert kinds == [[10, 0, 0], [10, 10, 0], [10, 50, 0], [10, 90, 0], [10, 0, 90], [100, 0, 0]]
@@ -45,7 +45,7 @@ def test_conditions_are_nested_and_no_recording_is_also_generated():
     for fewer, more in zip(which[:3], which[1:4], strict=True):
         assert more[: len(fewer)] == fewer
     assert which[MOST] == which[CONTROL] and sorted(which[ALL]) == sorted(which[MOST])
-    assert set(which[FEW]) != set(choose(CONDITIONS[FEW], DATA, seed=4).actions[:, 0, 0].astype(int).tolist())
+    assert set(which[FEW]) != set(choose(CONDITIONS[FEW], DATA, 4, 1).actions[:, 0, 0].astype(int).tolist())
 
 
 def test_the_share_of_the_gap_is_that_of_the_means():
@@ -74,9 +74,9 @@ def from_settings(kind: type, path: Path):
     return from_dict(kind, values)
 
 
-@pytest.mark.skipif(not (RESULTS / "synthetic").exists(), reason="not run yet")
-def test_the_committed_table_of_generated_trajectories_follows_from_its_trials():
-    place = RESULTS / "synthetic"
+@pytest.mark.parametrize("name", ["synthetic", "synthetic_given"])
+def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
+    place = RESULTS / name
     settings, trials = from_settings(Settings, place / "settings.json"), conditions.read_trials(place)
     assert set(trials) == {(i, s) for i in range(len(CONDITIONS)) for s in settings.seeds}
     assert settings.starts >= 50 and len(settings.seeds) >= 3
@@ -84,7 +84,6 @@ def test_the_committed_table_of_generated_trajectories_follows_from_its_trials()
     assert table == (place / "table.md").read_text() and table in (ROOT / "docs" / "generating.md").read_text()
 
 
-@pytest.mark.skipif(not (RESULTS / "planning").exists(), reason="not run yet")
 def test_the_committed_table_of_planners_follows_from_its_trials():
     place = RESULTS / "planning"
     settings = from_settings(plan_actions.Settings, place / "settings.json")
