@@ -10,8 +10,8 @@ Expected: planning in the model comes near to planning in the true simulator, an
 The goal is a picture: the last frame of an expert that began at the same start. Every second frame the planner looks,
 searches and carries out two actions. Cross-entropy method (CEM), MPPI and random shooting look ahead equally often, in
 the learned simulator; the ceiling is CEM that looks ahead in the true one. Success is that of the task, by the true
-simulator's state. The cloned policy was trained on 1000 trajectories of an expert; it sees the mark in the frame and is
-given no picture of the goal.
+simulator's state. The cloned policies were trained on trajectories of an expert at this task; they see the mark in the
+frame and are given no picture of the goal.
 
 Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png.
 """
@@ -65,8 +65,9 @@ PLANNERS: dict[str, tuple[Search, str]] = {
     "random shooting in the model": (plan_shooting, "learned"),
     "MPPI in the model": (plan_mppi, "learned"),
 }
-CLONED, RANDOM = "behaviour cloning", "random actions"
-WAYS = (*PLANNERS, CLONED, RANDOM)
+CLONED = {f"behaviour cloning of {n} trajectories": n for n in (100, 1000)}
+RANDOM = "random actions"
+WAYS = (*PLANNERS, *CLONED, RANDOM)
 NAMES = ["way", "start", "success", "distance", "seconds_per_plan"]
 
 
@@ -82,8 +83,7 @@ class Settings:
     execute: int = 2  # frames from one plan to the next
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
     search: SearchConfig = field(default_factory=SearchConfig)
-    trajectories: int = 1000  # that the cloned policy was trained on
-    steps: int = 2000
+    steps: int = 2000  # of training of the cloned policies
     batch: int = 32
     learning_rate: float = 2e-3
 
@@ -142,8 +142,8 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     """The same starts under a policy that does not plan."""
     task = settings.make_task()
     policy: Policy = RandomPolicy(robot)
-    if way == CLONED:
-        demos = record(task, settings.trajectories, stride=robot.stride, image_size=size, only_successes=True)
+    if way in CLONED:
+        demos = record(task, CLONED[way], stride=robot.stride, image_size=size, only_successes=True)
         fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
         config = BcConfig(frames=1, fit=fit)
         policy = ClonedPolicy(config, train_bc(demos, config, 0, report)[settings.steps], scale_of(demos))
@@ -237,7 +237,7 @@ def main() -> None:
     seeds = start_seeds(settings.make_task(), settings.starts)
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
     trials: dict[str, list[dict]] = {}
-    for way in (CLONED, RANDOM):
+    for way in (*CLONED, RANDOM):
         path = out / "trials" / f"{way.replace(' ', '_')}.json"
         with step(way) as update:
             if not path.exists():
