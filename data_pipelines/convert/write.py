@@ -12,10 +12,11 @@ import os
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from data_pipelines.convert.episode import Conversion, encode
 from data_pipelines.errors import DataError
@@ -77,14 +78,15 @@ def convert(
     *,
     skip_damaged: bool = False,
     shard_bytes: int = SHARD_BYTES,
+    origin: Mapping[str, Any] = {},
     progress: Progress | None = None,
 ) -> Conversion:
     """Writes every episode of `source` into `<out>/<name>/1.0.0`.
 
     The same source and settings again: goes on where it was, or finds it done. With
     `skip_damaged`, which may be added after damage was met, damaged units are left out and
-    counted. Raises UnitError for a damaged unit otherwise, DataError if no episode is left,
-    ConfigError for a name or place that cannot be used.
+    counted. `origin` is what metadata.json says besides. Raises UnitError for a damaged unit
+    otherwise, DataError if no episode is left, ConfigError for a name or place that cannot be used.
     """
     require(
         re.fullmatch(r"[a-z][a-z0-9_]*", name) is not None,
@@ -113,7 +115,7 @@ def convert(
         partial = final.with_name(f".{VERSION}.{mark[:16]}.partial")
         partial.mkdir(exist_ok=True)
         shards = _write_shards(source, partial, skip_damaged, shard_bytes, progress)
-        return _finish(source, partial, final, name, shards, mark)
+        return _finish(source, partial, final, name, shards, {**origin, FINGERPRINT: mark})
 
 
 def _write_shards(
@@ -157,7 +159,7 @@ def _write_shards(
 
 
 def _finish(
-    source: Source, partial: Path, final: Path, name: str, shards: list[_Shard], mark: str
+    source: Source, partial: Path, final: Path, name: str, shards: list[_Shard], metadata: Mapping[str, Any]
 ) -> Conversion:
     episodes = sum(s.records for s in shards)
     left_out = dict(sorted(sum((Counter(s.left_out) for s in shards), Counter()).items()))
@@ -177,7 +179,7 @@ def _finish(
         lengths=[s.records for _, s in kept],
         size=sum(s.size for _, s in kept),
         description=source.description,
-        metadata={FINGERPRINT: mark, "hz": source.hz, "left_out": left_out},
+        metadata={**metadata, "hz": source.hz, "left_out": left_out},
         module="data_pipelines.convert",
     )
     # Without the journal all of it is made again, so it goes last. Hidden files are of writers that were killed.

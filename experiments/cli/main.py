@@ -20,6 +20,7 @@ from experiments.cli.compare import compare
 from experiments.cli.data import app as data
 from experiments.cli.evaluate import evaluate
 from experiments.cli.fit import fit
+from experiments.cli.generate import generate
 from experiments.cli.judge import judge
 from experiments.cli.plan import plan
 from experiments.cli.play import play
@@ -48,6 +49,7 @@ app.command(bench.bench_app, name="bench", help=bench.HELP)
 app.command(name="plan")(plan)
 app.command(name="play")(play)
 app.command(name="check")(check)
+app.command(name="generate")(generate)
 app.command(name="judge")(judge)
 
 

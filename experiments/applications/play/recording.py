@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -70,18 +71,7 @@ class Recording:
 
     def video(self) -> bytes:
         """MP4, enlarged, in the robot's own time."""
-        av = require_module("av")
-        file = io.BytesIO()
-        with av.open(file, "w", format="mp4") as container:
-            stream = container.add_stream("libx264", rate=max(round(self.rate), 1))
-            height, width = (ENLARGED * side for side in self._images[0].shape[:2])
-            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            stream.options = {"crf": "16"}
-            for image in self._images:
-                large = image.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(large, format="rgb24")))
-            container.mux(stream.encode())
-        return file.getvalue()
+        return encode_video(self._images, self.rate)
 
     def dataset(self) -> bytes:
         """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it."""
@@ -110,6 +100,22 @@ class Recording:
                 module="experiments.applications.play",
             )  # fmt: skip
             return _zipped(Path(folder))
+
+
+def encode_video(images: Sequence[np.ndarray], rate: float) -> bytes:
+    """MP4 of frames uint8 [H, W, 3], enlarged, about `rate` of them per second. ConfigError where PyAV is missing."""
+    av = require_module("av")
+    file = io.BytesIO()
+    with av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=max(round(rate), 1))
+        height, width = (ENLARGED * side for side in images[0].shape[:2])
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": "16"}
+        for image in images:
+            large = image.repeat(ENLARGED, 0).repeat(ENLARGED, 1)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(large, format="rgb24")))
+        container.mux(stream.encode())
+    return file.getvalue()
 
 
 def _zipped(folder: Path) -> bytes:

@@ -36,10 +36,10 @@ class ReachMark(Reach):
 
 @dataclass(frozen=True)
 class HoverPuck(ReachMark):
-    """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things. The
-    expert takes small steps, so that its recordings are of the way there."""
+    """The first tool above the puck that is nearest to it, its gripper open; for robots that pass above things."""
 
-    step: float = 0.15  # that the expert moves the tool at once, world units
+    within: float = 0.3  # a little more than a puck's radius
+    step: float = 0.4  # that the expert moves the tool at once, world units
 
     def plan(self, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         target, move = scene.tools.copy(), self._move(scene)

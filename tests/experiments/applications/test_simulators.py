@@ -10,29 +10,14 @@ from experiments.applications import ship as ship_module
 from experiments.applications.ship import ship
 from experiments.applications.simulators import load_simulator, make_simulator
 from hma_jax import Simulator
-from hma_jax.config import ConfigError, DecodeConfig, TrainConfig
-from hma_jax.convert.run_directory import write_run
-from hma_jax.model.embodiments import Embodiment, EmbodimentTable
-from hma_jax.model.hma import declare_model
+from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.simulator.folder import USUAL, find_decode
-from hma_jax.tokenizers.io import save_tokenizer
-from hma_jax.training.runs import Run
-from tests.hma_jax.simulator.small import CONFIG, parts
-
-TABLE = EmbodimentTable((
-    Embodiment("pusher_sand", 2, 2, (0.0, 0.0), (2.0, 2.0)),
-    Embodiment("gripper_wood", 4, 2, (0.5,) * 4, (0.2,) * 4),
-))  # fmt: skip
+from tests.experiments.applications.runs import make_run
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run of two of the suite's robots, with its tokenizer beside it as in a study's directory."""
-    root, tokenizer = tmp_path_factory.mktemp("study"), parts()[1]
-    save_tokenizer(tokenizer, root / "tokenizer")
-    params = declare_model(CONFIG, TABLE).init(0)
-    write_run(Run(CONFIG, TrainConfig(), TABLE, params, 0, {"tokenizer": tokenizer.identity}), root / "model")
-    return root / "model"
+    return make_run(tmp_path_factory.mktemp("study"))
 
 
 def test_robots_of_the_suite_are_described_and_begin_at_held_out_episodes(run):

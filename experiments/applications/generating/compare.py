@@ -1,0 +1,75 @@
+"""Generated trajectories, read back, beside the recordings whose actions they are of."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from experiments.analysis.intervals import Interval, interval_of
+from experiments.applications.generating.source import ACTION, IMAGE
+from experiments.applications.generating.trajectories import Trajectories
+from experiments.applications.play.recording import encode_video
+from hma_jax.evaluation.metrics import psnr
+from hma_jax.evaluation.statistics import mean_and_sem
+
+ORIGIN_KEY = "episode_metadata/file_path"
+
+Progress = Callable[[int, int, str], None]
+
+
+class Pair(NamedTuple):
+    """One generated episode and its recording, uint8 [M, H, W, 3] each."""
+
+    number: int  # of the recording
+    generated: np.ndarray
+    recorded: np.ndarray
+
+
+def read_pairs(directory: Path, recorded: Trajectories) -> Iterator[Pair]:
+    """In the order in which they were written."""
+    source = RldsDataset(directory)
+    for i in range(len(source)):
+        origin = source.record(i, [ORIGIN_KEY])[ORIGIN_KEY][0].decode()
+        number = int(re.search(r"/(\d+)/seed \d+$", origin)[1])
+        images = np.stack(source.episode(i, IMAGE, (ACTION,)).images)
+        yield Pair(number, images, recorded[number].images)
+
+
+def psnr_of(pair: Pair, given: int) -> np.ndarray:
+    """dB of every frame after the `given` ones, [M - given]."""
+    return np.asarray(psnr(pair.generated[given:], pair.recorded[given:]))
+
+
+class Compared(NamedTuple):
+    """PSNR against the recording, the mean of every episode's frames, with its interval over episodes."""
+
+    generated: Interval
+    still: Interval  # of the last given frame, kept
+
+
+def compare(
+    directory: Path, recorded: Trajectories, given: int, clips: int, rate: float, progress: Progress | None = None
+) -> Compared:
+    """Writes `psnr.csv` and the first `clips` episodes as MP4 beside `directory`: recording left, model right."""
+    rows, home, total = [], directory.parent, len(RldsDataset(directory))
+    for i, pair in enumerate(read_pairs(directory, recorded)):
+        still = np.broadcast_to(pair.recorded[given - 1], pair.recorded.shape)
+        rows.append((pair.number, psnr_of(pair, given), psnr_of(pair._replace(generated=still), given)))
+        clip = home / "clips" / f"{pair.number:05d}.mp4"
+        if i < clips and not clip.exists():
+            clip.parent.mkdir(exist_ok=True)
+            write_file(clip, encode_video(np.concatenate([pair.recorded, pair.generated], axis=2), rate))
+        if progress:
+            progress(i + 1, total, "compared")
+    lines = ["episode,frame,psnr,psnr_still"]
+    for number, mine, kept in rows:
+        lines += [f"{number},{given + t},{a:.3f},{b:.3f}" for t, (a, b) in enumerate(zip(mine, kept, strict=True))]
+    write_file(home / "psnr.csv", "\n".join(lines) + "\n")
+    means = np.array([[mine.mean(), kept.mean()] for _, mine, kept in rows])
+    return Compared(*(interval_of(mean_and_sem(column, np.arange(len(column)))) for column in means.T))

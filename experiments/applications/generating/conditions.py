@@ -1,0 +1,120 @@
+"""What policies are trained on to find out what generated trajectories are worth, and what is made of the outcomes."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals, resample
+from experiments.analysis.intervals import Interval
+from experiments.applications.tables import write_table
+
+Trials = dict[tuple[int, int], dict[str, list[float]]]
+"""{(place of the condition, seed): {success and distance by start, error by held-out trajectory}}."""
+
+
+class Condition(NamedTuple):
+    """What a policy is trained on: so many recorded trajectories, and so many of the kind `more`."""
+
+    name: str
+    recorded: int
+    generated: int = 0
+    more: str = "generated"
+
+
+CONDITIONS = (
+    Condition("10 recorded", 10),
+    Condition("10 + 10 generated", 10, 10),
+    Condition("10 + 50 generated", 10, 50),
+    Condition("10 + 90 generated", 10, 90),
+    Condition("10 + 90, other actions", 10, 90, "shuffled"),
+    Condition("100 recorded", 100),
+)
+
+TRIALS, STARTS = "trials.csv", ["condition", "seed", "start", "success", "distance"]
+ERRORS, HELD_OUT = "errors.csv", ["condition", "seed", "trajectory", "error"]
+
+KINDS = ("recorded", "generated", "shuffled")
+
+FEW, MOST, CONTROL, ALL = 0, 3, 4, 5
+"""Places in `CONDITIONS` that the share of the gap is made of."""
+
+
+def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") -> Panel:
+    """Success of every condition, seed and start, or the error by held-out trajectory."""
+    own = [tuple(s for s in seeds if (i, s) in trials) for i in range(len(CONDITIONS))]  # a run may be under way
+    points = [np.array([trials[i, s][what] for s in found], float) for i, found in enumerate(own)]
+    each = np.arange(points[0].shape[1])
+    return Panel(np.full(len(each), "robot"), each, tuple(points), tuple(own))
+
+
+def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
+    """Which share of the gap between few and all recorded trajectories condition `at` closes; the interval holds 95 %
+    of the draws over seeds and starts."""
+    found = resample(panel, draws)
+
+    def share(points: np.ndarray) -> np.ndarray:
+        gap = points[..., ALL] - points[..., FEW]
+        return (points[..., at] - points[..., FEW]) / np.where(np.abs(gap) < 1e-9, np.nan, gap)
+
+    drawn = share(found.drawn)
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return Interval(float(share(found.value)), float(np.nanstd(drawn)), float(low), float(high))
+
+
+class Summary(NamedTuple):
+    """One condition, or how much of the gap from few to all recorded trajectories it closes."""
+
+    name: str
+    success: Interval
+    error: Interval
+
+
+def summarise(trials: Trials, seeds: tuple[int, ...]) -> list[Summary]:
+    """Every condition; then which share of the gap 90 generated trajectories close, and 90 of the control."""
+    panels = [make_panel(trials, seeds, what) for what in ("success", "error")]
+    found = [Summary(c.name, *both) for c, *both in zip(CONDITIONS, *map(bootstrap_intervals, panels), strict=True)]
+    for name, at in (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL)):
+        found.append(Summary(name, *(share_closed(panel, at) for panel in panels)))
+    return found
+
+
+def write_tables(trials: Trials, seeds: tuple[int, ...], out: Path) -> None:
+    """All outcomes, as `read_trials` reads them."""
+    for path, names, what in ((TRIALS, STARTS, ("success", "distance")), (ERRORS, HELD_OUT, ("error",))):
+        rows = [
+            [c.name, s, k, *(round(value, 5) for value in values)]
+            for i, c in enumerate(CONDITIONS)
+            for s in seeds
+            if (i, s) in trials
+            for k, values in enumerate(zip(*(trials[i, s][name] for name in what), strict=True))
+        ]
+        write_table(out / path, names, rows)
+
+
+def markdown(found: Sequence[Summary]) -> str:
+    """The table that docs/generating.md shows; an interval of a rate ends at 0 and 1."""
+    lines = ["| trained on | success | 95 % interval | action error | 95 % interval |", "|---|---|---|---|---|"]
+    for one in found:
+        low, high = one.success.low, one.success.high
+        if not one.name.startswith("share"):
+            low, high = max(low, 0.0), min(high, 1.0)
+        error = f"{one.error.mean:.3f} | {one.error.low:.3f} to {one.error.high:.3f}"
+        lines.append(f"| {one.name} | {one.success.mean:.2f} | {low:.2f} to {high:.2f} | {error} |")
+    return "\n".join(lines) + "\n"
+
+
+def read_trials(directory: Path) -> Trials:
+    """What the tables say: {(place of the condition, seed): {success, distance, error}}."""
+    places, trials = {c.name: i for i, c in enumerate(CONDITIONS)}, {}
+    for path, what in ((TRIALS, ("success", "distance")), (ERRORS, ("error",))):
+        with open(directory / path, newline="") as file:
+            for row in csv.DictReader(file):
+                one = trials.setdefault((places[row["condition"]], int(row["seed"])), {})
+                for name in what:
+                    one.setdefault(name, []).append(float(row[name]))
+    return trials

@@ -1,0 +1,161 @@
+"""Recorded trajectories at a model's rate: of an RLDS directory, or of a dataset in a study's token store."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from data_pipelines.registry import DatasetSpec, get_spec
+from data_pipelines.sources.open import open_source, source_name
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.source import INSTRUCTION_KEY
+from data_pipelines.tokens.manifest import FILE as MANIFEST
+from data_pipelines.tokens.store import TokenStore
+from hma_jax.config import ConfigError, require
+from hma_jax.simulator.robots import Robot
+
+if TYPE_CHECKING:
+    from hma_jax.tokenizers.shared import BaseTokenizer
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One recorded episode as a model sees it: M frames, and after each the chunk that was executed then."""
+
+    origin: str  # dataset/split/number
+    images: np.ndarray  # uint8 [M, H, W, 3]
+    chunks: np.ndarray  # float32 [M, stride, A], raw; the last one's effect is not seen
+    instruction: str = ""
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+class Trajectories(ABC):
+    """The recorded trajectories of one split, made when they are asked for."""
+
+    name: str  # of the dataset
+    split: str
+    fingerprint: str  # of its contents
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def __getitem__(self, i: int) -> Trajectory:
+        """Raises EpisodeError for an episode that cannot be read."""
+
+    def origin(self, i: int) -> str:
+        return f"{self.name}/{self.split}/{i}"
+
+
+class RldsTrajectories(Trajectories):
+    """Of a dataset in any format that is read where it lies."""
+
+    def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int):
+        """Raises ConfigError for a dataset whose actions are not this robot's."""
+        self._source, self._spec, self._robot, self._size = open_source(directory, split), spec, robot, size
+        self.name, self.split, self.fingerprint = spec.name, split, self._source.fingerprint()
+        _require_fit(spec, robot)
+        self._source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def __getitem__(self, i: int) -> Trajectory:
+        spec = self._spec
+        episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
+        images = np.stack([fit_image(image, self._size) for image in episode.images])
+        said: Sequence[bytes] = ()
+        if INSTRUCTION_KEY in self._source.features:
+            said = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())
+        instruction = said[0].decode(errors="replace") if len(said) else ""
+        return _trajectory(self.origin(i), images, spec.convert(episode.actions), self._robot, instruction)
+
+
+class StoredTrajectories(Trajectories):
+    """Of a token store: its frames where it kept them, otherwise what the tokenizer makes of its tokens."""
+
+    def __init__(self, store: TokenStore, name: str, split: str, tokenizer: BaseTokenizer, robot: Robot):
+        """Raises ConfigError for tokens of another tokenizer, or of frames too far apart."""
+        manifest = store.manifest(name)
+        _require_fit(manifest.spec, robot)
+        made_by = manifest.tokenizer.identity
+        require(
+            made_by == tokenizer.identity,
+            f"{store.root / name} has tokens of tokenizer {made_by}, the model's is {tokenizer.identity}; give the "
+            "RLDS directory that the tokens were made of",
+        )
+        require(
+            robot.stride % manifest.frame_step == 0,
+            f"{store.root / name} keeps every {manifest.frame_step} frames, {robot.name} is shown every "
+            f"{robot.stride}; give the RLDS directory that the tokens were made of",
+        )
+        self._store, self._tokenizer, self._robot = store, tokenizer, robot
+        self._every = robot.stride // manifest.frame_step
+        self.name, self.split, self.fingerprint = name, split, manifest.hash()
+        self._count = len(manifest.split(split).episodes)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, i: int) -> Trajectory:
+        episode = self._store.episode(self.name, self.split, i)
+        if episode.frames is not None and episode.frames.shape[1:3] == self._tokenizer.image_shape:
+            images = np.array(episode.frames[:: self._every])
+        else:
+            images = np.asarray(self._tokenizer.decode(np.array(episode.tokens[:: self._every])))
+        return _trajectory(self.origin(i), images, episode.actions, self._robot, "")
+
+
+def open_trajectories(
+    place: str, split: str, robot: Robot | None, robots: dict[str, Robot], tokenizer: BaseTokenizer, stores: Path
+) -> tuple[Trajectories, Robot]:
+    """The trajectories at `place`, and who replays them: `robot`, or the one that the dataset is called after.
+
+    `place` is a dataset's directory, one of a token store (`STORE/NAME`), or the name of a dataset in the token store
+    `stores`. Raises ConfigError for what is none of them, or of no known robot; DataError for damage.
+    """
+    path = Path(place)
+    if not path.exists() and stores.is_dir() and place in TokenStore(stores).names:
+        path = stores / place
+    stored = (path / MANIFEST).is_file()
+    name = path.name if stored else source_name(place)
+    chosen = robot or robots.get(name)
+    if chosen is None:
+        known = ", ".join(robots)
+        raise ConfigError(f"{place} is called {name!r}, but the model's robots are {known}; name one with --robot")
+    if stored:
+        return StoredTrajectories(TokenStore(path.parent), name, split, tokenizer, chosen), chosen
+    return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size), chosen
+
+
+def _require_fit(spec: DatasetSpec, robot: Robot) -> None:
+    require(
+        spec.action_dim == robot.action_dim,
+        f"{spec.name} has {spec.action_dim} action values, {robot.name} takes {robot.action_dim}; name the robot whose "
+        "actions they are with --robot",
+    )
+    require(
+        not robot.hz or robot.hz == spec.hz,
+        f"{spec.name} was recorded at {spec.hz:g} Hz, the model knows {robot.name} at {robot.hz:g} Hz",
+    )
+
+
+def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Robot, instruction: str) -> Trajectory:
+    """Frames every `stride` native steps, and all actions between them; of a last chunk that is not whole, the last
+    action is held."""
+    missing = len(images) * robot.stride - len(actions)
+    held = np.concatenate([actions, np.repeat(actions[-1:], max(missing, 0), 0)])[: len(images) * robot.stride]
+    chunks = held.reshape(len(images), robot.stride, robot.action_dim).astype(np.float32)
+    return Trajectory(origin, images, chunks, instruction)
+
+
+def describe(trajectories: Trajectories) -> dict[str, Any]:
+    """What tells these recordings from others."""
+    return {"dataset": trajectories.name, "split": trajectories.split, "contents": trajectories.fingerprint}

@@ -1,0 +1,261 @@
+"""What a learned simulator is worth to a planner.
+
+Question: does a planner that looks ahead in the model reach goals in the true simulator?
+Paper: left for later there.
+Command: python -m experiments.applications.plan_actions
+Cost: half an hour of one core; goes on where it was stopped.
+Expected: planning in the model comes near to planning in the true simulator, and both are above cloned and random
+          actions.
+
+The goal is a picture: the last frame of an expert that began at the same start. Every second frame the planner looks,
+searches and carries out two actions. Cross-entropy method (CEM), MPPI and random shooting look ahead equally often, in
+the learned simulator; the ceiling is CEM that looks ahead in the true one. Success is that of the task, by the true
+simulator's state. The cloned policies were trained on trajectories of an expert at this task; they see the mark in the
+frame and are given no picture of the goal.
+
+Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.suite.environment import Environment
+from data_pipelines.suite.spec import EmbodimentSpec
+from data_pipelines.suite.world import World
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.intervals import Interval
+from experiments.applications.planning.cem import plan_cem
+from experiments.applications.planning.control import Planner, Search
+from experiments.applications.planning.goals import to_picture
+from experiments.applications.planning.models import CONTEXT, LearnedModel, Model, TrueModel
+from experiments.applications.planning.mppi import plan_mppi
+from experiments.applications.planning.search import SearchConfig
+from experiments.applications.planning.shooting import plan_shooting
+from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
+from experiments.applications.policies.closed_loop import gap, run_policy, start_seeds
+from experiments.applications.policies.demonstrations import record
+from experiments.applications.policies.learning import FitConfig
+from experiments.applications.policies.policy import Policy, RandomPolicy
+from experiments.applications.policies.scripted import make_expert, noisy
+from experiments.applications.policies.tasks import Task, find_task, held
+from experiments.applications.simulators import load_simulator
+from experiments.applications.tables import write_table
+from experiments.progress import Pace, step
+from experiments.wrote import wrote
+from hma_jax.simulator.folder import find_decode
+from hma_jax.simulator.robots import Robot
+
+RUN, OUT = Path("experiments/results/simulator"), Path("runs/planning")
+
+PLANNERS: dict[str, tuple[Search, str]] = {
+    "CEM in the true simulator": (plan_cem, "true"),
+    "CEM in the model": (plan_cem, "learned"),
+    "random shooting in the model": (plan_shooting, "learned"),
+    "MPPI in the model": (plan_mppi, "learned"),
+}
+CLONED = {f"behaviour cloning of {n} trajectories": n for n in (100, 1000)}
+RANDOM = "random actions"
+WAYS = (*PLANNERS, *CLONED, RANDOM)
+NAMES = ["way", "start", "success", "distance", "seconds_per_plan"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that the results depend on besides the world model."""
+
+    robot: str = "pusher_sand"
+    task: str = "reach"
+    frames: int = 16
+    hold: int = 6  # frames in a row at the goal, for success
+    starts: int = 30
+    execute: int = 2  # frames from one plan to the next
+    unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
+    search: SearchConfig = field(default_factory=SearchConfig)
+    steps: int = 2000  # of training of the cloned policies
+    batch: int = 32
+    learning_rate: float = 2e-3
+
+    def make_task(self) -> Task:
+        return find_task(self.robot, self.task, self.frames, self.hold)
+
+
+def goal_picture(task: Task, seed: int, size: int) -> np.ndarray:
+    """uint8 [H, W, 3]: what is seen where an expert without imprecision ends, from this start on."""
+    spec = noisy(task, 0.0)
+    world, seen = World(spec, [seed]), Environment(spec)
+    expert = make_expert(world, 0)
+    for _ in range(2 * task.frames):
+        world.step(expert.act().astype(np.float64))
+    seen.set_state(world.state)
+    return fit_image(seen.render(), size)
+
+
+def run_planner(search: Search, model: Model, robot: Robot, settings: Settings, seed: int, size: int) -> dict:
+    """One episode, until it is decided: {success, distance then, seconds of a plan}."""
+    task, seen = settings.make_task(), Environment(settings.make_task().spec)
+    seen.reset(seed)
+    cost = to_picture(goal_picture(task, seed, size))
+    planner = Planner(search, settings.search, model, robot, cost, seed % 2**32)
+    images, actions, reached, seconds = [fit_image(seen.render(), size)], [], [seen.success()], []
+    left: list[np.ndarray] = []
+    while not decided(reached, task):
+        if not left:
+            began = time.perf_counter()
+            model.begin(images[-CONTEXT:], actions[len(actions) + 1 - min(len(images), CONTEXT) :], seen.get_state())
+            left = list(planner.plan(settings.execute))
+            seconds.append(time.perf_counter() - began)
+        actions.append(left.pop(0))
+        for _ in range(robot.stride):
+            seen.step(actions[-1])
+        images.append(fit_image(seen.render(), size))
+        reached.append(seen.success())
+    success = bool(held(np.array([reached]), task.hold).any())
+    return {"success": success, "distance": distance_of(task.spec, seen), "seconds": float(np.median(seconds))}
+
+
+def decided(reached: Sequence[bool], task: Task) -> bool:
+    """Whether the goal was held long enough, or there is no time left for that."""
+    run = next((i for i, done in enumerate(reversed(reached)) if not done), len(reached))
+    return run >= task.hold or task.frames - len(reached) < task.hold - run
+
+
+def distance_of(spec: EmbodimentSpec, seen: Environment) -> float:
+    state = seen.get_state()
+    world = World(spec, state.seeds)
+    world.state = state
+    return float(gap(world)[0])
+
+
+def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report) -> list[dict]:
+    """The same starts under a policy that does not plan."""
+    task = settings.make_task()
+    policy: Policy = RandomPolicy(robot)
+    if way in CLONED:
+        demos = record(task, CLONED[way], stride=robot.stride, image_size=size, only_successes=True)
+        fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
+        config = BcConfig(frames=1, fit=fit)
+        policy = ClonedPolicy(config, train_bc(demos, config, 0, report)[settings.steps], scale_of(demos))
+    found = run_policy(task, policy, seeds, size, robot.stride)
+    return [
+        {"success": bool(s), "distance": float(d), "seconds": 0.0}
+        for s, d in zip(found.success, found.distance, strict=True)
+    ]
+
+
+def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval, float]]:
+    """Success of each way of acting, and seconds per plan (median over starts)."""
+    points = tuple(np.array([[t["success"] for t in found]], float) for found in trials.values())
+    starts = points[0].shape[1]
+    panel = Panel(np.full(starts, "robot"), np.arange(starts), points, ((0,),) * len(points))
+    seconds = [float(np.median([t["seconds"] for t in found])) for found in trials.values()]
+    return list(zip(trials, bootstrap_intervals(panel), seconds, strict=True))
+
+
+def write_results(settings: Settings, trials: Mapping[str, Sequence[dict]], out: Path) -> None:
+    rows = [
+        [way, k, int(t["success"]), f"{t['distance']:.4f}", f"{t['seconds']:.4f}"]
+        for way, found in trials.items()
+        for k, t in enumerate(found)
+    ]
+    write_table(out / "trials.csv", NAMES, rows)
+    found = summarise(trials)
+    summary = [[way, *(f"{x:.4f}" for x in (r.mean, r.low, r.high, seconds))] for way, r, seconds in found]
+    write_table(out / "summary.csv", ["way", "mean", "low", "high", "seconds_per_plan"], summary)
+    write_file(out / "table.md", markdown(found))
+    write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
+    draw(found, out / "planning.png")
+
+
+def markdown(found: Sequence[tuple[str, Interval, float]]) -> str:
+    """The table that docs/planning.md shows."""
+    lines = ["| acting | success | 95 % interval | seconds per plan |", "|---|---|---|---|"]
+    for way, r, seconds in found:
+        took = f"{seconds:.1f}" if seconds else ""
+        lines.append(f"| {way} | {r.mean:.2f} | {max(r.low, 0.0):.2f} to {min(r.high, 1.0):.2f} | {took} |")
+    return "\n".join(lines) + "\n"
+
+
+def read_trials(path: Path) -> dict[str, list[dict]]:
+    """What trials.csv says."""
+    trials: dict[str, list[dict]] = {}
+    with open(path, newline="") as file:
+        for row in csv.DictReader(file):
+            success, (distance, seconds) = row["success"] == "1", (float(row[name]) for name in NAMES[3:])
+            trials.setdefault(row["way"], []).append({"success": success, "distance": distance, "seconds": seconds})
+    return trials
+
+
+def draw(found: Sequence[tuple[str, Interval, float]], path: Path) -> None:
+    """Success by way of acting, with its interval."""
+    from experiments.report.plot_style import COLOURS, INK, MUTED, STYLE, plt, save
+
+    with plt.rc_context(STYLE):
+        figure, panel = plt.subplots(figsize=(6.4, 2.9), layout="constrained")
+        places, mean = np.arange(len(found))[::-1], np.array([r.mean for _, r, _ in found])
+        low, high = (np.clip([getattr(r, end) for _, r, _ in found], 0, 1) for end in ("low", "high"))
+        colours = [COLOURS["perplexity"] if "in the model" in way else MUTED for way, _, _ in found]
+        panel.barh(places, mean, color=colours, height=0.62)
+        panel.errorbar(mean, places, xerr=[mean - low, high - mean], fmt="none", color=INK, capsize=3)
+        panel.set_yticks(places, [way for way, _, _ in found])
+        panel.set(xlim=(0, 1), xlabel="success in the true simulator")
+        panel.grid(False, axis="y")
+        save(figure, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, nargs="?", default=RUN, help="directory of a training run")
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--robot", default=Settings.robot)
+    parser.add_argument("--task", default=Settings.task, help="reach, or own: what the robot's own recordings do")
+    parser.add_argument("--frames", type=int, default=Settings.frames, help="of an episode")
+    parser.add_argument("--starts", type=int, default=Settings.starts)
+    parser.add_argument("--execute", type=int, default=Settings.execute, help="frames from one plan to the next")
+    parser.add_argument("--candidates", type=int, default=SearchConfig.candidates)
+    parser.add_argument("--iterations", type=int, default=SearchConfig.iterations)
+    parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
+    asked = vars(parser.parse_args())
+    run, out = asked.pop("run"), asked.pop("out")
+    search = SearchConfig(candidates=asked.pop("candidates"), iterations=asked.pop("iterations"))
+    settings = Settings(search=search, **asked)
+    (out / "trials").mkdir(parents=True, exist_ok=True)
+    decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)
+    simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
+    robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
+    seeds = start_seeds(settings.make_task(), settings.starts)
+    models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
+    trials: dict[str, list[dict]] = {}
+    for way in (*CLONED, RANDOM):
+        path = out / "trials" / f"{way.replace(' ', '_')}.json"
+        with step(way) as update:
+            if not path.exists():
+                write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
+        trials[way] = json.loads(path.read_text())
+    for ways in (tuple(PLANNERS)[:3], tuple(PLANNERS)[3:]):  # those that are compared, start by start; then MPPI
+        trials, pace = trials | {way: [] for way in ways}, Pace()
+        with step(f"{', '.join(ways)}: {settings.starts} episodes each") as update:
+            for k, seed in enumerate(seeds.tolist()):
+                for way in ways:
+                    path, (search_by, where) = out / "trials" / f"{way.replace(' ', '_')}-{k}.json", PLANNERS[way]
+                    if not path.exists():
+                        write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
+                    trials[way].append(json.loads(path.read_text()))
+                update(k + 1, len(seeds), f"starts{pace(k + 1, len(seeds))}")
+        write_results(settings, {name: trials[name] for name in WAYS if name in trials}, out)
+    wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
+
+
+if __name__ == "__main__":
+    main()

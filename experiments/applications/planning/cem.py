@@ -1,0 +1,23 @@
+"""The cross-entropy method (Rubinstein 1999): candidates are drawn from a normal distribution that is fitted again and
+again to the best of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from experiments.applications.planning.search import Best, Found, Score, SearchConfig, draw
+
+
+def plan_cem(score: Score, config: SearchConfig, mean: np.ndarray, rng: np.random.Generator) -> Found:
+    """The cheapest sequence seen, from `mean` [K, A] on. The best of a batch is among the candidates of the next."""
+    std, best = np.full(mean.shape, config.spread), Best()
+    for i in range(config.iterations):
+        candidates = draw(rng, mean, std, config.candidates)
+        if i:
+            candidates[-1] = best.plan
+        costs = score(candidates)
+        best.see(candidates, costs)
+        elites = candidates[np.argsort(costs, kind="stable")[: config.elites]]
+        mean = config.momentum * mean + (1 - config.momentum) * elites.mean(0)
+        std = np.maximum(config.momentum * std + (1 - config.momentum) * elites.std(0), config.least)
+    return best.found()

@@ -1,0 +1,92 @@
+"""What all searches share: sequences of actions in units of a robot's range, and how they are spread over frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hma_jax.config import require
+
+Score = Callable[[np.ndarray], np.ndarray]
+"""What sequences [B, K, A] would cost, float [B]: one batch of the model, always of the same size. Less is better."""
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """A sequence is K actions, each held for `hold` frames. Values are in units in which the robot's recorded range is
+    [-1, 1]. A search scores `iterations` batches of B candidates."""
+
+    candidates: int = 16  # B
+    iterations: int = 3
+    knots: int = 3  # K
+    hold: int = 2
+    spread: float = 0.7  # standard deviation of the first candidates
+    elites: int = 4  # of a batch, that the next is drawn around (CEM)
+    momentum: float = 0.1  # share of the former mean and deviation that an update keeps (CEM)
+    temperature: float = 0.3  # of the weights exp(-cost / temperature), costs in their standard deviations (MPPI)
+    least: float = 0.1  # no deviation becomes smaller
+
+    def __post_init__(self):
+        require(self.candidates >= 2, f"a search needs at least 2 candidates, got {self.candidates}")
+        require(
+            self.iterations >= 1 and self.knots >= 1 and self.hold >= 1,
+            "iterations, knots and hold must be at least 1",
+        )
+        require(1 <= self.elites <= self.candidates, f"elites must lie in 1..{self.candidates}, got {self.elites}")
+        require(0 <= self.momentum < 1, f"momentum must lie in [0, 1), got {self.momentum}")
+        require(self.temperature > 0 and self.spread > 0, "temperature and spread must be positive")
+
+    @property
+    def frames(self) -> int:
+        """The horizon, in frames of the model."""
+        return self.knots * self.hold
+
+
+@dataclass(frozen=True)
+class Found:
+    """The end of a search."""
+
+    plan: np.ndarray  # [K, A]
+    cost: float  # that the model said of it
+    costs: np.ndarray  # [iterations]: the least of each batch
+
+
+class Best:
+    """The cheapest sequence so far."""
+
+    def __init__(self) -> None:
+        self.plan, self.cost = np.zeros(0), np.inf
+        self.costs: list[float] = []
+
+    def see(self, candidates: np.ndarray, costs: np.ndarray) -> None:
+        """Raises ConfigError for costs that are not finite."""
+        require(bool(np.isfinite(costs).all()), "the score of a candidate is not finite")
+        i = int(costs.argmin())
+        self.costs.append(float(costs[i]))
+        if costs[i] < self.cost:
+            self.plan, self.cost = candidates[i].copy(), float(costs[i])
+
+    def found(self) -> Found:
+        return Found(self.plan, self.cost, np.array(self.costs))
+
+
+def draw(rng: np.random.Generator, mean: np.ndarray, std: np.ndarray, count: int) -> np.ndarray:
+    """`count` normal sequences around `mean` [K, A], within the range: the first is the mean itself."""
+    drawn = mean + std * rng.standard_normal((count, *mean.shape))
+    drawn[0] = mean
+    return np.clip(drawn, -1.0, 1.0)
+
+
+def shifted(plan: np.ndarray, config: SearchConfig, frames: int) -> np.ndarray:
+    """The mean to begin the next search with, after the first `frames` of `plan` [K, A] were carried out: what is left
+    of it, then its last action."""
+    each = np.repeat(plan, config.hold, axis=0)
+    rest = np.concatenate([each[frames:], np.repeat(each[-1:], frames, 0)])[: config.frames]
+    return rest[:: config.hold]
+
+
+def over_frames(plans: np.ndarray, config: SearchConfig) -> np.ndarray:
+    """[..., K, A] to an action for each frame, [..., K hold, A]."""
+    return np.repeat(plans, config.hold, axis=-2)

@@ -1,0 +1,69 @@
+"""A policy in the true world of its task: many episodes side by side, drawn and stepped together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.suite.appearance import draw_appearance
+from data_pipelines.suite.render import render_frames
+from data_pipelines.suite.rollout import episode_seeds
+from data_pipelines.suite.world import World
+from experiments.applications.policies.policy import Policy
+from experiments.applications.policies.tasks import ReachMark, Task, held
+from hma_jax.config import require
+
+SPLIT = "closed loop"
+"""Starts of these seeds are in no recording."""
+
+MOST_TRIED = 8
+"""Starts that are looked at for each that is far enough from its goal."""
+
+
+class Outcome(NamedTuple):
+    """How n episodes went."""
+
+    success: np.ndarray  # bool [n]: the goal was held
+    distance: np.ndarray  # float [n]: from the goal at the last frame, in halves of the floor's side
+
+
+def start_seeds(task: Task, count: int, seed: int = 0, least: float = 0.0) -> np.ndarray:
+    """int64 [count]: of starts that no recording has, at least so far from the goal. More of them begin with the same
+    ones. Raises ConfigError where there are hardly any."""
+    seeds = episode_seeds(task.spec, MOST_TRIED * count, seed, SPLIT)
+    far = seeds[away_at_start(task, seeds) >= least][:count]
+    require(len(far) == count, f"{task.robot}: hardly a start is {least:g} away from its goal")
+    return far
+
+
+def away_at_start(task: Task, seeds: np.ndarray) -> np.ndarray:
+    """float [n]: how far from the goal the episodes with these seeds begin."""
+    return gap(World(task.spec, seeds))
+
+
+def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, stride: int = 1) -> Outcome:
+    """One episode of `task.frames` frames from each start. A function of its arguments."""
+    world, looks = World(task.spec, seeds), draw_appearance(task.spec, seeds)
+    reached = []
+    policy.reset(seeds=[int(seed) % 2**32 for seed in seeds])
+    for t in range(task.frames):
+        reached.append(world.success())
+        if t == task.frames - 1:
+            break
+        images = render_frames(task.spec, looks, world.goals, world.q, world.objects, np.arange(len(seeds)))
+        if images.shape[1] != image_size:
+            images = np.stack([fit_image(image, image_size) for image in images])
+        actions = policy.act(images).astype(np.float64)
+        for _ in range(stride):
+            world.step(actions)
+    return Outcome(held(np.stack(reached, 1), task.hold).any(1), gap(world))
+
+
+def gap(world: World) -> np.ndarray:
+    """float [n]: how far from the goal, of a robot's own task how far the farthest tool is from its mark."""
+    task = world.spec.task
+    if isinstance(task, ReachMark):
+        return task.away(world)
+    return np.linalg.norm(world.tools - world.goals, axis=-1).max(1)

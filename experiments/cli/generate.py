@@ -1,0 +1,101 @@
+"""`hma generate`: recorded actions replayed in a learned simulator, written as a dataset."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from experiments.progress import Pace, console, step
+from experiments.setting import UNSET, command, require_local, use_entries
+from experiments.wrote import wrote
+from hma_jax.config import ExecutionConfig, require
+
+
+def generate(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    actions: Annotated[str, arg(metavar="DATASET")],
+    out: Annotated[Path, arg(metavar="DIR")],
+    split: str = "train",
+    episodes: Annotated[int | None, arg(metavar="N"), UNSET] = None,
+    robot: Annotated[str | None, UNSET] = None,
+    name: Annotated[str | None, UNSET] = None,
+    given: int = 3,
+    seed: int = 0,
+    batch: int = 8,
+    clips: int = 4,
+    unmask_steps: Annotated[int | None, arg(name="unmask-steps", metavar="M"), UNSET] = None,
+    temperature: Annotated[float | None, UNSET] = None,
+    tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
+) -> None:
+    """Replay recorded actions in a trained model, and write what it shows as an RLDS dataset.
+
+    Every recorded episode begins with its own first frames; all others are the model's. Prints PSNR against the
+    recording. The same command again goes on where it was stopped, and the bytes are the same.
+
+    Args:
+        run: Directory of a training run.
+        actions: Dataset with the recorded episodes: its directory (RLDS, LeRobot, robomimic), a directory of a token
+            store, or the name of a dataset in the token store beside RUN.
+        out: Directory in which NAME/1.0.0 is written, and beside it psnr.csv and clips.
+        split: Of the dataset.
+        episodes: Only the first N.
+        robot: Of the model, that replays them; the one that the dataset is called after if not given.
+        name: Of the new dataset; ROBOT_generated if not given.
+        given: Recorded frames that an episode begins with.
+        seed: Another seed gives other draws of the same episodes.
+        batch: Episodes at once. Part of what the frames depend on, by rounding.
+        clips: So many of the episodes also as MP4, the recording on the left.
+        unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says.
+        temperature: Of drawing tokens, instead of what RUN/decode.json says.
+        tokenizer: That the model was trained with, if it is not beside the run.
+        registry: TOML file with entries of your own.
+    """
+    from data_pipelines.convert.write import convert
+    from experiments.applications.generating.compare import compare
+    from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
+    from experiments.applications.generating.trajectories import open_trajectories
+    from experiments.applications.simulators import load_simulator
+    from experiments.running.workspace import Workspace
+    from hma_jax.simulator.folder import find_decode
+
+    require_local("--out", out)
+    require(given >= 1, f"--given must be at least 1, got {given}")
+    require(batch >= 1, f"--batch must be at least 1, got {batch}")
+    require(episodes is None or episodes >= 1, f"--episodes must be at least 1, got {episodes}")
+    require(0 <= seed < 2**32, f"--seed must lie in [0, 2^32), got {seed}")
+    use_entries(registry)
+    asked = {"unmask_steps": unmask_steps, "temperature": temperature}
+    decode = replace(find_decode(run), **{key: x for key, x in asked.items() if x is not None})
+    simulator = load_simulator(
+        run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch, decode=decode, history=1
+    )
+    robots, stores = dict(simulator.robots), Workspace(run.absolute().parent).store
+    named = simulator.robot(robot) if robot else None
+    recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)
+    count = len(recorded) if episodes is None else min(episodes, len(recorded))
+    mark = checkpoint_hash(run, simulator.model.step)
+    source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)
+    called, pace = name or f"{driven.name}_generated", Pace()
+    with step(f"generate {count} episodes of {driven.name}") as update:
+        done = convert(
+            source, out, called, shard_bytes=SHARD_BYTES, origin=source.origin() | {"run": str(run)},
+            progress=lambda n, total, unit: update(n, total, unit + pace(n, total)),
+        )  # fmt: skip
+    for reason, left in done.left_out.items():
+        console.print(f"left out {left:,} x: {reason}", markup=False, soft_wrap=True)
+    with step("compare with the recordings") as update:
+        found = compare(done.directory, recorded, given, clips, source.hz, update)
+    console.print(
+        f"{done.episodes:,} episodes. PSNR against the recording {found.generated.mean:.2f} dB "
+        f"({found.generated.low:.2f} to {found.generated.high:.2f}, 95 % over episodes); a still picture "
+        f"{found.still.mean:.2f} ({found.still.low:.2f} to {found.still.high:.2f})",
+        soft_wrap=True,
+    )
+    written = [done.directory, done.directory.parent / "psnr.csv"]
+    written += [done.directory.parent / "clips"] if clips else []
+    entry = ("--hz", f"{source.hz:g}", "--entry", f"{called}.toml")
+    wrote(*written, then=command("data inspect", done.directory, *entry))

@@ -1,0 +1,125 @@
+"""`hma generate`: what is replayed, what is written, and that being killed changes nothing."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from data_pipelines.convert import write as convert_module
+from data_pipelines.registry import get_spec
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.suite.generate import generate_suite
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
+from experiments.applications.generating import source as source_module
+from experiments.applications.generating.trajectories import open_trajectories
+from experiments.cli.main import main
+from hma_jax.config import ConfigError
+from hma_jax.simulator import simulator as simulator_module
+from hma_jax.simulator.robots import Robot
+from hma_jax.tokenizers.io import load_tokenizer
+from tests.experiments.applications.runs import TABLE, make_run
+from tests.hma_jax.simulator.conftest import programs
+
+ROBOT = Robot.of(TABLE.entries[0])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("study"))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Five recorded episodes of pusher_sand."""
+    root = tmp_path_factory.mktemp("suite")
+    (directory,) = generate_suite(root, scale=0.01, validation=5, names=["pusher_sand"])
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def compiled_once(monkeypatch):
+    """Simulators of the same run share their programs, and none is tuned for speed."""
+    kept = {}
+
+    def shared(model, tokenizer, episodes, decode):
+        key = tokenizer.identity, episodes, decode
+        return kept.setdefault(key, KEPT.setdefault(key, programs(model, tokenizer, episodes, decode)))
+
+    monkeypatch.setattr(simulator_module, "Programs", shared)
+
+
+KEPT: dict = {}
+
+
+def generate(run, recorded, out, *more: str) -> int:
+    asked = ["--actions", str(recorded), "--split", "val", "--out", str(out), "--batch", "2", "--clips", "0"]
+    return main(["generate", str(run), *asked, *more])
+
+
+def content(out):
+    directory = out / "pusher_sand_generated" / "1.0.0"
+    return {path.name: path.read_bytes() for path in directory.iterdir() if not path.name.startswith(".")}
+
+
+def test_recorded_actions_are_replayed_and_a_killed_command_goes_on(run, recorded, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(source_module, "SHARD_BYTES", 1)  # a shard per batch
+    assert generate(run, recorded, tmp_path / "whole") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "5 episodes. PSNR against the recording" in said and "hma data inspect" in said
+
+    begun = []
+    encode = convert_module.encode
+
+    def dies(episode, layout):
+        begun.append(episode.origin)
+        if len(begun) == 4:  # in the second of three batches
+            raise KeyboardInterrupt
+        return encode(episode, layout)
+
+    monkeypatch.setattr(convert_module, "encode", dies)
+    assert generate(run, recorded, tmp_path / "cut") == 130
+    assert not (tmp_path / "cut" / "pusher_sand_generated" / "1.0.0").exists()
+    assert generate(run, recorded, tmp_path / "cut") == 0
+    assert begun[4:] == [f"generated/pusher_sand/val/{i}/seed {episode_seed(i)}" for i in (2, 3, 4)]
+    assert content(tmp_path / "cut") == content(tmp_path / "whole")
+
+    made = RldsDataset(tmp_path / "whole" / "pusher_sand_generated" / "1.0.0")
+    source = RldsDataset(recorded, "val")
+    metadata = json.loads(content(tmp_path / "whole")["metadata.json"])
+    assert metadata["actions"]["dataset"] == "pusher_sand" and metadata["hz"] == 2.0 and metadata["stride"] == 2
+    assert len(made) == len(source) == 5
+    for i in range(5):
+        mine = made.episode(i, "observation/image", ("action",))
+        truth = open_trajectories(str(recorded), "val", ROBOT, {}, load_tokenizer(run.parent / "tokenizer"), run)[0][i]
+        low, high = np.array(ROBOT.low * 2, np.float32), np.array(ROBOT.high * 2, np.float32)
+        np.testing.assert_array_equal(mine.actions, np.clip(truth.chunks.reshape(len(truth), -1), low, high))
+        apart = np.abs(np.stack(mine.images).astype(int) - truth.images)
+        assert apart[:3].mean() < 6 < apart[3:].mean()  # JPEG; then a model that knows nothing
+
+
+def episode_seed(i: int) -> int:
+    return source_module.episode_seed(0, f"pusher_sand/val/{i}")
+
+
+def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path):
+    tokenizer, robots = load_tokenizer(run.parent / "tokenizer"), {ROBOT.name: ROBOT}
+    tokenize_dataset(get_spec("pusher_sand"), recorded, tokenizer, tmp_path, min_val=1, keep_frames="val")
+    for split in ("train", "val"):
+        stored, robot = open_trajectories("pusher_sand", split, None, robots, tokenizer, tmp_path)
+        assert robot == ROBOT
+        number = int(stored._store.episode("pusher_sand", split, 0).episode)
+        truth = open_trajectories(str(recorded), "train+val", ROBOT, robots, tokenizer, tmp_path)[0][number]
+        np.testing.assert_array_equal(stored[0].chunks, truth.chunks)
+        seen = truth.images if split == "val" else tokenizer.decode(tokenizer.encode(truth.images))
+        np.testing.assert_array_equal(stored[0].images, seen)
+
+
+def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
+    tokenizer = load_tokenizer(run.parent / "tokenizer")
+    gripper = Robot.of(TABLE.entries[1])
+    with pytest.raises(ConfigError, match="2 action values, gripper_wood takes 4"):
+        open_trajectories(str(recorded), "val", gripper, {}, tokenizer, tmp_path)
+    with pytest.raises(ConfigError, match="name one with --robot"):
+        open_trajectories(str(recorded), "val", None, {gripper.name: gripper}, tokenizer, tmp_path)

@@ -1,0 +1,115 @@
+"""Planners: searches on functions whose least is known, models against what they model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_pipelines.suite.environment import Environment
+from experiments.applications.planning.cem import plan_cem
+from experiments.applications.planning.control import Planner, Units
+from experiments.applications.planning.goals import to_picture
+from experiments.applications.planning.models import LearnedModel, TrueModel
+from experiments.applications.planning.mppi import plan_mppi
+from experiments.applications.planning.search import SearchConfig, over_frames, shifted
+from experiments.applications.planning.shooting import plan_shooting
+from experiments.applications.policies.tasks import find_task
+from hma_jax.config import ConfigError
+from hma_jax.simulator.robots import Robot
+from tests.hma_jax.simulator.small import ROBOTS, simulator
+
+CONFIG = SearchConfig(candidates=16, iterations=4, knots=3, hold=2)
+TARGET = np.array([[0.6, -0.5], [0.1, 0.4], [-0.7, 0.2]])
+
+
+def search(by, seed: int = 0, config: SearchConfig = CONFIG):
+    """(distance of the plan from the least, candidates scored)."""
+    batches = []
+
+    def score(candidates: np.ndarray) -> np.ndarray:
+        batches.append(candidates)
+        return ((candidates - TARGET) ** 2).sum((1, 2))
+
+    found = by(score, config, np.zeros_like(TARGET), np.random.default_rng(seed))
+    assert [len(b) for b in batches] == [config.candidates] * config.iterations
+    assert all(np.abs(b).max() <= 1 for b in batches) and len(found.costs) == config.iterations
+    return float(((found.plan - TARGET) ** 2).sum()), np.stack(batches)
+
+
+def test_searches_that_learn_from_their_batches_beat_shooting():
+    reached = {by: np.mean([search(by, seed)[0] for seed in range(8)]) for by in (plan_cem, plan_mppi, plan_shooting)}
+    assert reached[plan_cem] < 0.5 * reached[plan_shooting]
+    assert reached[plan_mppi] < 0.5 * reached[plan_shooting]
+    np.testing.assert_array_equal(search(plan_cem, 3)[1], search(plan_cem, 3)[1])
+
+
+def test_a_cost_that_is_not_finite_is_no_plan():
+    with pytest.raises(ConfigError, match="not finite"):
+        plan_cem(lambda c: np.full(len(c), np.nan), CONFIG, np.zeros((3, 2)), np.random.default_rng(0))
+
+
+def test_the_next_search_begins_with_what_is_left_of_the_plan():
+    plan = np.array([[1.0], [2.0], [3.0]])
+    np.testing.assert_array_equal(shifted(plan, CONFIG, 2), [[2.0], [3.0], [3.0]])
+    np.testing.assert_array_equal(shifted(plan, CONFIG, 6), [[3.0], [3.0], [3.0]])
+    np.testing.assert_array_equal(over_frames(plan, CONFIG)[:, 0], [1, 1, 2, 2, 3, 3])
+
+
+def test_units_span_the_recorded_range():
+    units = Units.of(Robot("r", 1, (0.0, -3.0), (4.0, 1.0), (0.0, 0.0)))
+    np.testing.assert_allclose(units.raw(np.array([[-1.0, -1.0], [1.0, 1.0]])), [[0.0, -3.0], [4.0, 1.0]])
+    np.testing.assert_allclose(units.raw(units.rest), [0.0, 0.0])
+
+
+def test_the_true_model_sees_what_the_robot_would():
+    task = find_task("pusher_sand", "reach")
+    robot, seen = Robot("pusher_sand", 1, (-8.0, -8.0), (8.0, 8.0), (0.0, 0.0)), Environment(task.spec)
+    actions = np.random.default_rng(0).uniform(-8, 8, (2, 3, 2)).astype(np.float32)
+    model = TrueModel(task.spec, robot, 64)
+    seen.reset(5)
+    began = seen.get_state()
+    model.begin([], [], began)
+    imagined = model.imagine(actions)
+    for b in range(2):
+        seen.set_state(began)
+        for t in range(3):
+            seen.step(actions[b, t])
+            np.testing.assert_array_equal(imagined[b, t], seen.render())
+
+
+def test_a_planner_in_the_true_simulator_goes_where_the_picture_says():
+    """The same picture distance as in the model; the head is brought from its start to where it was shown."""
+    task = find_task("pusher_sand", "reach")
+    robot, seen = Robot("pusher_sand", 1, (-8.8, -8.8), (8.8, 8.8), (0.0, 0.0)), Environment(task.spec)
+    seen.reset(7)
+    began = seen.get_state()
+    for action in [(-8.0, 6.0)] * 5 + [(0.0, 0.0)] * 2:
+        seen.step(np.array(action, np.float32))
+    goal, there = seen.render(), seen.positions()[0]
+    seen.set_state(began)
+    model = TrueModel(task.spec, robot, 64)
+    planner = Planner(plan_cem, SearchConfig(), model, robot, to_picture(goal), seed=1)
+    away = np.linalg.norm(seen.positions()[0] - there)
+    for _ in range(4):
+        model.begin([], [], seen.get_state())
+        for action in planner.plan(2):
+            seen.step(action)
+    assert np.linalg.norm(seen.positions()[0] - there) < 0.2 * away
+
+
+def test_the_learned_model_imagines_again_from_the_same_present(monkeypatch):
+    from tests.hma_jax.simulator.conftest import programs
+
+    monkeypatch.setattr("hma_jax.simulator.simulator.Programs", programs)
+    robot, rng = ROBOTS[0], np.random.default_rng(0)
+    model = LearnedModel(simulator(episodes=2, history=1), robot)
+    images = list(rng.integers(0, 256, (5, 8, 8, 3), np.uint8))
+    given = list(rng.uniform(robot.low, robot.high, (4, robot.action_dim)).astype(np.float32))
+    first, other = rng.uniform(robot.low, robot.high, (2, 2, 3, robot.action_dim)).astype(np.float32)
+    first[1] = first[0]
+    model.begin(images, given, None)
+    imagined = model.imagine(first)
+    np.testing.assert_array_equal(imagined[0], imagined[1])  # candidates share their seed
+    assert (model.imagine(other) != imagined).any()
+    np.testing.assert_array_equal(model.imagine(first), imagined)
+    assert (to_picture(imagined[0, -1])(imagined) < to_picture(255 - imagined[0, -1])(imagined)).all()

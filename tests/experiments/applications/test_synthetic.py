@@ -1,0 +1,93 @@
+"""What generated trajectories are worth: who is trained on what, and what is made of the outcomes."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.applications import plan_actions
+from experiments.applications.generating import conditions
+from experiments.applications.generating.conditions import ALL, CONDITIONS, CONTROL, FEW, MOST, share_closed
+from experiments.applications.plan_actions import decided
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.tasks import find_task
+from experiments.applications.synthetic import Settings, choose
+from hma_jax.config.json import from_dict
+
+ROOT = Path(__file__).parents[3]
+RESULTS = ROOT / "experiments" / "results"
+
+
+def demonstrations(kind: int, count: int = 100) -> Demonstrations:
+    """Episodes of one pixel that says of which kind they are, and an action that says which one it is."""
+    images = np.full((count, 3, 1, 1, 3), kind, np.uint8)
+    actions, ones = np.repeat(np.arange(count, dtype=np.float32), 3).reshape(count, 3, 1), np.ones(count, int)
+    images[:, 0] = 0  # the frame that a generated trajectory is given is a recorded one
+    return Demonstrations(images, actions, 3 * ones, np.ones((count, 3), bool), ones > 0, ones)
+
+
+DATA = {"recorded": demonstrations(0), "generated": demonstrations(1), "shuffled": demonstrations(2)}
+
+
+def test_conditions_are_nested_and_no_recording_is_also_generated():
+    chosen = [choose(c, DATA, 3, 1) for c in CONDITIONS]
+    which = [d.actions[:, 0, 0].astype(int).tolist() for d in chosen]
+    kinds = [np.bincount(d.images[:, 0, 0, 0, 0], minlength=3).tolist() for d in chosen]
+    assert kinds == [[10, 0, 0], [10, 10, 0], [10, 50, 0], [10, 90, 0], [10, 0, 90], [100, 0, 0]]
+    assert all(len(set(w)) == len(w) for w in which)
+    for d, c in zip(chosen, CONDITIONS, strict=True):  # of a generated trajectory two frames, none of them recorded
+        assert d.lengths.tolist() == [3] * c.recorded + [2] * c.generated
+        assert (d.images[c.recorded :, :2] > 0).all()
+    for fewer, more in zip(which[:3], which[1:4], strict=True):
+        assert more[: len(fewer)] == fewer
+    assert which[MOST] == which[CONTROL] and sorted(which[ALL]) == sorted(which[MOST])
+    assert set(which[FEW]) != set(choose(CONDITIONS[FEW], DATA, 4, 1).actions[:, 0, 0].astype(int).tolist())
+
+
+def test_the_share_of_the_gap_is_that_of_the_means():
+    seeds, rng = (0, 1, 2), np.random.default_rng(0)
+    rates = (0.2, 0.3, 0.5, 0.7, 0.25, 0.8)
+    trials = {
+        (i, s): {"success": rng.random(400) < rate, "distance": np.zeros(400)}
+        for i, rate in enumerate(rates)
+        for s in seeds
+    }
+    panel = conditions.make_panel(trials, seeds)
+    share, control = share_closed(panel, MOST), share_closed(panel, CONTROL)
+    assert share.mean == pytest.approx(0.83, abs=0.08) and share.low < 0.83 < share.high < share.low + 0.4
+    assert control.high < share.low
+
+
+def test_an_episode_ends_when_nothing_can_change_its_outcome():
+    task = find_task("pusher_sand", "reach", frames=16, hold=6)
+    assert decided([False] * 4 + [True] * 6, task) and not decided([False] * 4 + [True] * 5, task)
+    assert decided([False] * 11, task) and not decided([False] * 10, task)
+    assert not decided([False] * 10 + [True] * 5, task) and decided([False] * 10 + [True, False], task)
+
+
+def from_settings(kind: type, path: Path):
+    assert set(values := json.loads(path.read_text())) == {f.name for f in fields(kind)}
+    return from_dict(kind, values)
+
+
+@pytest.mark.parametrize("name", ["synthetic", "synthetic_given"])
+def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
+    place = RESULTS / name
+    settings, trials = from_settings(Settings, place / "settings.json"), conditions.read_trials(place)
+    assert set(trials) == {(i, s) for i in range(len(CONDITIONS)) for s in settings.seeds}
+    assert settings.starts >= 50 and len(settings.seeds) >= 3
+    table = conditions.markdown(conditions.summarise(trials, settings.seeds))
+    assert table == (place / "table.md").read_text() and table in (ROOT / "docs" / "generating.md").read_text()
+
+
+def test_the_committed_table_of_planners_follows_from_its_trials():
+    place = RESULTS / "planning"
+    settings = from_settings(plan_actions.Settings, place / "settings.json")
+    trials = plan_actions.read_trials(place / "trials.csv")
+    assert {len(found) for found in trials.values()} == {settings.starts} and settings.starts >= 30
+    table = plan_actions.markdown(plan_actions.summarise(trials))
+    assert table == (place / "table.md").read_text() and table in (ROOT / "docs" / "planning.md").read_text()
