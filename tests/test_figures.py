@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from pathlib import Path
@@ -100,6 +101,17 @@ def test_the_shipped_model_is_as_good_as_readme_says():
         f"other actions {shuffled:.1f}; {report['frames_per_second']:.0f} frames a second"
     )
     assert said in " ".join(README.read_text().split())
+
+
+def test_policies_and_plans_in_the_shipped_model_are_as_readme_says():
+    judged = json.loads((ROOT / "experiments/results/judge-pusher_sand/agreement.json").read_text())
+    r = judged["agreement"]["learned model"]["policies and starts"]["pearson"]
+    with open(ROOT / "experiments/results/planning/summary.csv") as file:
+        success = {row["way"]: float(row["mean"]) for row in csv.DictReader(file)}
+    plans, shooting = success["CEM in the model"], success["random shooting in the model"]
+    text = " ".join(README.read_text().split())
+    assert len(judged["policies"]) == 9 and f"r = {r['mean']:.2f} ({r['low']:.2f} to {r['high']:.2f})" in text
+    assert f"reach {100 * plans:.0f} % of marks, random shooting {100 * shooting:.0f} %" in text
 
 
 def test_readme_is_read_in_a_few_minutes():
