@@ -25,6 +25,7 @@ from experiments.applications.judging.outcomes import SHUFFLED, TRUE, WORLDS, Ou
 from experiments.applications.judging.rollouts import Rollout, load_rollout, make_starts, run, save_rollout
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
 from experiments.applications.policies.learning import Report
+from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, held
 from experiments.applications.simulators import has_truth, load_simulator, true_simulator
 from hma_jax.config import require
@@ -99,12 +100,13 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     starts = make_starts(task, config.starts, size, stride)
     true = true_simulator(simulator, [robot], config.batch)
     seeds = [config.seed + i for i in range(len(starts))]
+    acting: dict[str, Policy] = {}  # what was compiled for one world serves the next
     for world in WORLDS:
         for name in policies:
             path = _place(out, name, world)
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                policy = find_policy(out / "policies", name, robot, simulator)
+                policy = acting[name] = acting.get(name) or find_policy(out / "policies", name, robot, simulator)
                 with step(f"{name} in the {world} world") as report:
                     made = run(
                         true if world == TRUE else simulator, policy, starts, seeds, task,
