@@ -47,18 +47,20 @@ def judge(
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's.
         demonstrations: Episodes of the scripted expert that the policies are trained on.
-        steps: Of training of each kind of policy.
+        steps: Of training of each kind of policy, and of the success head.
         cloned: Checkpoints of behaviour cloning.
         diffusion: Checkpoints of the Diffusion Policy.
         seed: Of recordings, training and episodes.
         labels: Saved by the blind page: only says how often that person agrees with the judges of --out.
     """
     from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
+    from experiments.applications.judging.head import HeadConfig
     from experiments.applications.judging.judge import JudgeConfig, judge_run
     from experiments.applications.judging.ladder import LadderConfig
     from experiments.applications.judging.outcomes import read_outcomes, write_outcomes
     from experiments.applications.judging.page import draw_scatter, write_page
     from experiments.applications.judging.summary import summarise, write_summary
+    from experiments.applications.policies.learning import FitConfig
     from experiments.applications.policies.tasks import find_task
 
     if labels is not None:
@@ -71,14 +73,25 @@ def judge(
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     ladder = replace(LadderConfig(), cloned=cloned, diffusion=diffusion, steps=steps)
     config = JudgeConfig(
-        find_task(robot, task, frames), starts, batch or starts, seed, demonstrations=demonstrations, ladder=ladder
+        find_task(robot, task, frames),
+        starts,
+        batch or starts,
+        seed,
+        demonstrations=demonstrations,
+        ladder=ladder,
+        head=HeadConfig(fit=FitConfig(steps=steps)),
     )
     judged = judge_run(run, out, config, step)
     summary = summarise(judged)
     write_outcomes(judged.outcomes, out / "outcomes.csv")
     write_summary(summary, out / "agreement.json")
     draw_scatter(summary, out / "scatter.png")
-    page = write_page(judged, summary, out, f"hma judge {run} --robot {robot} --task {task} --out {out}")
+    command = (
+        f"hma judge {run} --robot {robot} --task {task} --starts {starts} --frames {config.task.frames} "
+        f"--demonstrations {demonstrations} --steps {steps} --cloned {cloned} --diffusion {diffusion} --seed {seed} "
+        f"--out {out}"
+    )
+    page = write_page(judged, summary, out, command)
     blind = write_blind(judged, out)
     _say(summary)
     then = f"label the clips of {blind}, and the same command with --labels labels.json"

@@ -18,7 +18,7 @@ from experiments.report.pieces import data_uri, picture, section, table
 from experiments.report.plot_style import INK, MUTED, STYLE, save
 from experiments.report.style import CSS
 
-CLIPS = 9
+CLIPS = 6
 """Episodes that are shown."""
 
 
