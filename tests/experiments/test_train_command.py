@@ -71,7 +71,9 @@ def test_checkpoints_are_saved_by_the_minute_and_kept_as_asked_for(train, tmp_pa
     assert list_steps(tmp_path / "run" / "checkpoints") == [2, 3, 4, 5]
 
 
-@pytest.mark.parametrize(("asked", "steps"), [("", list(range(2, 41, 2))), ("30", [30, 40]), ("0", [])])
+@pytest.mark.parametrize(
+    ("asked", "steps"), [("", list(range(2, 41, 2))), pytest.param("30", [30, 40], marks=pytest.mark.slow), ("0", [])]
+)
 def test_held_out_windows_are_looked_at_as_often_as_asked_for_and_shown(asked, steps, train, tmp_path):
     train("--set", "train.steps=40", *(["--validate-every", asked] if asked else []))
     file = tmp_path / "run" / "validation.jsonl"

@@ -26,8 +26,8 @@ def keep_small_programs():
     jax.config.update(name, before)
 
 
-VARIANTS = {"08e_mar_mup_unit_width"}
-"""Cases that say little beyond another one; `make test-slow` has them."""
+VARIANTS = {"08d_mar_joint_actions", "08e_mar_mup_unit_width"}
+"""Cases that say little beyond others (of 08d: 08c its sampler, 07 its joint actions); `make test-slow` has them."""
 
 
 @pytest.mark.exact

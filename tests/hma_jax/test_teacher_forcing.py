@@ -23,8 +23,15 @@ def make(**changes) -> tuple[HMA, dict[str, jax.Array]]:
     return declared.merge(params), jax.tree.map(jnp.asarray, random_batch(0, config, 3))
 
 
-@pytest.mark.parametrize("alignment", ["causal", "released"])
-@pytest.mark.parametrize("diffusion", [None, DIFFUSION])
+@pytest.mark.parametrize(
+    ("diffusion", "alignment"),
+    [
+        (None, "causal"),
+        (DIFFUSION, "released"),
+        pytest.param(None, "released", marks=pytest.mark.slow),
+        pytest.param(DIFFUSION, "causal", marks=pytest.mark.slow),
+    ],
+)
 def test_of_wholly_masked_frames_it_is_the_loss_of_what_generation_is_asked_first(diffusion, alignment):
     model, batch = make(diffusion=diffusion, action_alignment=alignment)
     tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])

@@ -103,6 +103,7 @@ def test_a_checkpoint_of_another_configuration_is_refused_by_name(tmp_path: Path
         train(tmp_path, provenance={"data": "other"})
 
 
+@pytest.mark.slow  # resuming exactly is tested after errors and kills, what a signal does in test_faults
 @pytest.mark.exact
 def test_a_stop_request_saves_first_and_resumes_exactly(tmp_path: Path, unbroken):
     def stop_at_three(step: int, steps: int, metrics: dict) -> None:

@@ -31,7 +31,10 @@ def test_a_new_run_and_a_resumed_one_hold_one_state(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("mode", "reason"),
-    [("full", r"File too large\. It takes about 8 kB, and [0-9.]+ .?B are free there"), ("read-only", "Permission denied")],
+    [
+        ("full", r"File too large\. It takes about 8 kB, and [0-9.]+ .?B are free there"),
+        pytest.param("read-only", "Permission denied", marks=pytest.mark.slow),
+    ],
 )
 def test_a_disk_that_takes_no_more_is_one_message_and_the_last_checkpoint_is_kept(mode, reason, tmp_path: Path):
     failed = run("train_full_disk", tmp_path, mode)
