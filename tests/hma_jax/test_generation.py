@@ -129,6 +129,7 @@ def test_actions_that_are_all_hidden_make_no_difference(conditioning: str):
     np.testing.assert_array_equal(blind[:, 0], blind[:, 1])
 
 
+@pytest.mark.slow
 def test_top_1_is_greedy():
     config = model_config()
     declared, params = lively_params(config)

@@ -183,15 +183,10 @@ def test_hidden_actions_are_predicted_without_being_seen():
     np.testing.assert_array_equal(read(data), read(poisoned))
 
 
+@pytest.mark.slow  # of forward dynamics in every run: test_training
 @pytest.mark.parametrize(
     "setting, diffusion",
-    [
-        ("full", None),
-        pytest.param("full", DIFFUSION, marks=pytest.mark.slow),
-        pytest.param("forward", DIFFUSION, marks=pytest.mark.slow),
-        pytest.param("policy", None, marks=pytest.mark.slow),
-        pytest.param("inverse", None, marks=pytest.mark.slow),
-    ],
+    [("full", None), ("full", DIFFUSION), ("forward", DIFFUSION), ("policy", None), ("inverse", None)],
 )
 def test_every_setting_learns_a_repeated_batch(setting: str, diffusion):
     config = shallow_config(diffusion=diffusion, action_alignment="causal", trunk_gain=0.5, stem_gain=0.5, frames=4)

@@ -117,18 +117,11 @@ def test_activations_and_what_training_changes_keep_their_size_at_every_width(na
 
 
 INGREDIENTS = ("init", "learning_rate", "readout", "attention", "everything")
-# All four are in the trunk that both variants share; the rest takes minutes to compile.
-FAST = {("discrete", "init")}
 
 
-@pytest.mark.parametrize(
-    ("name", "ingredient"),
-    [
-        pytest.param(name, i, marks=() if (name, i) in FAST else pytest.mark.slow)
-        for name in VARIANTS
-        for i in INGREDIENTS
-    ],
-)
+@pytest.mark.slow  # minutes of compilation
+@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("ingredient", INGREDIENTS)
 def test_each_ingredient_is_needed(name, ingredient):
     rows = measured(without(variant(name), ingredient), 6 if ingredient == "attention" else 2)
     assert check_coordinates(rows) != [], slopes(rows)

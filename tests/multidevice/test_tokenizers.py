@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 
 def run_on(devices: int) -> dict:
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
@@ -22,6 +24,7 @@ def run_on(devices: int) -> dict:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_tokens_and_frames_do_not_depend_on_the_number_of_devices():
     one, eight = run_on(1), run_on(8)
     assert (one.pop("devices"), eight.pop("devices")) == (1, 8)

@@ -82,10 +82,8 @@ NEWCOMERS = (
 )
 
 
-@pytest.mark.parametrize(
-    "diffusion",
-    [pytest.param(None, id="discrete"), pytest.param(DIFFUSION, id="continuous", marks=pytest.mark.slow)],
-)
+@pytest.mark.slow  # in every run: test_adapt, and test_draws for the random actions
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["discrete", "continuous"])
 def test_new_robots_change_no_number_of_the_old_ones(diffusion):
     """Random actions, decoding, likelihood and policy: all random numbers are a window's own."""
     config = shallow_config(diffusion=diffusion)

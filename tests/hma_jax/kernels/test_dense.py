@@ -54,7 +54,9 @@ WIDTHS = [1, 7, 31, 33, 65, 176, 300]
 
 
 @pytest.mark.parametrize(
-    "rows, out", [((4, 6), 32), ((1, 1), 24), pytest.param((3, 12), 256, marks=pytest.mark.slow)], ids=str
+    "rows, out",
+    [((4, 6), 32), *(pytest.param(*n, marks=pytest.mark.slow) for n in (((1, 1), 24), ((3, 12), 256)))],
+    ids=str,
 )
 def test_padding_the_action_axis_changes_no_bit(rows: tuple, out: int):
     """Each width in a program of its own, padded to the next larger ones and to the largest."""
