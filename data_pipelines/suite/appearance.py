@@ -32,11 +32,9 @@ class Appearance:
 def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
     """The looks of the episodes with these seeds, each a function of its own seed alone."""
     n, palette, count = len(seeds), spec.palette, spec.task.objects
-    draws = [np.random.default_rng([seed, 4]) for seed in seeds]
-    light = np.array([rng.uniform(0.97, 1.03) for rng in draws])[:, None, None]
-    order = np.array([object_order(spec, seed) for seed in seeds])[:, :count]
-    for rng in draws:
-        rng.permutation(len(palette.objects))  # that order's; what follows is drawn after it
+    draws, lights, orders = zip(*(_begin(spec, seed) for seed in seeds), strict=True)
+    light = np.array(lights)[:, None, None]
+    order = np.array(orders)[:, :count]
     slope = np.array([rng.uniform(-2, 2, 2) for rng in draws], np.float32)
 
     def colours(base: np.ndarray) -> np.ndarray:
@@ -59,6 +57,10 @@ def draw_appearance(spec: EmbodimentSpec, seeds: Sequence[int]) -> Appearance:
 
 def object_order(spec: EmbodimentSpec, seed: int) -> np.ndarray:
     """int: which of the palette's colours for objects the first object of an episode has, the second, and so on."""
+    return _begin(spec, seed)[2]
+
+
+def _begin(spec: EmbodimentSpec, seed: int) -> tuple[np.random.Generator, float, np.ndarray]:
+    """(what all else of an episode is drawn from, its light, the order of its objects' colours)."""
     rng = np.random.default_rng([seed, 4])
-    rng.uniform()  # the light's
-    return rng.permutation(len(spec.palette.objects))
+    return rng, rng.uniform(0.97, 1.03), rng.permutation(len(spec.palette.objects))

@@ -67,10 +67,12 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
     listed = ", ".join(f"{steps} x {count}" for steps, count in sorted(chosen.items()))
     rows = []
     for metric in METRICS:
-        if not all(metric in t.metrics and not np.isnan(t.metrics[metric]).any() for t in composed.values()):
+        if not all(metric in t.metrics for t in composed.values()):
             continue
         panel = make_panel([composed], metric, sweep.scope)
-        (i,) = bootstrap_intervals(panel)
+        if not panel.known.any():
+            continue
+        (i,) = bootstrap_intervals(panel.rows(panel.known))  # robots without actions have no action-nats
         rows.append(
             AtBest(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed)
         )

@@ -44,6 +44,15 @@ class Panel:
                 f"{len(seeds)} seeds of {len(self.robot)} windows do not have values of shape {values.shape}",
             )
 
+    def rows(self, index: np.ndarray) -> Panel:
+        """Some of its windows."""
+        return Panel(self.robot[index], self.episode[index], tuple(p[:, index] for p in self.points), self.seeds)
+
+    @property
+    def known(self) -> np.ndarray:
+        """bool [n]: every seed of every point has a value there."""
+        return ~np.isnan(np.concatenate(self.points)).any(0)
+
     def minus(self, other: Panel) -> Panel:
         """Point by point and window by window, over the seeds that both have: a panel of differences.
 

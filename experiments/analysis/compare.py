@@ -95,7 +95,7 @@ def _panels(pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robot
 
 def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[Difference]:
     """Over the windows that have it, of which there may be none."""
-    there = ~np.isnan(np.concatenate([*a.points, *b.points])).any(0)
+    there = a.known & b.known
     robots = list(dict.fromkeys(a.robot[there].tolist()))
     chosen = [(robot, there & (a.robot == robot)) for robot in robots]
     if not robots:
@@ -103,7 +103,7 @@ def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[D
     rows = [(OVERALL, there), *chosen] if len(robots) > 1 else chosen
     if not by_robot:
         rows = [(OVERALL, there)]
-    return [_difference(scope, metric, _rows(a, index), _rows(b, index)) for scope, index in rows]
+    return [_difference(scope, metric, a.rows(index), b.rows(index)) for scope, index in rows]
 
 
 def _difference(scope: str, metric: str, a: Panel, b: Panel) -> Difference:
@@ -127,7 +127,3 @@ def _interval(panel: Panel) -> Interval:
         for robot in dict.fromkeys(panel.robot.tolist())
     ]
     return overall(stats) if len(stats) > 1 else interval_of(stats[0])
-
-
-def _rows(panel: Panel, index: np.ndarray) -> Panel:
-    return Panel(panel.robot[index], panel.episode[index], tuple(p[:, index] for p in panel.points), panel.seeds)

@@ -13,7 +13,6 @@ Writes detector.npz (half precision) and errors.csv, its own errors on held-out 
 from __future__ import annotations
 
 import argparse
-import csv
 import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -27,6 +26,7 @@ import optax
 from data_pipelines.publishing.files import write_file
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
+from experiments.applications.tables import write_rows
 from experiments.progress import step
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
@@ -153,15 +153,6 @@ def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, obj
     return rows
 
 
-def write_errors(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    content = io.StringIO()
-    writer = csv.DictWriter(content, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
-    write_file(path, content.getvalue())
-
-
 def shown_by(tokenizer, images: np.ndarray) -> np.ndarray:
     """Frames uint8 [n, H, W, 3] as a tokenizer shows them."""
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
@@ -208,7 +199,7 @@ def main() -> None:
     for name, scenes in held.items():
         for frames, seen in (("true", scenes), ("tokenizer", as_shown(tokenizer, scenes))):
             rows += [{"frames_of": frames} | row for row in errors(detector, name, seen)]
-    write_errors(arguments.out / ERRORS, rows)
+    write_rows(arguments.out / ERRORS, rows)
     for row in rows:
         print(" ".join(f"{v:.3f}" if isinstance(v, float) else f"{v}" for v in row.values()))
     then = f"python -m experiments.applications.endurance {arguments.run}"

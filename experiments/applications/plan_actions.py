@@ -35,6 +35,7 @@ from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.intervals import Interval
+from experiments.applications import SHIPPED
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
 from experiments.applications.planning.goals import to_picture
@@ -42,14 +43,13 @@ from experiments.applications.planning.models import CONTEXT, LearnedModel, Mode
 from experiments.applications.planning.mppi import plan_mppi
 from experiments.applications.planning.search import SearchConfig
 from experiments.applications.planning.shooting import plan_shooting
-from experiments.applications.policies.acting import scale_of
-from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
+from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import gap, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import record
 from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.scripted import make_expert, noisy
-from experiments.applications.policies.tasks import Task, find_task, held
+from experiments.applications.policies.tasks import Task, find_task, held, world_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.progress import Pace, step
@@ -57,7 +57,7 @@ from experiments.wrote import wrote
 from hma_jax.simulator.folder import find_decode
 from hma_jax.simulator.robots import Robot
 
-RUN, OUT = Path("experiments/results/simulator"), Path("runs/planning")
+OUT = Path("runs/planning")
 
 PLANNERS: dict[str, tuple[Search, str]] = {
     "CEM in the true simulator": (plan_cem, "true"),
@@ -132,10 +132,7 @@ def decided(reached: Sequence[bool], task: Task) -> bool:
 
 
 def distance_of(spec: EmbodimentSpec, seen: Environment) -> float:
-    state = seen.get_state()
-    world = World(spec, state.seeds)
-    world.state = state
-    return float(gap(world)[0])
+    return float(gap(world_of(spec, [seen.get_state()]))[0])
 
 
 def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report) -> list[dict]:
@@ -145,8 +142,7 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     if way in CLONED:
         demos = record(task, CLONED[way], stride=robot.stride, image_size=size, only_successes=True)
         fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
-        config = BcConfig(frames=1, fit=fit)
-        policy = ClonedPolicy(config, train_bc(demos, config, 0, report)[settings.steps], scale_of(demos))
+        policy = clone(demos, BcConfig(frames=1, fit=fit), 0, report)
     found = run_policy(task, policy, seeds, size, robot.stride)
     return [
         {"success": bool(s), "distance": float(d), "seconds": 0.0}
@@ -216,7 +212,7 @@ def draw(found: Sequence[tuple[str, Interval, float]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=RUN, help="directory of a training run")
+    parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--robot", default=Settings.robot)
     parser.add_argument("--task", default=Settings.task, help="reach, or own: what the robot's own recordings do")

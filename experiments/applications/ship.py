@@ -29,8 +29,9 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.publishing.files import publish, write_file
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_starts
+from experiments.applications import SHIPPED
 from experiments.applications.simulators import load_simulator, true_simulator
 from experiments.running.machine import describe_machine
 from hma_jax.config import DecodeConfig, require
@@ -46,7 +47,7 @@ from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import write_list
 from hma_jax.training.runs import describe_run, load_run
 
-OUT = Path("experiments/results/simulator")
+OUT = SHIPPED
 REPORT, CLIP = "report.json", "clip.gif"
 LARGEST = 10 * 2**20
 """Bytes of everything that is shipped."""
@@ -156,7 +157,7 @@ def held_out(robot: Robot, size: int) -> tuple[list[Start], np.ndarray]:
     require(len(whole) == EPISODES, f"{robot.name}: too few of its episodes (at most {longest:g} s) are long enough")
     given = (FIRST - 1) * robot.stride
     starts = [
-        Start(s.robot, np.stack([fit_image(i, size) for i in s.images[:FIRST]]), s.actions[:given], s.seed) for s in whole
+        Start(s.robot, fit_images(s.images[:FIRST], size), s.actions[:given], s.seed) for s in whole
     ]
     futures = np.stack([s.actions[given : given + FRAMES * robot.stride] for s in whole])
     return starts, futures.reshape(EPISODES, FRAMES, robot.stride, robot.action_dim)

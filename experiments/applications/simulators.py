@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
 from data_pipelines.tokens.store import TokenStore
 from experiments.running.workspace import Workspace
@@ -107,7 +107,7 @@ def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_
 
 
 def _fitted(start: Start, size: int) -> Start:
-    return Start(start.robot, np.stack([fit_image(image, size) for image in start.images]), start.actions, start.seed)
+    return Start(start.robot, fit_images(start.images, size), start.actions, start.seed)
 
 
 def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int], count: int) -> list[Start]:

@@ -30,6 +30,7 @@ import numpy as np
 
 from data_pipelines.publishing.files import write_file
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.applications import SHIPPED
 from experiments.applications.generating.conditions import (
     ALL,
     CONDITIONS,
@@ -49,7 +50,7 @@ from experiments.applications.generating.figures import draw_conditions, draw_st
 from experiments.applications.generating.source import replay
 from experiments.applications.generating.trajectories import Trajectory
 from experiments.applications.policies.acting import Scale, scale_of
-from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, train_bc
+from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import MOST_TRIED, away_at_start, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import (
     Demonstrations,
@@ -69,7 +70,7 @@ from hma_jax.config import require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.simulator.simulator import Simulator
 
-RUN, OUT = Path("experiments/results/simulator"), Path("runs/synthetic")
+OUT = Path("runs/synthetic")
 
 BATCH = 8
 
@@ -164,9 +165,7 @@ def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demon
     dropped, task = 0 if settings.with_given else settings.given, settings.make_task()
     demos = choose(condition, data, seed, dropped)
     fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
-    config = BcConfig(frames=1, fit=fit)
-    params = train_bc(demos, config, seed, update)[settings.steps]
-    policy = ClonedPolicy(config, params, scale_of(demos))
+    policy = clone(demos, BcConfig(frames=1, fit=fit), seed, update)
     starts = start_seeds(task, settings.starts, least=settings.least)
     found = run_policy(task, policy, starts, demos.images.shape[2])
     errors = action_errors(policy, data["held_out"], scale_of(data["recorded"]))
@@ -212,7 +211,7 @@ def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tupl
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=RUN, help="directory of a training run")
+    parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--robot", default=Settings.robot)
     parser.add_argument("--task", default=Settings.task, help="hover, reach, or own: what its recordings do")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from data_pipelines.publishing.files import write_file
@@ -15,3 +15,11 @@ def write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[object
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([names, *rows])
     write_file(path, text.getvalue())
+
+
+def write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Rows with the names of the first one; four decimals of what is a float."""
+    names = list(rows[0])
+    cells = [[f"{v:.4f}" if isinstance(v := row[name], float) else v for name in names] for row in rows]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_table(path, names, cells)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from experiments.applications import SHIPPED
 from experiments.progress import console
 from experiments.setting import UNSET
 from hma_jax.config import ConfigError, ExecutionConfig, require
@@ -17,10 +18,6 @@ from hma_jax.config import ConfigError, ExecutionConfig, require
 if TYPE_CHECKING:
     from data_pipelines.suite.simulator import SuiteSimulator
     from hma_jax.simulator.robots import Robot
-
-SHIPPED = Path("experiments/results/simulator")
-"""Where `experiments.applications.ship` puts a model; served unless another run is named."""
-
 
 def play(
     run: Annotated[Positional[Path], arg(metavar="RUN")] = SHIPPED,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hma_jax.simulator.programs import padded
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
@@ -21,12 +22,12 @@ def warm_up(simulator: Simulator, together: int | None = None) -> None:
 
 
 def warm_up_more(simulator: Simulator, above: int, most: int | None = None) -> None:
-    """Compiles for more than `above` episodes that advance together, up to `most` or all; also in a thread of its own."""
+    """Compiles for more than `above` episodes that advance together, up to `most` or all; from any thread."""
     for together in sizes(len(simulator)):
         if above < together <= (most or len(simulator)):
             simulator.compile(together)
 
 
 def sizes(episodes: int) -> list[int]:
-    """Of the programs that advance so many episodes: the powers of two below, and all."""
-    return sorted({*(1 << k for k in range(episodes.bit_length()) if 1 << k < episodes), episodes})
+    """Of the programs that advance any of so many episodes."""
+    return sorted({len(padded(list(range(together)), episodes)) for together in range(1, episodes + 1)})

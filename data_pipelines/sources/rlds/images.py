@@ -6,6 +6,7 @@ Owns decoding of one image and its geometry. Pixels leave here as uint8 [H, W, 3
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 
 import numpy as np
 import simplejpeg
@@ -63,3 +64,10 @@ def fit_image(image: np.ndarray, size: int) -> np.ndarray:
     left, top = (width - side) / 2, (height - side) / 2
     box = (left, top, left + side, top + side)
     return np.asarray(Image.fromarray(image).resize((size, size), Image.Resampling.BILINEAR, box=box))
+
+
+def fit_images(images: Sequence[np.ndarray] | np.ndarray, size: int) -> np.ndarray:
+    """`fit_image` of each, uint8 [n, size, size, 3]; the array itself if it is of that size."""
+    if isinstance(images, np.ndarray) and images.shape[1:3] == (size, size):
+        return images
+    return np.stack([fit_image(image, size) for image in images])

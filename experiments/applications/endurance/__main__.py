@@ -21,8 +21,9 @@ from experiments.applications.detector import WEIGHTS, Detector, known_robots
 from experiments.applications.endurance.drives import Kind, make_drive
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
-from experiments.applications.endurance.tables import Row, over_robots, rows_of, write_rows
+from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.simulators import load_simulator
+from experiments.applications.tables import write_rows
 from experiments.progress import console, step
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require

@@ -26,9 +26,10 @@ from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.detector import SURE, WEIGHTS, Detector, known_robots
-from experiments.applications.endurance.tables import CLOSE, Row, write_rows
+from experiments.applications.endurance.tables import CLOSE, Row
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
+from experiments.applications.tables import write_rows
 from experiments.progress import console, step
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.analysis.intervals import critical
 from experiments.applications.detector import NEAR, SURE
 from experiments.applications.endurance.films import Film
@@ -93,16 +91,6 @@ def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
     values = np.array([np.mean([float(row[name]) for row in rows if row["robot"] == robot]) for robot in robots])
     half = critical(len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
     return float(values.mean()), float(half), len(values)
-
-
-def write_rows(path: Path, rows: Sequence[Row]) -> None:
-    content = io.StringIO()
-    writer = csv.DictWriter(content, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.4f}" if isinstance(v, float) else v for k, v in row.items()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, content.getvalue())
 
 
 def read_rows(path: Path) -> list[Row]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.sources.open import open_source, source_name
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.sources.source import INSTRUCTION_KEY
 from data_pipelines.tokens.manifest import FILE as MANIFEST
 from data_pipelines.tokens.store import TokenStore
@@ -70,7 +70,7 @@ class RldsTrajectories(Trajectories):
     def __getitem__(self, i: int) -> Trajectory:
         spec = self._spec
         episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
-        images = np.stack([fit_image(image, self._size) for image in episode.images])
+        images = fit_images(episode.images, self._size)
         said: Sequence[bytes] = ()
         if INSTRUCTION_KEY in self._source.features:
             said = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications.judging.head import SuccessHead
 from experiments.applications.judging.rollouts import Rollout
 from experiments.applications.policies.tasks import Task, held
+from experiments.applications.tables import write_table
 from hma_jax.config import ConfigError
 
 TRUE, LEARNED, SHUFFLED = "true", "learned", "shuffled"
@@ -64,12 +63,8 @@ def successes(outcomes: Iterable[Outcome], policies: Sequence[str], world: str, 
 
 
 def write_outcomes(outcomes: Sequence[Outcome], path: Path) -> None:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([f.name for f in dataclasses.fields(Outcome)])
-    for o in outcomes:
-        writer.writerow([*dataclasses.astuple(o)[:-1], int(o.success)])
-    write_file(path, text.getvalue())
+    names = [f.name for f in dataclasses.fields(Outcome)]
+    write_table(path, names, ([*dataclasses.astuple(o)[:-1], int(o.success)] for o in outcomes))
 
 
 def read_outcomes(path: Path) -> list[Outcome]:

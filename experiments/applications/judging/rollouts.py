@@ -12,16 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.publishing.files import write_file
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SuiteSimulator, suite_starts
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, reached
+from experiments.applications.simulators import START_FRAMES
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.starts import Start
-
-START_FRAMES = 3
-"""Frames that an episode begins with: enough to see what moves."""
 
 STARTS_SEED = 2
 """Of the suite whose held-out episodes are the starts: neither trained on (0) nor used by `ship` (1)."""
@@ -53,7 +51,7 @@ def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
         chosen = [start for start, already in zip(found, done, strict=True) if not already]
         asked *= 2
         require(asked < 64 * count, f"{task.robot}: hardly a held-out episode begins without its goal reached")
-    return [Start(s.robot, np.stack([fit_image(i, size) for i in s.images]), s.actions, s.seed) for s in chosen[:count]]
+    return [Start(s.robot, fit_images(s.images, size), s.actions, s.seed) for s in chosen[:count]]
 
 
 def _robot(task: Task, stride: int):

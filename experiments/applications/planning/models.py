@@ -7,17 +7,18 @@ from typing import Protocol
 
 import numpy as np
 
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import State, World
+from experiments.applications.simulators import START_FRAMES
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
-CONTEXT = 3
-"""Frames that a plan begins with, as episodes do: enough to see what moves."""
+CONTEXT = START_FRAMES
+"""Frames that a plan begins with."""
 
 
 class Model(Protocol):
@@ -81,6 +82,5 @@ class TrueModel:
         looks = draw_appearance(self._spec, self._state.seeds)
         flat = [np.stack(x, 1).reshape(count * frames, *x[0].shape[1:]) for x in (q, objects)]
         images = render_frames(self._spec, looks, self._state.goals, *flat, np.zeros(count * frames, int))
-        if images.shape[1] != self._size:
-            images = np.stack([fit_image(image, self._size) for image in images])
+        images = fit_images(images, self._size)
         return images.reshape(count, frames, *images.shape[1:])

@@ -107,3 +107,10 @@ class ClonedPolicy(ChunkPolicy):
     def plan(self, frames: np.ndarray, seeds: Sequence[int], steps: Sequence[int]) -> np.ndarray:
         out = np.asarray(_act(self.params, self.config, frames))
         return out.reshape(len(frames), self.config.chunk, -1)
+
+
+def clone(
+    demos: Demonstrations, config: BcConfig, seed: int = 0, report: Report = lambda done, total, note: None
+) -> ClonedPolicy:
+    """The policy after all of its training."""
+    return ClonedPolicy(config, train_bc(demos, config, seed, report)[config.fit.steps], scale_of(demos))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import episode_seeds
@@ -53,9 +53,7 @@ def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, s
         if t == task.frames - 1:
             break
         images = render_frames(task.spec, looks, world.goals, world.q, world.objects, np.arange(len(seeds)))
-        if images.shape[1] != image_size:
-            images = np.stack([fit_image(image, image_size) for image in images])
-        actions = policy.act(images).astype(np.float64)
+        actions = policy.act(fit_images(images, image_size)).astype(np.float64)
         for _ in range(stride):
             world.step(actions)
     return Outcome(held(np.stack(reached, 1), task.hold).any(1), gap(world))

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.publishing.files import write_file
-from data_pipelines.sources.rlds.images import fit_image
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.behaviour import Behaviour
 from data_pipelines.suite.render import render_frames
@@ -128,8 +128,7 @@ def _drive(
     flat = [np.stack(x, 1).reshape(n * frames, *x[0].shape[1:]) for x in (q, objects)]
     looks = draw_appearance(world.spec, seeds)
     images = render_frames(world.spec, looks, world.goals, *flat, np.repeat(np.arange(n), frames))
-    if images.shape[1] != image_size:
-        images = np.stack([fit_image(image, image_size) for image in images])
+    images = fit_images(images, image_size)
     images, acted, done = images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.stack(reached, 1)
     solved = held(done, task.hold)
     lengths = np.full(n, frames)

@@ -63,9 +63,12 @@ def test_the_axis_of_trajectories_is_judged_at_its_best_steps():
         table = windows_of(point.trial)
         scarce = point.trial.max_trajectories == 2
         worse = 1.0 if longer == scarce else 0.0  # scarce data: fewer steps; all data: more
+        nats = np.where(table.dataset == "arm_sand", np.nan, 1.0)  # it has no actions
+        table = replace(table, metrics={**table.metrics, "action_nats": nats})
         tables[trial_id(point.trial, PROVENANCE)] = with_loss(table, table.metrics["cross_entropy"] + worse)
     found = judge_at_best([sweep], PROVENANCE, tables)
     assert "At the number of steps that suits each point" in describe(sweep, [], [], Along(best=found))
+    assert {r.mean for r in found if r.metric == "action_nats"} == {1.0}, "of the robots that have it"
     rows = {r.x: r for r in found if r.metric == "cross_entropy"}
     fewest, most = min(rows), max(rows)
     assert rows[fewest].chosen == "2 x 6" and rows[most].chosen == "8 x 6" and rows[most].seeds == 3

@@ -6,7 +6,8 @@ import numpy as np
 
 from experiments.applications.endurance.films import Film, colours_of, load_films, save_films
 from experiments.applications.endurance.hidden import LEAST, find_events
-from experiments.applications.endurance.tables import measure, over_robots, read_rows, rows_of, write_rows
+from experiments.applications.endurance.tables import measure, over_robots, read_rows, rows_of
+from experiments.applications.tables import write_rows
 
 N = 200
 
