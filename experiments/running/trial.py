@@ -90,15 +90,28 @@ def trial_id(trial: Trial, provenance: Provenance) -> str:
     return stable_hash({"trial": _identity(trial), "provenance": to_dict(provenance)})
 
 
-LATER = {"capped": [], "source": None}
-"""Fields that came later: they name a trial where they have another value than this, which all had before."""
+LATER: dict[str, Any] = {"capped": [], "source": None}
+"""Fields that came after trials were published, by their path (`train.masking.own_past`), with the value that all had
+before: they name a trial where they have another. A new field of `Trial` or of a configuration within it is added here,
+or every trial that is finished, committed ones too, is another trial and has to be run again."""
 
 
 def _identity(trial: Trial) -> dict[str, Any]:
     fields = to_dict(trial)
     if trial.source:
         fields["source"] = _identity(trial.source)
-    return {name: value for name, value in fields.items() if name not in LATER or value != LATER[name]}
+    for path, before in LATER.items():
+        _drop(fields, path.split("."), before)
+    return fields
+
+
+def _drop(fields: dict[str, Any] | None, path: list[str], value: Any) -> None:
+    """Deletes the entry at `path` where it is `value`; a part of the path may be a configuration that is absent."""
+    *parents, name = path
+    for parent in parents:
+        fields = fields.get(parent) if fields else None
+    if fields and name in fields and fields[name] == value:
+        del fields[name]
 
 
 @dataclass(frozen=True)
@@ -284,8 +297,8 @@ def run_trial(
     """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
 
     `keep`: steps after which its checkpoint stays, for trials that go on from there. `begin` gives what
-    a trial with a source goes on from (`newcomers`). Returns what it writes to result.json. Raises ConfigError, DataError, DivergedError or
-    Interrupted.
+    a trial with a source goes on from (`newcomers`). Returns what it writes to result.json. Raises ConfigError,
+    DataError, DivergedError or Interrupted.
     """
     import jax
 

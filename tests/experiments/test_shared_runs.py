@@ -13,9 +13,10 @@ from experiments.run_study import make_jobs
 from experiments.running.attempts import RUN
 from experiments.running.runner import Job
 from experiments.running.shared_runs import begin_shared, share_runs
-from experiments.running.trial import Trial, trial_id
+from experiments.running.trial import LATER, Trial, trial_id
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
+from hma_jax.config import DiffusionConfig
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.test_runner import events, job, run
@@ -100,7 +101,32 @@ def test_fields_that_came_later_do_not_change_the_name_of_a_trial():
     assert len({trial_id(one, PROVENANCE) for one in (plain, *others)}) == 4
 
 
+def test_a_field_within_a_configuration_may_come_later(monkeypatch):
+    """At any depth, in a source too, and in a configuration that not every trial has."""
+    plain = replace(reference_trial(CPU_FULL, 0), source=reference_trial(CPU_FULL, 1))
+    latents = replace(plain, model=replace(plain.model, diffusion=DiffusionConfig()))
+    masking = replace(plain.train.masking, own_past=0.5)
+    drawn = replace(plain, train=replace(plain.train, masking=masking))
+    named = {trial_id(one, PROVENANCE) for one in (plain, latents)}
+    fields = to_dict(plain)
+    for one in (fields, fields["source"]):
+        del one["train"]["masking"]["own_past"], one["capped"]
+    del fields["source"]["source"]
+    monkeypatch.setitem(LATER, "train.masking.own_past", plain.train.masking.own_past)
+    monkeypatch.setitem(LATER, "model.diffusion.depth", DiffusionConfig().depth)
+    assert trial_id(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
+    assert len({trial_id(one, PROVENANCE) for one in (plain, latents, drawn)} | named) == 5
+
+
+def test_names_of_trials_stay():
+    """Published trials have such names: whoever adds a field to a configuration adds it to LATER."""
+    inputs = replace(PROVENANCE, results=2)
+    assert trial_id(reference_trial(SMOKE, 0), inputs) == "4925133387f6a4df"
+    assert trial_id(reference_trial(CPU_FULL, 0), inputs) == "79f7d3e69834233e"
+
+
 @pytest.mark.parametrize("seed", CPU_FULL.seeds)
 def test_a_trial_reads_back_from_its_record_with_its_source(seed):
-    for one in unique_trials(plan_sweeps(replace(CPU_FULL, seeds=(seed,)), ("fewshot", "newcomers")), PROVENANCE).values():
+    sweeps = plan_sweeps(replace(CPU_FULL, seeds=(seed,)), ("fewshot", "newcomers"))
+    for one in unique_trials(sweeps, PROVENANCE).values():
         assert from_dict(Trial, json.loads(json.dumps(to_dict(one)))) == one
