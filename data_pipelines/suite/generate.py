@@ -9,8 +9,10 @@ import hashlib
 import math
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from pathlib import Path
 
 from data_pipelines.publishing.claims import claim
@@ -112,14 +114,35 @@ def generate_suite(
             _make(spec.name, root, scale, seed, validation)
             report(spec.name)
         return paths
-    # Spawned, not forked: the caller may have started threads (JAX has).
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(missing)), mp_context=context) as pool:
+    with _processes(min(workers, len(missing))) as pool:
         jobs = {pool.submit(_make, spec.name, root, scale, seed, validation): spec.name for spec in missing}
         for job in as_completed(jobs):
             job.result()
             report(jobs[job])
     return paths
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Ended at once where the block is left by an exception, Ctrl-C for one: by itself the pool would first do all that
+    it was given. What a process leaves half-made is made anew."""
+    # Spawned, not forked: the caller may have started threads (JAX has).
+    pool = ProcessPoolExecutor(
+        count,
+        mp_context=multiprocessing.get_context("spawn"),
+        # A terminal sends Ctrl-C to all; a process would give up one dataset and go on with the next.
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+    )
+    others = set(multiprocessing.active_children())
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+        raise
+    pool.shutdown()
 
 
 def _make(name: str, root: Path, scale: float, seed: int, validation: int) -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -157,6 +161,26 @@ def test_bytes_do_not_depend_on_the_number_of_workers(suite, tmp_path):
     assert [p.parent.name for p in paths] == list(NAMES)
     assert seen == [(1, 3), (2, 3), (3, 3)]
     assert contents(tmp_path) == contents(suite)
+
+
+@pytest.mark.parametrize("everyone", (False, True), ids=("by kill", "by a terminal"))
+def test_ctrl_c_ends_processes_that_have_hours_to_do(tmp_path, everyone):
+    """A terminal sends it to every process of the command, kill to one."""
+    call = f"generate_suite(Path({str(tmp_path)!r}), scale=1000.0, names={NAMES}, workers=2)"
+    program = f"from pathlib import Path; from data_pipelines.suite.generate import generate_suite; {call}"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], start_new_session=True, stderr=subprocess.PIPE, text=True
+    ) as command:
+        deadline = time.monotonic() + 60
+        while len(list(tmp_path.glob("*/.*.scratch.*"))) < 2 and time.monotonic() < deadline:
+            assert command.poll() is None, command.stderr.read()
+            time.sleep(0.05)
+        (os.killpg if everyone else os.kill)(command.pid, signal.SIGINT)
+        assert "KeyboardInterrupt" in command.communicate(timeout=30)[1]
+    with pytest.raises(ProcessLookupError):  # nobody is left of its session
+        for _ in range(100):
+            os.killpg(command.pid, 0)
+            time.sleep(0.1)
 
 
 def test_another_seed_gives_other_episodes(suite, tmp_path):
