@@ -1,12 +1,13 @@
 """A detector of tools and objects in frames of a simulator's robots, trained on true frames.
 
 Command: python -m experiments.applications.detector RUN
-Cost: about ten minutes of one core.
+Cost: about ten minutes of one core for eight robots, half an hour for forty.
 Expected: it finds tools and visible objects of held-out true frames within 2 pixels of 64 in nearly all of them, most
           also as the run's tokenizer shows them.
 
 The suite says where everything is; half of the frames it learns from are as RUN's tokenizer shows them, and in some an
-object is missing, so that it learns what nothing looks like.
+object is missing, so that it learns what nothing looks like. It sees frames of 64 pixels; those of a run that has fewer
+are enlarged.
 Writes detector.npz (half precision) and errors.csv, its own errors on held-out episodes.
 """
 
@@ -24,7 +25,9 @@ import numpy as np
 import optax
 
 from data_pipelines.publishing.files import write_file
+from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
+from data_pipelines.suite.spec import IMAGE_SIZE
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.tables import write_rows
 from experiments.progress import step
@@ -35,10 +38,13 @@ from hma_jax.simulator.robots import Robot
 
 OUT = Path("experiments/results/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
-EPISODES, PER_EPISODE, HELD_OUT = 240, 16, (24, 16)
-"""Of each robot, from the suite's training split, and frames of each; the same of the held-out split."""
+EPISODES, FEWEST, PER_EPISODE, HELD_OUT = 1920, 48, 16, (24, 16)
+"""Of all robots together, but so many of each, from the suite's training split, and frames of each episode; of each
+robot the same of the held-out split."""
 
-STEPS, BATCH, RATE = 2000, 32, 2e-3
+STEPS, MORE, BATCH, RATE = 1000, 125, 32, 2e-3
+"""Steps, and how many more for each robot."""
+
 MISSING = 0.2
 NOISE = 16.0
 """Grey levels of noise that frames are given at most."""
@@ -109,7 +115,7 @@ def batches(scenes: Sequence[Scenes], seed: int, count: int, size: int) -> Itera
 def train_detector(
     scenes: Mapping[str, Scenes],
     *,
-    steps: int = STEPS,
+    steps: int,
     size: int = BATCH,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -153,26 +159,62 @@ def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, obj
     return rows
 
 
+def enlarged(images: np.ndarray) -> np.ndarray:
+    """Square frames uint8 [n, H, W, 3] as the detector sees them, `IMAGE_SIZE` pixels wide."""
+    times, rest = divmod(IMAGE_SIZE, images.shape[1])
+    require(not rest, f"frames of {images.shape[1]} pixels cannot be enlarged to {IMAGE_SIZE}")
+    return images.repeat(times, axis=1).repeat(times, axis=2)
+
+
+def as_given(tokenizer, scenes: Scenes) -> Scenes:
+    """With frames as small as a tokenizer takes them."""
+    return scenes._replace(images=enlarged(fit_images(scenes.images, tokenizer.image_size)))
+
+
 def shown_by(tokenizer, images: np.ndarray) -> np.ndarray:
     """Frames uint8 [n, H, W, 3] as a tokenizer shows them."""
+    images = fit_images(images, tokenizer.image_size)
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
     filled = np.concatenate([images, np.repeat(images[-1:], -len(images) % BLOCK, 0)])
     parts = [np.asarray(whole(filled[i : i + BLOCK])) for i in range(0, len(filled), BLOCK)]
-    return np.concatenate(parts)[: len(images)]
+    return enlarged(np.concatenate(parts)[: len(images)])
 
 
 def as_shown(tokenizer, scenes: Scenes, every: int = 1) -> Scenes:
-    """With every n-th frame as the tokenizer shows it."""
-    images = scenes.images.copy()
-    images[::every] = shown_by(tokenizer, images[::every])
-    return scenes._replace(images=images)
+    """The same with every n-th frame as the tokenizer shows it."""
+    given = as_given(tokenizer, scenes)
+    given.images[::every] = shown_by(tokenizer, scenes.images[::every])
+    return given
 
 
 def known_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
     """Those whose truth the suite knows. Raises ConfigError if there are none."""
-    known = {name: robot for name, robot in robots.items() if name in SPECS and robot.stride == 1}
-    require(bool(known), "no robot of the suite at its native rate: nobody knows where its tools are")
+    known = {name: robot for name, robot in robots.items() if name in SPECS}
+    require(bool(known), "no robot of the suite: nobody knows where its tools are")
     return known
+
+
+def make_detector(robots: Sequence[str], tokenizer, out: Path) -> Detector:
+    """Trains one on frames as `tokenizer` takes and shows them; writes it and its own errors into `out`."""
+    episodes = max(EPISODES // len(robots), FEWEST)
+    with step("true frames") as update:
+        train, held = {}, {}
+        for i, name in enumerate(robots):
+            drawn = draw_scenes(SPECS[name], "train", episodes, PER_EPISODE, 0, MISSING)
+            train[name] = as_shown(tokenizer, drawn, every=2)
+            held[name] = draw_scenes(SPECS[name], "val", *HELD_OUT, 1)
+            update(i + 1, len(robots), name)
+    with step("train the detector") as update:
+        steps = STEPS + MORE * len(robots)
+        detector = train_detector(train, steps=steps, progress=lambda done, total: update(done, total, ""))
+    out.mkdir(parents=True, exist_ok=True)
+    detector.save(out / WEIGHTS)
+    detector, rows = Detector.load(out / WEIGHTS), []  # as it was saved
+    for name, scenes in held.items():
+        for frames, given in (("true", as_given), ("tokenizer", as_shown)):
+            rows += [{"frames_of": frames} | row for row in errors(detector, name, given(tokenizer, scenes))]
+    write_rows(out / ERRORS, rows)
+    return detector
 
 
 def main() -> None:
@@ -183,25 +225,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     arguments = parser.parse_args()
     simulator = load_simulator(arguments.run)
-    robots, tokenizer = known_robots(simulator.robots), simulator.tokenizer
-    with step("true frames") as update:
-        train, held = {}, {}
-        for i, name in enumerate(robots):
-            drawn = draw_scenes(SPECS[name], "train", EPISODES, PER_EPISODE, 0, MISSING)
-            train[name] = as_shown(tokenizer, drawn, every=2)
-            held[name] = draw_scenes(SPECS[name], "val", *HELD_OUT, 1)
-            update(i + 1, len(robots), name)
-    with step("train the detector") as update:
-        detector = train_detector(train, progress=lambda done, total: update(done, total, ""))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    detector.save(arguments.out / WEIGHTS)
-    detector, rows = Detector.load(arguments.out / WEIGHTS), []  # as it was saved
-    for name, scenes in held.items():
-        for frames, seen in (("true", scenes), ("tokenizer", as_shown(tokenizer, scenes))):
-            rows += [{"frames_of": frames} | row for row in errors(detector, name, seen)]
-    write_rows(arguments.out / ERRORS, rows)
-    for row in rows:
-        print(" ".join(f"{v:.3f}" if isinstance(v, float) else f"{v}" for v in row.values()))
+    make_detector(list(known_robots(simulator.robots)), simulator.tokenizer, arguments.out)
+    print((arguments.out / ERRORS).read_text())
     then = f"python -m experiments.applications.endurance {arguments.run}"
     wrote(arguments.out / WEIGHTS, arguments.out / ERRORS, then=then)
 

@@ -29,10 +29,9 @@ import numpy as np
 from PIL import Image
 
 from data_pipelines.publishing.files import publish, write_file
-from data_pipelines.sources.rlds.images import fit_images
-from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_starts
+from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.applications import SHIPPED
-from experiments.applications.simulators import load_simulator, true_simulator
+from experiments.applications.simulators import held_out, load_simulator, true_simulator
 from experiments.running.machine import describe_machine
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
@@ -56,7 +55,6 @@ EPISODES = 8
 FRAMES = 24
 """Frames after the start that are compared."""
 
-FIRST = 3
 ZOOM, COLOURS = 2, 128  # of the clip
 
 
@@ -106,7 +104,9 @@ class Seen(NamedTuple):
 
 
 def look(simulator: Simulator, robot: Robot) -> Seen:
-    starts, futures = held_out(robot, simulator.tokenizer.image_size)
+    starts, futures = held_out(robot, simulator.tokenizer.image_size, FRAMES, EPISODES)
+    longest = SPECS[robot.name].seconds[1]
+    require(len(starts) == EPISODES, f"{robot.name}: too few of its episodes (at most {longest:g} s) are long enough")
     others = np.roll(futures, 1, axis=0)
     runs = (true_simulator(simulator, [robot], len(starts)), futures), (simulator, futures), (simulator, others)
     return Seen(*(np.stack([image.copy() for image in rolled(by, starts, chunks)]) for by, chunks in runs))
@@ -148,19 +148,6 @@ def write_clip(seen: Mapping[str, Seen], path: Path, hz: float) -> None:
     content = io.BytesIO()
     larger[0].save(content, "GIF", save_all=True, append_images=larger[1:], duration=round(1000 / hz), loop=0)
     write_file(path, content.getvalue())
-
-
-def held_out(robot: Robot, size: int) -> tuple[list[Start], np.ndarray]:
-    """`EPISODES` starts, and what was done after them: chunks [EPISODES, FRAMES, stride, A]."""
-    whole = suite_starts(robot.name, 16 * EPISODES, FIRST + FRAMES, stride=robot.stride, seed=1)[:EPISODES]
-    longest = SPECS[robot.name].seconds[1]
-    require(len(whole) == EPISODES, f"{robot.name}: too few of its episodes (at most {longest:g} s) are long enough")
-    given = (FIRST - 1) * robot.stride
-    starts = [
-        Start(s.robot, fit_images(s.images[:FIRST], size), s.actions[:given], s.seed) for s in whole
-    ]
-    futures = np.stack([s.actions[given : given + FRAMES * robot.stride] for s in whole])
-    return starts, futures.reshape(EPISODES, FRAMES, robot.stride, robot.action_dim)
 
 
 def rolled(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futures: np.ndarray):

@@ -13,7 +13,7 @@ from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, s
 from data_pipelines.tokens.store import TokenStore
 from experiments.running.workspace import Workspace
 from hma_jax.config import require
-from hma_jax.simulator.folder import ROBOTS
+from hma_jax.simulator.folder import ROBOTS, TOKENIZER
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot, rest_of
 from hma_jax.simulator.simulator import Simulator
@@ -32,20 +32,23 @@ START_FRAMES = 3
 
 def load_simulator(run: Path, **options: Any) -> Simulator:
     """The learned simulator of a run, with robots and starts: those that lie beside it (`simulator.folder`), otherwise
-    those of the study's directory that the run is in.
+    those of the study's directory that the run is in, which may be one of its trials. `options` are those of
+    `Simulator.load`.
 
     Raises ConfigError where there is no run, or nothing to start from.
     """
+    study = Workspace.of_run(run)
+    if options.get("tokenizer") is None and not (run / TOKENIZER).exists() and study.tokenizer.exists():
+        options["tokenizer"] = study.tokenizer
     simulator = Simulator.load(run, **options)
     if not (run / ROBOTS).exists():
-        described = describe_robots(simulator, Workspace(run.absolute().parent))
-        simulator.describe(described)
+        simulator.describe(describe_robots(simulator, study))
     if not (run / STARTS).exists():
-        simulator.starts = find_starts(simulator, Workspace(run.absolute().parent))
+        simulator.starts = find_starts(simulator, study)
     require(
         bool(simulator.starts),
         f"{run}: there is no {STARTS} beside the run, and neither a robot of the suite nor held-out frames in "
-        f"{run.absolute().parent / 'tokens'} to start from",
+        f"{study.store} to start from",
     )
     return simulator
 
@@ -104,6 +107,18 @@ def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_
         elif store is not None and robot.name in store.names:
             starts += _stored_starts(store, robot, simulator.tokenizer.image_shape, count)
     return tuple(starts)
+
+
+def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Start], np.ndarray]:
+    """At most `count` starts of episodes that no suite of seed 0 has, with images of `size`, and what was done in the
+    `frames` after each: chunks [n, frames, stride, A]. Fewer where the robot's episodes are too short."""
+    whole = suite_starts(robot.name, 16 * count, START_FRAMES + frames, stride=robot.stride, seed=1)[:count]
+    given = (START_FRAMES - 1) * robot.stride
+    starts = [
+        Start(s.robot, fit_images(s.images[:START_FRAMES], size), s.actions[:given], s.seed) for s in whole
+    ]
+    chunks = [s.actions[given : given + frames * robot.stride] for s in whole]
+    return starts, np.array(chunks, np.float32).reshape(len(starts), frames, robot.stride, robot.action_dim)
 
 
 def _fitted(start: Start, size: int) -> Start:

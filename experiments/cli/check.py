@@ -37,7 +37,7 @@ def check(
 
     require_local("--out", out)
     require(windows >= 2, f"--windows must be at least 2, got {windows}")
-    workspace = Workspace(out or run.absolute().parent)
+    workspace = Workspace(out) if out else Workspace.of_run(run)
     with step(f"check {run}"):
         found = check_run(run, workspace, robots, windows)
     names = {robot.name: robot.dimensions for robot in find_robots(run, load_run(run).table)}

@@ -73,7 +73,7 @@ def generate(
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch, decode=decode, history=1
     )
-    robots, stores = dict(simulator.robots), Workspace(run.absolute().parent).store
+    robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)
     count = len(recorded) if episodes is None else min(episodes, len(recorded))

@@ -29,6 +29,13 @@ class Workspace:
 
     root: Path
 
+    @classmethod
+    def of_run(cls, run: Path) -> Workspace:
+        """The study that a run is of: STUDY/RUN, or the trial STUDY/trials/ID/run."""
+        parent = run.absolute().parent
+        study = parent.parent.parent
+        return cls(study if cls(study).trials == parent.parent else parent)
+
     @property
     def suite(self) -> Path:
         """Simulated RLDS datasets."""

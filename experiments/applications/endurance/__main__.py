@@ -17,8 +17,8 @@ from typing import Any
 
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import OUT as DETECTOR
-from experiments.applications.detector import WEIGHTS, Detector, known_robots
-from experiments.applications.endurance.drives import Kind, make_drive
+from experiments.applications.detector import WEIGHTS, Detector
+from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
@@ -59,7 +59,7 @@ def run_variant(
 ) -> dict[str, Film]:
     """All robots of a run that the suite knows, each from its start number `which` on, in one batch."""
     simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
-    robots = known_robots(simulator.robots)
+    robots = native_robots(simulator.robots)
     decode = replace(find_decode(run), **VARIANTS[variant])
     options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
     simulator = load_simulator(run, **options)

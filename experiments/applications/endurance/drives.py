@@ -6,6 +6,7 @@ was recorded.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,7 +18,9 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
+from experiments.applications.detector import known_robots
 from experiments.applications.scenes import Points, points_of
+from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -55,6 +58,14 @@ class Drive:
     def points(self) -> Points:
         """Of all n + 1 states."""
         return points_of(self.spec, np.full(len(self.q), self.start.seed), self.q, self.objects)
+
+
+def native_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
+    """Those that the detector knows, if they are driven as often as their behaviour acts. Raises ConfigError if there
+    are none."""
+    native = {name: robot for name, robot in known_robots(robots).items() if robot.stride == 1}
+    require(bool(native), "no robot of the suite at its native rate: drives have an action for every frame")
+    return native
 
 
 def make_drive(robot: Robot, start: Start, frames: int, kind: Kind, seed: int) -> Drive:

@@ -25,7 +25,8 @@ from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from experiments.applications.detector import OUT as DETECTOR
-from experiments.applications.detector import SURE, WEIGHTS, Detector, known_robots
+from experiments.applications.detector import SURE, WEIGHTS, Detector
+from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.tables import CLOSE, Row
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
@@ -141,7 +142,7 @@ def main() -> None:
     detector, rows = Detector.load(asked.detector), []
     simulator = load_simulator(asked.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
     with step("objects that come back") as update:
-        robots = known_robots(simulator.robots)
+        robots = native_robots(simulator.robots)
         for i, name in enumerate(robots):
             spec, rng = SPECS[name], np.random.default_rng([0, i])
             rollout = simulate(spec, episode_seeds(spec, EPISODES, 0, "val"))

@@ -1,6 +1,7 @@
 """Learned and true simulators of a run's robots, and the model that is shipped."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from experiments.applications import ship as ship_module
 from experiments.applications.ship import ship
 from experiments.applications.simulators import load_simulator, make_simulator
+from experiments.running.workspace import Workspace
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.simulator.folder import USUAL, find_decode
@@ -27,6 +29,14 @@ def test_robots_of_the_suite_are_described_and_begin_at_held_out_episodes(run):
     assert gripper.keeps and gripper.hz == 4.0
     assert {s.robot for s in simulator.starts} == {"pusher_sand", "gripper_wood"}
     assert all(s.seed is not None and s.images.shape == (3, 8, 8, 3) for s in simulator.starts)
+
+
+def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
+    study = tmp_path / "study"
+    shutil.copytree(run.parent / "tokenizer", study / "tokenizer")
+    trial = shutil.copytree(run, study / "trials" / "0a" / "run")
+    assert Workspace.of_run(trial) == Workspace(study) and Workspace.of_run(study / "model") == Workspace(study)
+    assert dict(load_simulator(trial).robots) == dict(load_simulator(run).robots)
 
 
 def test_true_and_learned_are_exchanged_by_one_word(run):

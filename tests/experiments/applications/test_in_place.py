@@ -1,0 +1,80 @@
+"""Where things stand at the end of a window, and a detector for frames of any size."""
+
+import numpy as np
+import pytest
+
+from data_pipelines.sources.rlds.images import fit_images
+from data_pipelines.suite.simulator import SPECS
+from experiments.applications import detector as detector_module
+from experiments.applications.detector import Detector, as_given, as_shown, enlarged, make_detector
+from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, in_place, watch_ends
+from experiments.applications.scenes import draw_scenes, point_names
+from experiments.applications.simulators import load_simulator
+from hma_jax.config import ConfigError
+from hma_jax.evaluation.detector import Found
+from tests.experiments.applications.runs import make_run
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory):
+    return load_simulator(make_run(tmp_path_factory.mktemp("study")), episodes=EPISODES)
+
+
+class Oracle(Detector):
+    """Finds what it is told, in frames that it keeps."""
+
+    def __init__(self, found: list[Found]):
+        self.found, self.films = found, []
+
+    def watch(self, robot, film):
+        self.films.append(film)
+        return self.found[len(self.films) - 1]
+
+
+def test_places_at_the_end_are_those_of_the_true_simulator(simulator):
+    robot = simulator.robots["pusher_sand"]
+    points = len(point_names(SPECS[robot.name]))
+    nowhere = Found(np.zeros((EPISODES, points, 2), np.float32), np.ones((EPISODES, points), np.float32))
+    oracle = Oracle([nowhere] * len(VIEWS))
+    rows = watch_ends(simulator, oracle, robot)
+    assert [film.shape for film in oracle.films] == [(EPISODES, 64, 64, 3)] * len(VIEWS)
+    assert (oracle.films[1] != oracle.films[2]).any(), "the true last frame, and the prompt's"
+    assert {row["what"] for row in rows} <= set(point_names(SPECS[robot.name]))
+    tools = [row for row in rows if row["what"] == "tool_0"]
+    assert len(tools) == EPISODES and np.mean([row["moved_px"] > CLOSE for row in tools]) > 0.3
+    # From the corner it is as far as the tool is.
+    assert all(row["true_px"] == row["model_px"] == row["still_px"] > 0 for row in tools)
+
+
+def test_the_share_is_of_what_moved_and_a_mean_over_robots():
+    def row(robot: str, moved: float, off: float, sure: float = 1.0):
+        return {"robot": robot, "moved_px": moved} | {
+            f"{view}_{name}": value for view in VIEWS for name, value in (("px", off), ("confidence", sure))
+        }
+
+    rows = [row("a", 9, 1), row("a", 9, 9), row("a", 1, 1), row("b", 9, 1), row("b", np.nan, 9), row("b", 9, 1, 0.0)]
+    assert in_place(rows, "model")[::2] == (0.5, 2)
+    rows += [row("c", 9, 1)] * 4
+    share, half, robots = in_place(rows, "model")
+    assert (round(share, 4), robots) == (0.6667, 3) and half > 0.5
+    assert in_place([], "true")[2] == 0
+
+
+def test_a_detector_sees_frames_as_small_as_the_run_s(simulator, tmp_path, monkeypatch):
+    few = {"EPISODES": 4, "FEWEST": 2, "PER_EPISODE": 2, "HELD_OUT": (2, 2), "STEPS": 1, "MORE": 1}
+    for name, value in few.items():
+        monkeypatch.setattr(detector_module, name, value)
+    made = make_detector(list(simulator.robots), simulator.tokenizer, tmp_path)
+    assert made.robots == ("pusher_sand", "gripper_wood")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["detector.npz", "errors.csv"]
+    scenes = draw_scenes(SPECS["pusher_sand"], "train", 2, 2, 0)
+    given, shown = (f(simulator.tokenizer, scenes) for f in (as_given, as_shown))
+    size = simulator.tokenizer.image_size
+    assert given.images.shape == scenes.images.shape
+    np.testing.assert_array_equal(given.images[:, :: 64 // size, :: 64 // size], fit_images(scenes.images, size))
+    assert (shown.images != given.images).any()
+    half = as_shown(simulator.tokenizer, scenes, every=2).images
+    np.testing.assert_array_equal(half[::2], shown.images[::2])
+    np.testing.assert_array_equal(half[1::2], given.images[1::2])
+    with pytest.raises(ConfigError, match="cannot be enlarged"):
+        enlarged(np.zeros((1, 48, 48, 3), np.uint8))
