@@ -1,0 +1,226 @@
+"""HMA itself as a policy, beside behaviour cloning and a Diffusion Policy.
+
+Question: how good is the model's own action head in closed loop, in the true simulator and past its window?
+Paper: section 3.1, policies as one of the settings that the model is trained in; section 5, post-training.
+Command: python -m experiments.applications.own_policy
+Cost: half an hour of two cores; goes on where it was stopped.
+Expected: well above random actions; no better than policies made for nothing else.
+
+The world model gets action heads and is post-trained, all of it, to say what an expert does next (`masking.setting` is
+policy). The others are trained on the same episodes. All begin at the same starts, which no recording has.
+
+Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from data_pipelines.publishing.files import write_file
+from experiments.applications import SHIPPED
+from experiments.applications.judging.agreement import rate_interval
+from experiments.applications.policies.acting import scale_of
+from experiments.applications.policies.cloning import BcConfig, clone
+from experiments.applications.policies.closed_loop import run_policy, start_seeds
+from experiments.applications.policies.demonstrations import (
+    Demonstrations,
+    load_demonstrations,
+    record,
+    save_demonstrations,
+)
+from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
+from experiments.applications.policies.learning import FitConfig, Report
+from experiments.applications.policies.own_head import OwnHeadPolicy
+from experiments.applications.policies.policy import Policy, RandomPolicy
+from experiments.applications.policies.tasks import Task, find_task
+from experiments.applications.simulators import load_simulator
+from experiments.applications.tables import write_table
+from experiments.progress import step
+from experiments.wrote import wrote
+from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig
+from hma_jax.model.hma import declare_model
+from hma_jax.model.params import Params, path_name
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.training.runs import Model, load_model
+from hma_jax.training.train import train_model
+
+OUT = Path("runs/own_policy")
+OWN, CLONED, DIFFUSION, RANDOM = "HMA's own action head", "behaviour cloning", "Diffusion Policy", "random actions"
+POLICIES = OWN, CLONED, DIFFUSION, RANDOM
+NAMES = ("policy", "start", "success", "distance")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that the results depend on besides the world model."""
+
+    robot: str = "pusher_sand"
+    task: str = "reach"
+    frames: int = 20  # of an episode: more than the model's window
+    hold: int = 4
+    demonstrations: int = 1500
+    noise: float = 0.1  # of the expert
+    starts: int = 100
+    steps: int = 3000  # of training, of every policy
+    batch: int = 12  # windows of the model
+    learning_rate: float = 1e-3
+    seed: int = 0
+
+    def make_task(self) -> Task:
+        return find_task(self.robot, self.task, self.frames, self.hold)
+
+
+def windows(
+    tokens: np.ndarray, demos: Demonstrations, model: Model, robot: Robot, batch: int, seed: int
+) -> Callable[[int], Iterator[dict[str, np.ndarray]]]:
+    """make_batches(start): random windows of tokens [N, L, ...] with their actions; a function of seed and step."""
+    (episodes, longest), frames = tokens.shape[:2], model.config.frames
+    chunks = np.tile(demos.actions, robot.stride)  # an action is held for the whole frame
+    chunks = np.pad(chunks, [(0, 0), (0, 0), (0, model.table.action_width - chunks.shape[-1])])
+    embodiment = model.table.index(robot.name)
+
+    def make(start: int) -> Iterator[dict[str, np.ndarray]]:
+        number = start
+        while True:
+            rng = np.random.default_rng([seed, number])
+            episode = rng.integers(episodes, size=(batch, 1))
+            at = rng.integers(longest - frames + 1, size=(batch, 1)) + np.arange(frames)
+            yield {
+                "tokens": tokens[episode, at], "actions": chunks[episode, at],
+                "embodiment": np.full(batch, embodiment, np.int32),
+            }  # fmt: skip
+            number += 1
+
+    return make
+
+
+def with_heads(model: Model, seed: int) -> tuple[Params, ModelConfig]:
+    """(parameters, configuration) of a model that says the same of frames and has action heads, which know nothing."""
+    config = replace(model.config, action_heads=True)
+    known = {path_name(path): x for path, x in jax.tree_util.tree_leaves_with_path(model.params)}
+    fresh = declare_model(config, model.table).init(seed)
+    return jax.tree_util.tree_map_with_path(lambda path, x: known.get(path_name(path), x), fresh), config
+
+
+def post_train(
+    simulator: Simulator, robot: Robot, demos: Demonstrations, settings: Settings, run: Path, report: Report
+) -> Model:
+    """The world model as a policy, trained or trained on in `run`."""
+    model, tokenizer = simulator.model, simulator.tokenizer
+    flat = demos.images.reshape(-1, *demos.images.shape[2:])
+    tokens = np.concatenate([np.asarray(tokenizer.encode(flat[i : i + 256])) for i in range(0, len(flat), 256)])
+    tokens = tokens.reshape(*demos.images.shape[:2], *tokens.shape[1:])
+    params, config = with_heads(model, settings.seed)
+    make = windows(tokens, demos, model, robot, settings.batch, settings.seed)
+    optimizer = OptimizerConfig(learning_rate=settings.learning_rate, warmup_steps=100, schedule="wsd")
+    training = TrainConfig(
+        steps=settings.steps, batch=settings.batch, optimizer=optimizer, seed=settings.seed, ema_decay=0.99,
+        masking=MaskingConfig(setting="policy"),
+    )  # fmt: skip
+    execution = ExecutionConfig(remat="none")
+    train_model(
+        config, model.table, training, make, run_dir=run, initial=params, execution=execution,
+        provenance={"data": f"demonstrations of {settings.robot}, {settings.task}", "tokenizer": tokenizer.identity},
+        progress=lambda done, total, values: report(done, total, ""),
+    )  # fmt: skip
+    return load_model(run, execution)
+
+
+def make_policy(
+    name: str, simulator: Simulator, robot: Robot, demos: Demonstrations, settings: Settings, out: Path, report: Report
+) -> Policy:
+    fit = FitConfig(settings.steps)
+    if name == OWN:
+        model = post_train(simulator, robot, demos, settings, out / "run", report)
+        return OwnHeadPolicy(model, simulator.tokenizer, robot)
+    if name == CLONED:
+        return clone(demos, BcConfig(frames=1, fit=fit), settings.seed, report)
+    if name == DIFFUSION:
+        config = DiffusionConfig(frames=1, fit=fit)
+        made = train_diffusion(demos, config, settings.seed, report)
+        return DiffusionPolicy(config, made[settings.steps], scale_of(demos))
+    return RandomPolicy(robot)
+
+
+def read_trials(path: Path) -> dict[str, list[tuple[bool, float]]]:
+    """{policy: (success, distance) of each start} of trials.csv."""
+    trials: dict[str, list[tuple[bool, float]]] = {}
+    with open(path, newline="") as file:
+        for row in csv.DictReader(file):
+            trials.setdefault(row["policy"], []).append((row["success"] == "1", float(row["distance"])))
+    return trials
+
+
+def summarise(trials: Mapping[str, list[tuple[bool, float]]]) -> list[tuple[str, float, float, float]]:
+    """(policy, success, its interval of 95 %) over starts."""
+    found = {name: rate_interval(np.array([success for success, _ in ends])) for name, ends in trials.items()}
+    return [(name, rate.mean, rate.low, rate.high) for name, rate in found.items()]
+
+
+def markdown(rows: list[tuple[str, float, float, float]]) -> str:
+    """The table that docs/policies.md shows."""
+    lines = ["| policy | success | 95 % interval |", "|---|---|---|"]
+    lines += [f"| {name} | {mean:.2f} | {low:.2f} to {high:.2f} |" for name, mean, low, high in rows]
+    return "\n".join(lines) + "\n"
+
+
+def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bool, float]]]:
+    """What `read_trials` reads. Every policy's outcomes are kept in `out` and made once."""
+    out.mkdir(parents=True, exist_ok=True)
+    simulator = load_simulator(run)
+    robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
+    seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
+    if not kept.exists():
+        with step(f"record {settings.demonstrations} demonstrations"):
+            made = record(
+                task, settings.demonstrations, stride=robot.stride, image_size=size, noise=settings.noise,
+                only_successes=True, seed=settings.seed,
+            )  # fmt: skip
+        save_demonstrations(made, kept)
+    demos, trials = load_demonstrations(kept), {}
+    for name in POLICIES:
+        path = out / "outcomes" / f"{name.replace(' ', '_')}.json"
+        if not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            with step(name) as report:
+                policy = make_policy(name, simulator, robot, demos, settings, out, report)
+                found = run_policy(task, policy, seeds, size, robot.stride)
+            write_file(path, json.dumps([found.success.tolist(), found.distance.tolist()]))
+        trials[name] = list(zip(*json.loads(path.read_text()), strict=True))
+    return trials
+
+
+def write_results(trials: Mapping[str, list[tuple[bool, float]]], settings: Settings, out: Path) -> None:
+    rows = [[name, k, int(s), f"{d:.4f}"] for name, found in trials.items() for k, (s, d) in enumerate(found)]
+    write_table(out / "trials.csv", NAMES, rows)
+    summary = summarise(trials)
+    cells = [[name, *(f"{x:.4f}" for x in numbers)] for name, *numbers in summary]
+    write_table(out / "summary.csv", ("policy", "mean", "low", "high"), cells)
+    write_file(out / "table.md", markdown(summary))
+    write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
+    print(markdown(summary))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
+    parser.add_argument("--starts", type=int, default=Settings.starts)
+    asked = parser.parse_args()
+    settings, out = Settings(steps=asked.steps, starts=asked.starts), asked.out
+    write_results(compare(asked.run, out, settings), settings, out)
+    wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""A world model that is post-trained to be a policy."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from experiments.applications import own_policy
+from experiments.applications.own_policy import (
+    OWN,
+    RANDOM,
+    Settings,
+    compare,
+    read_trials,
+    summarise,
+    windows,
+    with_heads,
+    write_results,
+)
+from experiments.applications.policies.demonstrations import Demonstrations
+from hma_jax.model.params import path_name
+from tests.experiments.applications.runs import make_run
+from tests.hma_jax.simulator.small import ROBOTS, parts
+
+FEW = Settings(demonstrations=4, starts=3, steps=2, batch=2, frames=6)
+
+
+def test_windows_are_parts_of_episodes_with_the_actions_given_at_their_frames():
+    model, robot = parts()[0], ROBOTS[1]  # two native steps per frame
+    rng = np.random.default_rng(0)
+    demos = Demonstrations(
+        np.zeros((3, 6, 8, 8, 3), np.uint8), rng.normal(size=(3, 6, 7)).astype(np.float32), np.full(3, 6),
+        np.zeros((3, 6), bool), np.ones(3, bool), np.arange(3),
+    )  # fmt: skip
+    tokens = np.broadcast_to(np.arange(6)[:, None], (3, 6, 4)) + 100 * np.arange(3)[:, None, None]
+    make = windows(tokens, demos, model, robot, 2, seed=0)
+    first, second = (batch for batch, _ in zip(make(0), range(2), strict=False))
+    again = next(make(1))
+    for name in first:
+        np.testing.assert_array_equal(again[name], second[name])
+    assert (first["embodiment"] == 1).all()
+    for window, actions in zip(second["tokens"], second["actions"], strict=True):
+        episode, at = window[0, 0] // 100, window[:, 0] % 100
+        assert (np.diff(at) == 1).all()
+        assert actions.shape == (model.config.frames, 14) and len(at) == model.config.frames
+        for part in (actions[:, :7], actions[:, 7:]):
+            np.testing.assert_array_equal(part, demos.actions[episode, at])
+
+
+def test_heads_are_added_and_nothing_else_changes():
+    model = parts()[0]
+    bare = replace(model, run=replace(model.run, model=replace(model.config, action_heads=False)))
+    known = {path_name(p): x for p, x in jax.tree_util.tree_leaves_with_path(bare.params)}
+    params, config = with_heads(bare, 0)
+    assert config.action_heads
+    for path, x in jax.tree_util.tree_leaves_with_path(params):
+        if path_name(path) in known:
+            np.testing.assert_array_equal(x, known[path_name(path)])
+
+
+def test_outcomes_are_made_once_and_written_with_intervals(tmp_path, monkeypatch):
+    run, out = make_run(tmp_path / "study"), tmp_path / "out"
+    monkeypatch.setattr(own_policy, "POLICIES", (OWN, RANDOM))
+    trials = compare(run, out, FEW)
+    assert list(trials) == [OWN, RANDOM] and {len(found) for found in trials.values()} == {FEW.starts}
+    write_results(trials, FEW, out)
+    assert read_trials(out / "trials.csv") == {
+        name: [(s, round(d, 4)) for s, d in found] for name, found in trials.items()
+    }
+    monkeypatch.setattr(own_policy, "make_policy", lambda *_: pytest.fail("it was made again"))
+    assert compare(run, out, FEW) == trials
+    done = summarise({"all": [(True, 0.0)] * 10, "none": [(False, 1.0)] * 10})
+    assert [row[1] for row in done] == [1.0, 0.0] and done[0][2] > 0.6 and done[1][3] < 0.4
