@@ -1,7 +1,7 @@
 """HMA itself as a policy, beside behaviour cloning and a Diffusion Policy.
 
 Question: how good is the model's own action head in closed loop, in the true simulator and past its window?
-Paper: section 3.1, policies as one of the settings that the model is trained in; section 5, post-training.
+Paper: paper section 3.1, policies as one of the settings that the model is trained in.
 Command: python -m experiments.applications.own_policy
 Cost: half an hour of two cores; goes on where it was stopped.
 Expected: well above random actions; no better than policies made for nothing else.

@@ -55,7 +55,7 @@ def open_record(path: Location, offset: int, length: int) -> Iterator[bytes]:
     """Record number `offset`, for the time of a `with`, as `tfrecord.open_record`. `length` is not used."""
     del length
     try:
-        payload = _reader(path).read([offset])[0]
+        payload = _reader(path).read(offset, offset + 1)[0]  # of a list it would go through all records
     except (RuntimeError, IndexError) as error:
         raise _damage(path, offset, error) from error
     yield payload
