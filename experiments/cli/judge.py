@@ -24,6 +24,7 @@ def judge(
     frames: Annotated[int | None, UNSET] = None,
     demonstrations: int = 3000,
     steps: int = 6000,
+    head_steps: int = 6000,
     cloned: int = 6,
     diffusion: int = 3,
     seed: int = 0,
@@ -47,7 +48,8 @@ def judge(
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's.
         demonstrations: Episodes of the scripted expert that the policies are trained on.
-        steps: Of training of each kind of policy, and of the success head.
+        steps: Of training of each kind of policy.
+        head_steps: Of training of the success head.
         cloned: Checkpoints of behaviour cloning.
         diffusion: Checkpoints of the Diffusion Policy.
         seed: Of recordings, training and episodes.
@@ -79,7 +81,7 @@ def judge(
         seed,
         demonstrations=demonstrations,
         ladder=ladder,
-        head=HeadConfig(fit=FitConfig(steps=steps)),
+        head=HeadConfig(fit=FitConfig(steps=head_steps)),
     )
     judged = judge_run(run, out, config, step)
     summary = summarise(judged)
@@ -88,8 +90,8 @@ def judge(
     draw_scatter(summary, out / "scatter.png")
     command = (
         f"hma judge {run} --robot {robot} --task {task} --starts {starts} --frames {config.task.frames} "
-        f"--demonstrations {demonstrations} --steps {steps} --cloned {cloned} --diffusion {diffusion} --seed {seed} "
-        f"--out {out}"
+        f"--demonstrations {demonstrations} --steps {steps} --head-steps {head_steps} --cloned {cloned} "
+        f"--diffusion {diffusion} --seed {seed} --out {out}"
     )
     page = write_page(judged, summary, out, command)
     blind = write_blind(judged, out)

@@ -78,7 +78,10 @@ class _Task:
             require(0 <= number < len(self.starts), f"there are {len(self.starts)} starts, no {number}")
             chosen.append(self.starts[number])
             seeds.append(int(rng.integers(2**32)))
-        return self.simulator.reset(chosen, seeds=seeds, episodes=episodes)
+        images = self.simulator.reset(chosen, seeds=seeds, episodes=episodes)
+        if hasattr(self.judge, "begin"):
+            self.judge.begin(self.simulator, episodes)
+        return images
 
 
 class RobotEnv(gymnasium.Env):

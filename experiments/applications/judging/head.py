@@ -1,10 +1,12 @@
-"""The success head: from the present frame, how probable it is that the goal is reached. Trained on recorded frames
-that the simulator's state labels; some of them as the model's tokenizer would show them."""
+"""The success head: from the present frame and the episode's first one, how probable it is that the goal is reached.
+
+A model may lose the mark once something covers it; the first frame shows where it is. Trained on recorded frames that
+the simulator's state labels; some of them as the model's tokenizer would show them."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,6 +53,7 @@ class HeadConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=lambda: FitConfig(steps=3000, learning_rate=2e-3))
     light: float = 0.03
+    first: bool = True  # it sees the frame in which the episode begins as well, where the goal is whole
     threshold: float = 0.5
 
     def __post_init__(self):
@@ -61,14 +64,14 @@ def init_head(config: HeadConfig, seed: int) -> Params:
     first, second = jax.random.split(jax.random.key(seed))
     hidden = config.encoder.hidden
     return {
-        "encoder": init_encoder(first, config.encoder, 3),
+        "encoder": init_encoder(first, config.encoder, 6 if config.first else 3),
         "mlp": init_mlp(second, (config.encoder.features, hidden, hidden, 1)),
     }
 
 
 def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Array:
-    """Logits [B] of frames [B, H, W, 3] in [-1, 1]."""
-    return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames[:, None])))[:, 0]
+    """Logits [B] of frames [B, 1, H, W, 3] in [-1, 1], or [B, 2, H, W, 3], the first one of the episode before."""
+    return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames)))[:, 0]
 
 
 class SuccessHead:
@@ -78,9 +81,13 @@ class SuccessHead:
         self.config, self.params, self.measured = config, params, dict(measured or {})
         self._apply = jax.jit(lambda params, frames: jax.nn.sigmoid(apply_head(params, config, as_floats(frames))))
 
-    def probabilities(self, images: np.ndarray) -> np.ndarray:
-        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each."""
-        flat = shrink_bytes(images, self.config.encoder.size).reshape(-1, *(self.config.encoder.size,) * 2, 3)
+    def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`, which may have the
+        size 1 where `images` have frames of one episode, are those in which the episodes begin."""
+        size = self.config.encoder.size
+        seen = [first, images] if self.config.first else [images]
+        small = [np.broadcast_to(s := shrink_bytes(x, size), (*images.shape[:-3], *s.shape[-3:])) for x in seen]
+        flat = np.stack(small, -4).reshape(-1, len(seen), size, size, 3)
         found = []
         for first in range(0, len(flat), PIECE):
             part = flat[first : first + PIECE]
@@ -89,9 +96,9 @@ class SuccessHead:
             found.append(np.asarray(self._apply(self.params, padded))[: len(part)])
         return np.concatenate(found).reshape(images.shape[:-3])
 
-    def reached(self, images: np.ndarray) -> np.ndarray:
+    def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         """bool [...]: it is taken for reached."""
-        return self.probabilities(images) > self.config.threshold
+        return self.probabilities(images, first) > self.config.threshold
 
 
 def train_head(
@@ -107,16 +114,18 @@ def train_head(
     Raises ConfigError where all frames have one label.
     """
     steps = demos.steps()
-    images = demos.images[steps[:, 0], steps[:, 1]]
+    images, begun = demos.images[steps[:, 0], steps[:, 1]], demos.images[steps[:, 0], 0]
     labels = demos.reached[steps[:, 0], steps[:, 1]]
     require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
     if reconstruct is not None:
-        images[::RECONSTRUCTED] = reconstruct(images[::RECONSTRUCTED])
+        for seen in (images, begun):
+            seen[::RECONSTRUCTED] = reconstruct(seen[::RECONSTRUCTED])
+    seen = np.stack([shrink_bytes(x, config.encoder.size) for x in ([begun, images] if config.first else [images])], 1)
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
-    data = {"images": shrink_bytes(images, config.encoder.size), "label": labels.astype(np.float32), "weight": weight}
+    data = {"images": seen, "label": labels.astype(np.float32), "weight": weight}
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
-        frames = lit(as_floats(data["images"][index])[:, None], key, config.light)[:, 0]
+        frames = lit(as_floats(data["images"][index]), key, config.light)
         errors = optax.sigmoid_binary_cross_entropy(apply_head(params, config, frames), data["label"][index])
         return jnp.mean(errors * data["weight"][index])
 
@@ -160,15 +169,23 @@ def load_head(directory: Path) -> SuccessHead:
 
 class HeadJudge:
     """A `Judge` of the simulators' Gymnasium environments: 1 and the end once the head has seen success at `hold`
-    frames in a row. Frames of an episode that begins anew are no success, which is how it forgets the one before."""
+    frames in a row. The environment says when episodes begin."""
 
     def __init__(self, head: SuccessHead, hold: int = 1):
         self.head, self.hold = head, hold
         self._count: np.ndarray | None = None
+        self._first: np.ndarray | None = None  # frames in which the episodes began
+
+    def begin(self, simulator: AnySimulator, episodes: Sequence[int]) -> None:
+        """These episodes begin with the simulator's present frames."""
+        if self._first is None:
+            self._first, self._count = simulator.images.copy(), np.zeros(len(simulator.images), int)
+        self._first[list(episodes)], self._count[list(episodes)] = simulator.images[list(episodes)], 0
 
     def __call__(self, simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:
-        reached = self.head.reached(simulator.images)
-        count = np.zeros(len(reached), int) if self._count is None else self._count
-        self._count = np.where(reached, count + 1, 0)
+        """Raises ConfigError before the first `begin`."""
+        require(self._first is not None, "no episode has begun: call `begin` after the simulator's reset")
+        reached = self.head.reached(simulator.images, self._first)
+        self._count = np.where(reached, self._count + 1, 0)
         done = self._count >= self.hold
         return done.astype(float), done

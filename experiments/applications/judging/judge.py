@@ -52,7 +52,7 @@ class JudgeConfig:
     noise: tuple[float, ...] = (0.0, 0.1)  # of the expert that is cloned
     ladder: LadderConfig = field(default_factory=LadderConfig)
     head: HeadConfig = field(default_factory=HeadConfig)
-    head_episodes: int = 1200
+    head_episodes: int = 3000
     head_noise: tuple[float, ...] = (0.0, 0.2, 0.6)  # of the expert in the head's recordings; a third are play
 
     def __post_init__(self):
@@ -182,7 +182,7 @@ def _find_head(directory: Path, config: JudgeConfig, simulator: Simulator, strid
 def measure_head(head: SuccessHead, demos: Demonstrations, task: Task) -> dict[str, float]:
     """On recorded true frames: accuracy and AUROC of frames, and accuracy of whole episodes."""
     steps = demos.steps()
-    score = head.probabilities(demos.images)
+    score = head.probabilities(demos.images, demos.images[:, :1])
     frames, labels = score[steps[:, 0], steps[:, 1]], demos.reached[steps[:, 0], steps[:, 1]]
     by_head = held(score > head.config.threshold, task.hold).any(1)
     return {

@@ -46,7 +46,7 @@ def judge_rollout(
     seeds: Sequence[int],
 ) -> list[Outcome]:
     """By the head in every world, by the state in the true one. The start itself does not count."""
-    found = {HEAD: held(head.reached(rollout.images[:, 1:]), task.hold).any(1)}
+    found = {HEAD: held(head.reached(rollout.images[:, 1:], rollout.images[:, :1]), task.hold).any(1)}
     if world == TRUE:
         found[STATE] = held(rollout.reached[:, 1:], task.hold).any(1)
     return [

@@ -58,6 +58,27 @@ def test_an_episode_ends_by_its_judge_or_its_length():
     assert env.step(env.action_space.sample())[1:3] == (2.5, True)
 
 
+def test_a_judge_is_told_of_episodes_that_begin():
+    class Judge:
+        def __init__(self):
+            self.begun = []
+
+        def begin(self, simulator, episodes):
+            self.begun.append((list(episodes), simulator.images.copy()))
+
+        def __call__(self, simulator):
+            return np.zeros(2), np.array([True, False])
+
+    judge = Judge()
+    env = RobotVectorEnv(2, simulator=simulator(episodes=2), starts=STARTS, robot="arm", judge=judge)
+    first, _ = env.reset(seed=0)
+    for _ in range(2):  # the first episode ends with the first step and begins anew with the second
+        images = env.step(np.stack([env.single_action_space.low] * 2))[0]
+    assert [episodes for episodes, _ in judge.begun] == [[0, 1], [0]]
+    np.testing.assert_array_equal(judge.begun[0][1], first)
+    np.testing.assert_array_equal(judge.begun[1][1][0], images[0])
+
+
 def test_a_clipped_action_is_said():
     env = RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
     env.reset(seed=0)

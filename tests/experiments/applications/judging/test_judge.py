@@ -110,8 +110,14 @@ def test_the_head_judges_environments_and_forgets_with_them(judged):
     head = load_head(judged[0] / "out" / "head")
     assert set(head.measured) >= {"frame accuracy", "frame AUROC", "episode accuracy"}
     judge = HeadJudge(head, hold=2)
-    head.reached = lambda images: images[:, 0, 0, 0] > 0
+    head.reached = lambda images, first: images[:, 0, 0, 0] > first[:, 0, 0, 0]
     frames = [[1, 0], [1, 1], [1, 0], [0, 1], [1, 1]]
     images = [np.broadcast_to(np.array(f)[:, None, None, None], (2, 8, 8, 3)) for f in frames]
-    done = [judge(SimpleNamespace(images=each))[1] for each in images]
-    assert [d.tolist() for d in done] == [[False, False], [True, False], [True, False], [False, False], [False, True]]
+    seen = [SimpleNamespace(images=each) for each in images]
+    with pytest.raises(ConfigError, match="no episode has begun"):
+        judge(seen[0])
+    judge.begin(SimpleNamespace(images=np.zeros_like(images[0])), [0, 1])
+    done = [judge(each)[1].tolist() for each in seen]
+    assert done == [[False, False], [True, False], [True, False], [False, False], [False, True]]
+    judge.begin(seen[0], [0])  # which begins with a 1
+    assert judge(seen[1])[1].tolist() == [False, True] and judge(seen[4])[1].tolist() == [False, True]
