@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.text import Annotation
+from matplotlib.transforms import Bbox
 
 from data_pipelines.publishing.files import write_file
 from experiments.applications.judging.judge import Judged
@@ -26,6 +29,7 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
     """Success in the true world against success in the learned one, and in the control, a point for each policy."""
     with plt.rc_context(STYLE):
         figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.7), sharex=True, sharey=True)
+        labels: list[list[Annotation]] = []
         for panel, column, title in zip(
             panels,
             ("learned, by head", "shuffled, by head"),
@@ -33,6 +37,7 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
             strict=True,
         ):
             panel.plot([0, 1], [0, 1], color=MUTED, linewidth=1, zorder=1)
+            words = []
             for name, rates in summary["policies"].items():
                 x, y = rates["true, by state"], rates[column]
                 spread = (
@@ -44,16 +49,34 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
                     x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
                     color=colour, elinewidth=0.8, markersize=5,
                 )  # fmt: skip
-                panel.annotate(name, (x["mean"], y["mean"]), (4, 4), textcoords="offset points", fontsize=7, color=INK)
+                at = (x["mean"], y["mean"])
+                left = x["mean"] > 0.85  # there is no room on the right
+                words.append(panel.annotate(
+                    name, at, (-4 if left else 4, 4), textcoords="offset points", fontsize=7, color=INK,
+                    ha="right" if left else "left",
+                ))  # fmt: skip
             panel.set(
                 xlim=(-0.03, 1.03),
                 ylim=(-0.03, 1.03),
                 title=title,
                 xlabel="success in the true simulator, by its state",
             )
+            labels.append(words)
         panels[0].set_ylabel("success in the model, by the head")
         figure.tight_layout()
+        figure.canvas.draw()
+        for words in labels:
+            thin_out(words)
         save(figure, path)
+
+
+def thin_out(words: Sequence[Annotation]) -> None:
+    """Hides what would be written over another word; the table has all names."""
+    kept: list[Bbox] = []
+    for word in words:
+        box = word.get_window_extent()
+        word.set_visible(not any(box.overlaps(other) for other in kept))
+        kept += [box] if word.get_visible() else []
 
 
 def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str) -> Path:
