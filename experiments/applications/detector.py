@@ -149,6 +149,8 @@ def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, obj
     for kind, prefix in (("tool", "tool"), ("object", "colour")):
         mine = [i for i, name in enumerate(names) if name.startswith(prefix)]
         there, sure = scenes.there[:, mine], confidence[:, mine] >= SURE
+        if not there.any():
+            continue  # a robot that touches nothing
         far = off[:, mine][there]
         near = {f"within_{r:g}px": float(np.mean((far <= r) & sure[there])) for r in NEAR}
         rows.append({
