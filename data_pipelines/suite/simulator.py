@@ -155,16 +155,20 @@ def _keys(spec: EmbodimentSpec) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(sign * (d == at) for d, sign in enumerate(signs)) for at in moved)
 
 
-def suite_starts(name: str, count: int, frames: int, *, stride: int | None = None, seed: int = 0) -> list[Start]:
-    """The first `frames` frames of `count` held-out episodes of a suite made with `seed`.
+def suite_starts(
+    name: str, count: int, frames: int, *, stride: int | None = None, seed: int = 0, most: int | None = None
+) -> list[Start]:
+    """The first `frames` frames of `count` held-out episodes of a suite made with `seed`, of the first `most` that are
+    long enough (None: of all).
 
-    A frame is seen every `stride` native steps; None: as nearly twice a second as they can be. Episodes that are not long
-    enough are left out.
+    A frame is seen every `stride` native steps; None: as nearly twice a second as they can be.
     """
     spec = SPECS[name]
     stride, numbers = stride or stride_of(spec.hz), episode_seeds(spec, count, seed, "val")
     rollout, starts = simulate(spec, numbers), []
     for i, number in enumerate(numbers):
+        if len(starts) == most:
+            break
         if rollout.lengths[i] <= (frames - 1) * stride:
             continue
         world, images = Environment(spec), []

@@ -112,7 +112,7 @@ def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_
 def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Start], np.ndarray]:
     """At most `count` starts of episodes that no suite of seed 0 has, with images of `size`, and what was done in the
     `frames` after each: chunks [n, frames, stride, A]. Fewer where the robot's episodes are too short."""
-    whole = suite_starts(robot.name, 16 * count, START_FRAMES + frames, stride=robot.stride, seed=1)[:count]
+    whole = suite_starts(robot.name, 16 * count, START_FRAMES + frames, stride=robot.stride, seed=1, most=count)
     given = (START_FRAMES - 1) * robot.stride
     starts = [
         Start(s.robot, fit_images(s.images[:START_FRAMES], size), s.actions[:given], s.seed) for s in whole

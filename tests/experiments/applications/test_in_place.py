@@ -60,13 +60,17 @@ def test_the_share_is_of_what_moved_and_a_mean_over_robots():
     assert in_place([], "true")[2] == 0
 
 
-def test_a_detector_sees_frames_as_small_as_the_run_s(simulator, tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_a_detector_is_made_of_a_run_s_robots(simulator, tmp_path, monkeypatch):
     few = {"EPISODES": 4, "FEWEST": 2, "PER_EPISODE": 2, "HELD_OUT": (2, 2), "STEPS": 1, "MORE": 1}
     for name, value in few.items():
         monkeypatch.setattr(detector_module, name, value)
     made = make_detector(list(simulator.robots), simulator.tokenizer, tmp_path)
     assert made.robots == ("pusher_sand", "gripper_wood")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["detector.npz", "errors.csv"]
+
+
+def test_a_detector_sees_frames_as_small_as_the_run_s(simulator):
     scenes = draw_scenes(SPECS["pusher_sand"], "train", 2, 2, 0)
     given, shown = (f(simulator.tokenizer, scenes) for f in (as_given, as_shown))
     size = simulator.tokenizer.image_size

@@ -59,6 +59,7 @@ def test_heads_are_added_and_nothing_else_changes():
             np.testing.assert_array_equal(x, known[path_name(path)])
 
 
+@pytest.mark.slow
 def test_outcomes_are_made_once_and_written_with_intervals(tmp_path, monkeypatch):
     run, out = make_run(tmp_path / "study"), tmp_path / "out"
     monkeypatch.setattr(own_policy, "POLICIES", (OWN, RANDOM))
