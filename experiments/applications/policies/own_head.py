@@ -1,7 +1,7 @@
 """HMA itself as a policy: its action head reads the next chunk off the frames it sees, as long as one likes.
 
 Past the model's window the oldest frame and its action are forgotten. Needs a run with `model.action_heads`; the model
-of this repository was trained without.
+of this repository was trained without (`experiments.applications.own_policy` adds them).
 """
 
 from __future__ import annotations

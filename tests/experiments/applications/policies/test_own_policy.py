@@ -1,6 +1,7 @@
 """A world model that is post-trained to be a policy."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ from experiments.applications.own_policy import (
     RANDOM,
     Settings,
     compare,
+    markdown,
     read_trials,
     summarise,
     windows,
@@ -57,6 +59,13 @@ def test_heads_are_added_and_nothing_else_changes():
     for path, x in jax.tree_util.tree_leaves_with_path(params):
         if path_name(path) in known:
             np.testing.assert_array_equal(x, known[path_name(path)])
+
+
+def test_the_page_says_what_came():
+    root = Path(__file__).parents[4]
+    table = markdown(summarise(read_trials(root / "experiments/results/own_policy/trials.csv")))
+    assert table == (root / "experiments/results/own_policy/table.md").read_text()
+    assert table in (root / "docs/policies.md").read_text()
 
 
 @pytest.mark.slow
