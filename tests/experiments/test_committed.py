@@ -5,9 +5,11 @@ table alone cannot be: its files are held by their hashes.
 """
 
 import hashlib
+import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments.report.draw import draw, draw_again
@@ -39,6 +41,18 @@ def test_every_trial_of_a_table_is_finished_and_judged(name):
     assert {r.status for r in rows} == {FINISHED}
     assert all(r.metric for r in rows)
     assert len({r.manifest for r in rows}) == 1, "judged on different windows"
+
+
+def test_the_first_axis_by_how_much_data_a_robot_has_is_as_the_page_on_designs_says():
+    folder = RESULTS / "cpu-full-horizon"
+    windows = {name: d["windows"] for name, d in json.loads((folder / "data.json").read_text()).items()}
+    rows = [r for r in read_csv(folder / "results.csv") if r.metric == "cross_entropy" and r.role == "point"]
+    page = (RESULTS.parents[1] / "docs/designs.md").read_text()
+    for least, most in ((0, 400), (400, 2000), (2000, 10**9)):
+        mine = [r for r in rows if least <= windows.get(r.scope, -1) < most]
+        means = [np.mean([r.mean for r in mine if r.x == n]) for n in (500, 1000, 2000, 4000, 8000, 16_000)]
+        line = " | ".join([str(len({r.scope for r in mine})), *(f"{mean:.2f}" for mean in means)])
+        assert f"| {line} |" in page, line
 
 
 @pytest.mark.parametrize("name", STUDIES)
