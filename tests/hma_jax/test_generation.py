@@ -381,6 +381,7 @@ def test_one_to_twenty_four_frames_of_different_robots_equal_the_oracle_s(
         np.testing.assert_array_equal(fast(params), want[:, :new])
 
 
+@pytest.mark.slow
 def test_the_sliding_rollout_is_exact_for_continuous_tokens_and_hidden_actions():
     hidden = np.random.default_rng(0).random((2, LONG)) < 0.5
     got, want = whole_rollouts(model_config(diffusion=DIFFUSION), DecodeConfig(2, sampler=SAMPLER), 4, hidden)

@@ -185,6 +185,7 @@ def test_a_window_without_a_frame_to_predict_is_refused():
         evaluate(lively_params(MODEL)[1], MODEL, TABLE, TOKENIZER, [batch], EVAL)
 
 
+@pytest.mark.slow
 def test_random_actions_and_errors_are_of_the_recorded_statistics():
     """A model trained on a few trajectories has a table of those; it is judged as any other."""
     (batch,) = make_batches(MODEL, names=("arm",), each=4)

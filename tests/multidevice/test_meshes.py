@@ -41,6 +41,7 @@ def check_forty_robots(kind: str, steps: int, meshes: tuple[str, ...], robots: i
     return found
 
 
+@pytest.mark.slow
 def test_forty_robots_train_on_eight_devices_as_on_one():
     check_forty_robots("ids", 4, ("2,2,2",))
 

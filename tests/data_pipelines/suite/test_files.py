@@ -163,7 +163,9 @@ def test_bytes_do_not_depend_on_the_number_of_workers(suite, tmp_path):
     assert contents(tmp_path) == contents(suite)
 
 
-@pytest.mark.parametrize("everyone", (False, True), ids=("by kill", "by a terminal"))
+@pytest.mark.parametrize(
+    "everyone", (False, pytest.param(True, marks=pytest.mark.slow)), ids=("by kill", "by a terminal")
+)
 def test_ctrl_c_ends_processes_that_have_hours_to_do(tmp_path, everyone):
     """A terminal sends it to every process of the command, kill to one."""
     call = f"generate_suite(Path({str(tmp_path)!r}), scale=1000.0, names={NAMES}, workers=2)"

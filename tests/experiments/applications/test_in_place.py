@@ -13,6 +13,7 @@ from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.detector import Found
 from tests.experiments.applications.runs import make_run
+from tests.hma_jax.simulator.small import parts
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +32,7 @@ class Oracle(Detector):
         return self.found[len(self.films) - 1]
 
 
+@pytest.mark.slow
 def test_places_at_the_end_are_those_of_the_true_simulator(simulator):
     robot = simulator.robots["pusher_sand"]
     points = len(point_names(SPECS[robot.name]))
@@ -70,14 +72,14 @@ def test_a_detector_is_made_of_a_run_s_robots(simulator, tmp_path, monkeypatch):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["detector.npz", "errors.csv"]
 
 
-def test_a_detector_sees_frames_as_small_as_the_run_s(simulator):
-    scenes = draw_scenes(SPECS["pusher_sand"], "train", 2, 2, 0)
-    given, shown = (f(simulator.tokenizer, scenes) for f in (as_given, as_shown))
-    size = simulator.tokenizer.image_size
+def test_a_detector_sees_frames_as_small_as_the_run_s():
+    tokenizer, scenes = parts()[1], draw_scenes(SPECS["pusher_sand"], "train", 2, 2, 0)
+    given, shown = (f(tokenizer, scenes) for f in (as_given, as_shown))
+    size = tokenizer.image_size
     assert given.images.shape == scenes.images.shape
     np.testing.assert_array_equal(given.images[:, :: 64 // size, :: 64 // size], fit_images(scenes.images, size))
     assert (shown.images != given.images).any()
-    half = as_shown(simulator.tokenizer, scenes, every=2).images
+    half = as_shown(tokenizer, scenes, every=2).images
     np.testing.assert_array_equal(half[::2], shown.images[::2])
     np.testing.assert_array_equal(half[1::2], given.images[1::2])
     with pytest.raises(ConfigError, match="cannot be enlarged"):

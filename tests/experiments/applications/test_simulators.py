@@ -53,6 +53,7 @@ def test_true_and_learned_are_exchanged_by_one_word(run):
     assert seen["learned"] == seen["true"]
 
 
+@pytest.mark.slow
 def test_what_is_shipped_stands_alone_and_does_the_same(run, tmp_path):
     out, decode = tmp_path / "simulator", DecodeConfig(3, temperature=0.5)
     ship(run, out, decode)
