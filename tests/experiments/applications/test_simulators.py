@@ -39,6 +39,7 @@ def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
     assert dict(load_simulator(trial).robots) == dict(load_simulator(run).robots)
 
 
+@pytest.mark.slow
 def test_true_and_learned_are_exchanged_by_one_word(run):
     seen = {}
     for world in ("learned", "true"):
