@@ -158,8 +158,8 @@ def _keys(spec: EmbodimentSpec) -> tuple[tuple[float, ...], ...]:
 def suite_starts(
     name: str, count: int, frames: int, *, stride: int | None = None, seed: int = 0, most: int | None = None
 ) -> list[Start]:
-    """The first `frames` frames of `count` held-out episodes of a suite made with `seed`, of the first `most` that are
-    long enough (None: of all).
+    """The first `frames` frames of those of the first `count` held-out episodes of a suite made with `seed` that are
+    long enough, at most of `most` of them (None: of all).
 
     A frame is seen every `stride` native steps; None: as nearly twice a second as they can be.
     """

@@ -53,7 +53,10 @@ SURE = 0.15
 """Confidence from which a point counts as found."""
 
 NEAR = (2.0, 4.0)
-"""Pixels of a 64-pixel frame: the second is 2 pixels of a frame of 32."""
+"""Pixels of a 64-pixel frame that its own errors are counted within."""
+
+CLOSE = NEAR[1]
+"""2 pixels of a frame of 32: what is found within them of the truth is where it should be."""
 
 BLOCK = 64
 """Frames that are watched in one call."""

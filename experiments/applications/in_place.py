@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.suite.simulator import SPECS
-from experiments.analysis.intervals import critical
-from experiments.applications.detector import NEAR, SURE, WEIGHTS, Detector, enlarged, known_robots, make_detector
+from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector, enlarged, known_robots, make_detector
+from experiments.applications.endurance.tables import Row, over_robots
 from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.applications.tables import write_rows
@@ -30,13 +30,10 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
 EPISODES = 8
-CLOSE = NEAR[1]
 TABLE = "in_place.csv"
 VIEWS = ("model", "true", "still")
 """Whose last frame the detector looks at: the model's, the true one (what it misses there is its own error), and the
 last one of the prompt, which is what copying shows."""
-
-Row = dict[str, object]
 
 
 def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[Row]:
@@ -82,16 +79,12 @@ def _points(true, robot: Robot, episodes: int) -> Points:
 def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
     """(share, half of its 95 % interval, robots): of what moved by more than `CLOSE`, how much is found as near its
     true place, by robot, then over robots (Student's t)."""
-    by_robot: dict[object, list[bool]] = {}
-    for row in rows:
-        if float(row["moved_px"]) > CLOSE:  # not of what came into view
-            near = float(row[f"{view}_px"]) <= CLOSE and float(row[f"{view}_confidence"]) >= SURE
-            by_robot.setdefault(row["robot"], []).append(near)
-    shares = np.array([np.mean(near) for near in by_robot.values()])
-    if len(shares) < 2:
-        return (float(shares.mean()) if len(shares) else float("nan")), float("nan"), len(shares)
-    half = critical(len(shares) - 1) * shares.std(ddof=1) / np.sqrt(len(shares))
-    return float(shares.mean()), float(half), len(shares)
+    near = [
+        {"robot": row["robot"], "near": float(row[f"{view}_px"]) <= CLOSE and float(row[f"{view}_confidence"]) >= SURE}
+        for row in rows
+        if float(row["moved_px"]) > CLOSE  # not of what came into view
+    ]
+    return over_robots(near, "near") if near else (float("nan"), float("nan"), 0)
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 Question: how good is the model's own action head in closed loop, in the true simulator and past its window?
 Paper: paper section 3.1, policies as one of the settings that the model is trained in.
 Command: python -m experiments.applications.own_policy
-Cost: half an hour of two cores; goes on where it was stopped.
+Cost: forty minutes of one core; goes on where it was stopped.
 Expected: well above random actions; no better than policies made for nothing else.
 
 The world model gets action heads and is post-trained, all of it, to say what an expert does next (`masking.setting` is
@@ -27,6 +27,7 @@ import numpy as np
 from data_pipelines.publishing.files import write_file
 from experiments.applications import SHIPPED
 from experiments.applications.judging.agreement import rate_interval
+from experiments.applications.made_with import claim
 from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import run_policy, start_seeds
@@ -174,8 +175,9 @@ def markdown(rows: list[tuple[str, float, float, float]]) -> str:
 
 
 def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bool, float]]]:
-    """What `read_trials` reads. Every policy's outcomes are kept in `out` and made once."""
-    out.mkdir(parents=True, exist_ok=True)
+    """What `read_trials` reads. Every policy's outcomes are kept in `out` and made once. Raises ConfigError where they
+    were made with other settings."""
+    claim(out, run, asdict(settings))
     simulator = load_simulator(run)
     robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
@@ -199,14 +201,13 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
     return trials
 
 
-def write_results(trials: Mapping[str, list[tuple[bool, float]]], settings: Settings, out: Path) -> None:
+def write_results(trials: Mapping[str, list[tuple[bool, float]]], out: Path) -> None:
     rows = [[name, k, int(s), f"{d:.4f}"] for name, found in trials.items() for k, (s, d) in enumerate(found)]
     write_table(out / "trials.csv", NAMES, rows)
     summary = summarise(trials)
     cells = [[name, *(f"{x:.4f}" for x in numbers)] for name, *numbers in summary]
     write_table(out / "summary.csv", ("policy", "mean", "low", "high"), cells)
     write_file(out / "table.md", markdown(summary))
-    write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
     print(markdown(summary))
 
 
@@ -218,7 +219,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=Settings.starts)
     asked = parser.parse_args()
     settings, out = Settings(steps=asked.steps, starts=asked.starts), asked.out
-    write_results(compare(asked.run, out, settings), settings, out)
+    write_results(compare(asked.run, out, settings), out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md")
 
 

@@ -36,6 +36,7 @@ from data_pipelines.suite.world import World
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.intervals import Interval
 from experiments.applications import SHIPPED
+from experiments.applications.made_with import claim
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
 from experiments.applications.planning.goals import to_picture
@@ -159,7 +160,7 @@ def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval,
     return list(zip(trials, bootstrap_intervals(panel), seconds, strict=True))
 
 
-def write_results(settings: Settings, trials: Mapping[str, Sequence[dict]], out: Path) -> None:
+def write_results(trials: Mapping[str, Sequence[dict]], out: Path) -> None:
     rows = [
         [way, k, int(t["success"]), f"{t['distance']:.4f}", f"{t['seconds']:.4f}"]
         for way, found in trials.items()
@@ -170,7 +171,6 @@ def write_results(settings: Settings, trials: Mapping[str, Sequence[dict]], out:
     summary = [[way, *(f"{x:.4f}" for x in (r.mean, r.low, r.high, seconds))] for way, r, seconds in found]
     write_table(out / "summary.csv", ["way", "mean", "low", "high", "seconds_per_plan"], summary)
     write_file(out / "table.md", markdown(found))
-    write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
     draw(found, out / "planning.png")
 
 
@@ -226,7 +226,8 @@ def main() -> None:
     run, out = asked.pop("run"), asked.pop("out")
     search = SearchConfig(candidates=asked.pop("candidates"), iterations=asked.pop("iterations"))
     settings = Settings(search=search, **asked)
-    (out / "trials").mkdir(parents=True, exist_ok=True)
+    claim(out, run, asdict(settings))
+    (out / "trials").mkdir(exist_ok=True)
     decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)
     simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
@@ -249,7 +250,7 @@ def main() -> None:
                         write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
                     trials[way].append(json.loads(path.read_text()))
                 update(k + 1, len(seeds), f"starts{pace(k + 1, len(seeds))}")
-        write_results(settings, {name: trials[name] for name in WAYS if name in trials}, out)
+        write_results({name: trials[name] for name in WAYS if name in trials}, out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 
 

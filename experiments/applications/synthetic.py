@@ -49,6 +49,7 @@ from experiments.applications.generating.conditions import (
 from experiments.applications.generating.figures import draw_conditions, draw_strips
 from experiments.applications.generating.source import replay
 from experiments.applications.generating.trajectories import Trajectory
+from experiments.applications.made_with import claim, write_settings
 from experiments.applications.policies.acting import Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import MOST_TRIED, away_at_start, run_policy, start_seeds
@@ -191,7 +192,6 @@ def write_results(settings: Settings, trials: Trials, quality: dict, out: Path) 
     lines += [[f"PSNR of {kind}, dB", *(f"{x:.4f}" for x in three)] for kind, three in quality.items()]
     write_table(out / "summary.csv", ["what", "mean", "low", "high"], lines)
     write_file(out / "table.md", markdown(found))
-    write_file(out / "settings.json", json.dumps(asdict(settings), indent=1) + "\n")
     places = range(len(CONDITIONS))
     seeds = [[float(np.mean(trials[i, s]["success"])) for s in settings.seeds if (i, s) in trials] for i in places]
     named = {one.name: one.success for one in found[: len(CONDITIONS)]}
@@ -224,6 +224,7 @@ def main() -> None:
     asked = vars(parser.parse_args())
     run, out, seeds = asked.pop("run"), asked.pop("out"), tuple(range(asked.pop("seeds")))
     settings = Settings(seeds=seeds, **asked)
+    claim(out, run, asdict(settings), grows=("seeds",))
     trials_dir = out / "trials"
     trials_dir.mkdir(parents=True, exist_ok=True)
     simulator = load_simulator(run, episodes=BATCH, history=1)
@@ -240,6 +241,7 @@ def main() -> None:
                 write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
     write_results(settings, trials, quality_of(data, settings.given), out)
+    write_settings(out, run, asdict(settings))
     draw_strips([data[kind].images[:2] for kind in KINDS], KINDS, out / "frames.png")
     wrote(out / TRIALS, out / ERRORS, out / "summary.csv", out / "table.md", out / "synthetic.png", out / "frames.png")
 

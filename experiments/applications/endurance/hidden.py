@@ -24,10 +24,10 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
+from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector
 from experiments.applications.detector import OUT as DETECTOR
-from experiments.applications.detector import SURE, WEIGHTS, Detector
 from experiments.applications.endurance.drives import native_robots
-from experiments.applications.endurance.tables import CLOSE, Row
+from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows

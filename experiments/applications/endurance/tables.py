@@ -9,12 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from experiments.analysis.intervals import critical
-from experiments.applications.detector import NEAR, SURE
+from experiments.applications.detector import CLOSE, SURE
 from experiments.applications.endurance.films import Film
 from experiments.applications.scenes import SEEN
-
-CLOSE = NEAR[1]
-"""Pixels of a 64-pixel frame, 2 of a frame of 32: what is found within them of the truth is where it should be."""
 
 STILL = 1e-3
 """Pixels: what varies less does not move."""

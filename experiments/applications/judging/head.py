@@ -53,7 +53,6 @@ class HeadConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     fit: FitConfig = field(default_factory=lambda: FitConfig(steps=3000, learning_rate=2e-3))
     light: float = 0.03
-    first: bool = True  # it sees the frame in which the episode begins as well, where the goal is whole
     threshold: float = 0.5
 
     def __post_init__(self):
@@ -64,13 +63,13 @@ def init_head(config: HeadConfig, seed: int) -> Params:
     first, second = jax.random.split(jax.random.key(seed))
     hidden = config.encoder.hidden
     return {
-        "encoder": init_encoder(first, config.encoder, 6 if config.first else 3),
+        "encoder": init_encoder(first, config.encoder, 2 * 3),
         "mlp": init_mlp(second, (config.encoder.features, hidden, hidden, 1)),
     }
 
 
 def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Array:
-    """Logits [B] of frames [B, 1, H, W, 3] in [-1, 1], or [B, 2, H, W, 3], the first one of the episode before."""
+    """Logits [B] of frames [B, 2, H, W, 3] in [-1, 1]: the first one of the episode, and the present one."""
     return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames)))[:, 0]
 
 
@@ -85,9 +84,9 @@ class SuccessHead:
         """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`, which may have the
         size 1 where `images` have frames of one episode, are those in which the episodes begin."""
         size = self.config.encoder.size
-        seen = [first, images] if self.config.first else [images]
-        small = [np.broadcast_to(s := shrink_bytes(x, size), (*images.shape[:-3], *s.shape[-3:])) for x in seen]
-        flat = np.stack(small, -4).reshape(-1, len(seen), size, size, 3)
+        whole = (*images.shape[:-3], size, size, 3)
+        small = [np.broadcast_to(shrink_bytes(x, size), whole) for x in (first, images)]
+        flat = np.stack(small, -4).reshape(-1, 2, size, size, 3)
         found = []
         for first in range(0, len(flat), PIECE):
             part = flat[first : first + PIECE]
@@ -120,7 +119,7 @@ def train_head(
     if reconstruct is not None:
         for seen in (images, begun):
             seen[::RECONSTRUCTED] = reconstruct(seen[::RECONSTRUCTED])
-    seen = np.stack([shrink_bytes(x, config.encoder.size) for x in ([begun, images] if config.first else [images])], 1)
+    seen = np.stack([shrink_bytes(x, config.encoder.size) for x in (begun, images)], 1)
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
     data = {"images": seen, "label": labels.astype(np.float32), "weight": weight}
 

@@ -9,7 +9,6 @@ OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -17,19 +16,19 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
 from experiments.applications.judging.head import HeadConfig, SuccessHead, auroc, load_head, save_head, train_head
 from experiments.applications.judging.ladder import OWN_HEAD, LadderConfig, find_policy, names, train_ladder
 from experiments.applications.judging.outcomes import SHUFFLED, TRUE, WORLDS, Outcome, judge_rollout
 from experiments.applications.judging.rollouts import Rollout, load_rollout, make_starts, run, save_rollout
+from experiments.applications.made_with import claim
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
 from experiments.applications.policies.learning import Report
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, held
 from experiments.applications.simulators import has_truth, load_simulator, true_simulator
 from hma_jax.config import require
-from hma_jax.config.json import diff, to_dict
+from hma_jax.config.json import to_dict
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
@@ -76,7 +75,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     simulator = load_simulator(run_directory, episodes=config.batch)
     robot = simulator.robot(config.task.robot)
     require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
-    _claim(out, run_directory, config)
+    claim(out, run_directory, {"config": to_dict(config)}, file="judge.json")
     size, stride, task = simulator.tokenizer.image_size, robot.stride, config.task
     policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads
 
@@ -139,19 +138,6 @@ def _collect(
 
 def _place(out: Path, name: str, world: str) -> Path:
     return out / "rollouts" / f"{name}.{world}.npz"
-
-
-def _claim(out: Path, run_directory: Path, config: JudgeConfig) -> None:
-    path, said = out / "judge.json", {"run": run_directory.name, "config": to_dict(config)}
-    if path.exists():
-        differences = diff(json.loads(path.read_text()), json.loads(json.dumps(said)))
-        require(
-            not differences,
-            f"{out} holds other judgements ({'; '.join(map(str, differences))}); choose another --out or remove it",
-        )
-        return
-    out.mkdir(parents=True, exist_ok=True)
-    write_file(path, json.dumps(said, indent=1) + "\n")
 
 
 def head_recordings(config: JudgeConfig, size: int, stride: int, episodes: int, seed: int) -> Demonstrations:

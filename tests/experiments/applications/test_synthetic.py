@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.applications import plan_actions
+from experiments.applications import SHIPPED, plan_actions
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import ALL, CONDITIONS, CONTROL, FEW, MOST, share_closed
 from experiments.applications.plan_actions import decided
@@ -70,7 +70,8 @@ def test_an_episode_ends_when_nothing_can_change_its_outcome():
 
 
 def from_settings(kind: type, path: Path):
-    assert set(values := json.loads(path.read_text())) == {f.name for f in fields(kind)}
+    values = json.loads(path.read_text())
+    assert values.pop("run") == SHIPPED.name and set(values) == {f.name for f in fields(kind)}
     return from_dict(kind, values)
 
 

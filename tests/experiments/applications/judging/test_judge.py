@@ -72,7 +72,7 @@ def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged)
     assert kept.stat().st_mtime_ns == before
     np.testing.assert_array_equal(again.rollouts("cloned-3", LEARNED).images, images)
     assert again.outcomes == found.outcomes
-    with pytest.raises(ConfigError, match="other judgements .config.starts: 4 -> 2"):
+    with pytest.raises(ConfigError, match="other settings .config.starts: 4 -> 2"):
         judge_run(root / "model", root / "out", replace(ASKED, starts=2), step)
 
 

@@ -21,6 +21,7 @@ from experiments.applications.own_policy import (
     write_results,
 )
 from experiments.applications.policies.demonstrations import Demonstrations
+from hma_jax.config import ConfigError
 from hma_jax.model.params import path_name
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
@@ -74,11 +75,13 @@ def test_outcomes_are_made_once_and_written_with_intervals(tmp_path, monkeypatch
     monkeypatch.setattr(own_policy, "POLICIES", (OWN, RANDOM))
     trials = compare(run, out, FEW)
     assert list(trials) == [OWN, RANDOM] and {len(found) for found in trials.values()} == {FEW.starts}
-    write_results(trials, FEW, out)
+    write_results(trials, out)
     assert read_trials(out / "trials.csv") == {
         name: [(s, round(d, 4)) for s, d in found] for name, found in trials.items()
     }
     monkeypatch.setattr(own_policy, "make_policy", lambda *_: pytest.fail("it was made again"))
     assert compare(run, out, FEW) == trials
+    with pytest.raises(ConfigError, match="other settings .steps: 2 -> 3"):
+        compare(run, out, replace(FEW, steps=3))
     done = summarise({"all": [(True, 0.0)] * 10, "none": [(False, 1.0)] * 10})
     assert [row[1] for row in done] == [1.0, 0.0] and done[0][2] > 0.6 and done[1][3] < 0.4
