@@ -32,7 +32,8 @@ from hma_jax.config.json import from_dict, to_dict
 class SuiteConfig:
     """The simulated datasets; not used when a study runs on the user's own."""
 
-    scale: float = 1.0  # multiplies the largest dataset's number of episodes; the smallest keep theirs
+    scale: float = 1.0  # multiplies the largest dataset's number of episodes
+    fewest: int = 8  # episodes of the smallest dataset; what lies between is stretched evenly in the logarithm
     seed: int = 0
     validation: int = 24  # held-out episodes of every dataset
 
@@ -99,12 +100,16 @@ class DesignConfig:
     rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the first and last of `budgets`
     ablation_steps: int | None = None  # of `settings` and `conditioning`; None: as many as every other trial
     end_controls: bool = False  # controls at both ends of an axis, not at the reference alone
+    # Other episodes' actions that all trials but the reference's are judged under; None: as many as `eval` says.
+    other_actions: int | None = None
 
     def __post_init__(self):
         for name in ("counts", "shots", "shots_after", "caps", "budgets", "long", "compute"):
             require_increasing(f"designs.{name}", getattr(self, name), at_least=1)
         for name in ("judged", "poor", "kinship", "shots_steps"):
             require(getattr(self, name) >= 1, f"designs.{name} must be at least 1, got {getattr(self, name)}")
+        n = self.other_actions
+        require(n is None or n >= 0, f"designs.other_actions must not be negative, got {n}")
 
 
 def require_increasing(name: str, points: tuple[int, ...], at_least: int) -> None:

@@ -50,16 +50,18 @@ def select(names: Sequence[str] | None) -> tuple[EmbodimentSpec, ...]:
     return tuple(known[n] for n in names)
 
 
-def episode_count(spec: EmbodimentSpec, scale: float) -> int:
+def episode_count(spec: EmbodimentSpec, scale: float, fewest: int = FEWEST) -> int:
     """Training episodes at a scale: the largest dataset has `scale` times as many as at 1, the
-    smallest always FEWEST, and what lies between is stretched evenly in the logarithm."""
-    stretch = max(math.log(scale * MOST / FEWEST) / math.log(MOST / FEWEST), 0.0)
-    return round(FEWEST * (spec.episodes / FEWEST) ** stretch)
+    smallest always `fewest`, and what lies between is stretched evenly in the logarithm."""
+    stretch = max(math.log(scale * MOST / fewest) / math.log(MOST / FEWEST), 0.0)
+    return round(fewest * (spec.episodes / FEWEST) ** stretch)
 
 
-def fingerprint(spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION) -> str:
+def fingerprint(
+    spec: EmbodimentSpec, scale: float, seed: int, validation: int = VALIDATION, fewest: int = FEWEST
+) -> str:
     """Hash of everything the bytes of this dataset depend on."""
-    text = repr((GENERATOR, spec, episode_count(spec, scale), validation, seed))
+    text = repr((GENERATOR, spec, episode_count(spec, scale, fewest), validation, seed))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -69,19 +71,21 @@ def generate_suite(
     scale: float = 1.0,
     seed: int = 0,
     validation: int = VALIDATION,
+    fewest: int = FEWEST,
     names: Sequence[str] | None = None,
     workers: int = 1,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
-    `scale` multiplies the size of the largest dataset, see `episode_count`; each has `validation`
-    held-out episodes besides. Datasets already complete with the
-    same fingerprint are left as they are, others are remade; each appears all at once.
+    `scale` multiplies the size of the largest dataset, `fewest` is that of the smallest, see `episode_count`; each has
+    `validation` held-out episodes besides. Datasets already complete with the same fingerprint are left as they are,
+    others are remade; each appears all at once.
     Raises ConfigError for bad arguments or a root that cannot be written.
     """
     require(scale > 0, f"suite scale must be positive, got {scale}")
     require(validation >= 1, f"suite validation must be at least 1 episode, got {validation}")
+    require(fewest >= 1, f"the fewest episodes of a dataset must be at least 1, got {fewest}")
     require(workers >= 1, f"suite workers must be at least 1, got {workers}")
     specs, root = select(names), Path(root)
     try:
@@ -95,13 +99,14 @@ def generate_suite(
     missing = []
     finished = 0
     for spec, path in zip(specs, paths, strict=True):
-        if is_complete(path, fingerprint(spec, scale, seed, validation)):
+        if is_complete(path, fingerprint(spec, scale, seed, validation, fewest)):
             finished += 1
             if progress:
                 progress(spec.name, finished, len(specs))
         else:
             missing.append(spec)
-    missing.sort(key=lambda s: -(episode_count(s, scale) + validation) * s.hz * sum(s.seconds))  # the longest first
+    # The longest first.
+    missing.sort(key=lambda s: -(episode_count(s, scale, fewest) + validation) * s.hz * sum(s.seconds))
 
     def report(name: str) -> None:
         nonlocal finished
@@ -111,11 +116,11 @@ def generate_suite(
 
     if workers == 1 or len(missing) <= 1:
         for spec in missing:
-            _make(spec.name, root, scale, seed, validation)
+            _make(spec.name, root, scale, seed, validation, fewest)
             report(spec.name)
         return paths
     with _processes(min(workers, len(missing))) as pool:
-        jobs = {pool.submit(_make, spec.name, root, scale, seed, validation): spec.name for spec in missing}
+        jobs = {pool.submit(_make, spec.name, root, scale, seed, validation, fewest): spec.name for spec in missing}
         for job in as_completed(jobs):
             job.result()
             report(jobs[job])
@@ -145,17 +150,17 @@ def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
     pool.shutdown()
 
 
-def _make(name: str, root: Path, scale: float, seed: int, validation: int) -> None:
+def _make(name: str, root: Path, scale: float, seed: int, validation: int, fewest: int) -> None:
     """One dataset, unless another process makes it meanwhile."""
     (spec,) = select([name])
-    final, mark = root / name / VERSION, fingerprint(spec, scale, seed, validation)
+    final, mark = root / name / VERSION, fingerprint(spec, scale, seed, validation, fewest)
     with claim(final.with_name(f".{VERSION}"), wait=True) as held:
         if is_complete(final, mark):
             return
         write_dataset(
             spec,
             held.scratch,
-            episodes={"train": episode_count(spec, scale), "val": validation},
+            episodes={"train": episode_count(spec, scale, fewest), "val": validation},
             seed=seed,
             metadata={FINGERPRINT: mark, "generator": GENERATOR, "seed": seed, "family": spec.family},
         )

@@ -50,6 +50,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
             scale=study.suite.scale,
             seed=study.suite.seed,
             validation=study.suite.validation,
+            fewest=study.suite.fewest,
             names=[name for name in names if name not in kept],
             workers=_cores(),
             progress=lambda name, done, total: update(done, total, name),
@@ -71,7 +72,7 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
     from data_pipelines.suite.generate import episode_count, fingerprint, select
 
     (spec,) = select([name])
-    mark = fingerprint(spec, suite.scale, suite.seed, suite.validation)
+    mark = fingerprint(spec, suite.scale, suite.seed, suite.validation, suite.fewest)
     if not directory.exists() or is_complete(directory, mark):
         return None
     metadata = read_metadata(directory)
@@ -79,9 +80,9 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
     episodes, held_out = (sum(shard_lengths(directory, split)) for split in ("train", "val"))
     if made_as is None or seed is None or not episodes or not held_out:
         return ["what is there says nothing of what it was made from"]
-    wanted = episode_count(spec, suite.scale)
+    wanted = episode_count(spec, suite.scale, suite.fewest)
     lines = [f"suite.seed: {seed} -> {suite.seed}"] if seed != suite.seed else []
-    lines += [f"suite.scale: {episodes} -> {wanted} episodes"] if episodes != wanted else []
+    lines += [f"suite.scale or suite.fewest: {episodes} -> {wanted} episodes"] if episodes != wanted else []
     lines += [f"suite.validation: {held_out} -> {suite.validation} episodes"] if held_out != suite.validation else []
     return lines if lines or is_complete(directory, made_as) else None
 

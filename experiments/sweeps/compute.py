@@ -28,7 +28,9 @@ def plan(study: Study) -> Sweep:
 
     def point(width: int, budget: float, seed: int) -> Point:
         steps = max(round(budget / flops[width]), 1)
-        trial = of_width(replace(reference_trial(study, seed, steps), measure_untrained=False), width)
+        trial = reference_trial(study, seed, steps)
+        if width != study.model.width:
+            trial = replace(of_width(trial, width), measure_untrained=False)
         return Point(width, trial, series=f"{budget:.2g} FLOP")
 
     points = [

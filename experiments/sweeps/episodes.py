@@ -53,7 +53,7 @@ def count_episodes(study: Study, cap: int | None) -> int:
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
-    simulated = {e.name: episode_count(e, study.suite.scale) for e in EMBODIMENTS}
+    simulated = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
     there = [simulated.get(name) or get_spec(name).episodes or cap or 0 for name in study.dataset_names()]
     return sum(n if cap is None else min(n, cap) for n in there)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from data_pipelines.publishing.files import write_file
 from experiments.study import Study
-from experiments.sweeps.sweep import Sweep
+from experiments.sweeps.sweep import Sweep, judge_less
 from hma_jax.config import ConfigError, require
 
 SCALING = ("datasets", "trajectories", "width")
@@ -61,7 +61,8 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
 
 
 def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[Sweep]:
-    """The sweeps along `axes`, of which files are relative to `root`. Raises ConfigError for an axis that is none, or that does not fit the study."""
+    """The sweeps along `axes`, of which files are relative to `root`. Raises ConfigError for an axis that is none, or
+    that does not fit the study."""
     sweeps = [find_axis(axis, root)(study) for axis in axes]
     for axis, sweep in zip(axes, sweeps, strict=True):
         where = f"{axis}: plan(study)"
@@ -75,7 +76,7 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
             )
     names = [sweep.name for sweep in sweeps]
     require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
-    return sweeps
+    return [judge_less(study, sweep) for sweep in sweeps]
 
 
 def _load(path: Path) -> Plan:

@@ -9,8 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from experiments.running.provenance import Provenance
-from experiments.running.trial import Trial, trial_id
+from experiments.running.trial import Trial, training_of, trial_id
 from experiments.study import Study
+from hma_jax.config.json import stable_hash
 
 POINT, CONTROL, STANDARD = "point", "control", "standard"
 """Roles of a trial: on the curve; beside it, trained on shuffled actions; on a curve without muP."""
@@ -94,6 +95,25 @@ def reference_trial(study: Study, seed: int, steps: int | None = None) -> Trial:
 def control_of(trial: Trial) -> Trial:
     """The same, trained on the actions of other episodes: what it says of them it cannot have learned."""
     return replace(trial, shuffle_actions=True, measure_untrained=False)
+
+
+def judge_less(study: Study, sweep: Sweep) -> Sweep:
+    """The sweep as it is judged: retrieval among many sequences, half of an evaluation's cost, is asked of the
+    reference at all its steps and of its control; of others action-nats need `designs.other_actions` sequences."""
+    few = study.designs.other_actions
+    if few is None:
+        return sweep
+    references = [reference_trial(study, seed) for seed in study.seeds]
+    whole = {stable_hash(training_of(t)) for trial in references for t in (trial, control_of(trial))}
+
+    def judged(trial: Trial) -> Trial:
+        if trial.source:
+            trial = replace(trial, source=judged(trial.source))
+        if trial.eval != study.eval or stable_hash(training_of(trial)) in whole:
+            return trial
+        return replace(trial, eval=replace(trial.eval, other_actions=few))
+
+    return replace(sweep, points=tuple(replace(point, trial=judged(point.trial)) for point in sweep.points))
 
 
 def make_sweep(

@@ -12,7 +12,7 @@ from data_pipelines.suite.generate import episode_count
 from experiments.cost import plan_trials
 from experiments.preparing_cost import estimate_preparing
 from experiments.presets import CPU_FULL, PAPER
-from experiments.running.trial import trial_id
+from experiments.running.trial import training_of, trial_id
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.registry import AXES, find_axis, plan_sweeps
@@ -115,7 +115,7 @@ def test_every_width_spends_the_same_compute():
 
 
 def test_trajectories_are_counted_as_they_are():
-    there = [episode_count(e, CPU_FULL.suite.scale) for e in TRAINED]
+    there = [episode_count(e, CPU_FULL.suite.scale, CPU_FULL.suite.fewest) for e in TRAINED]
     for cap in (4, 64, 10_000):
         assert count_episodes(CPU_FULL, cap) == sum(min(n, cap) for n in there)
     assert {p.x for p in points("episodes")} >= {160, sum(there)}
@@ -129,6 +129,19 @@ def test_few_shots_start_from_trials_of_other_axes():
     assert len(whole) == 9 and all(p.trial.source and p.trial.train.only == () for p in whole)
     adapted = [p for p in points("fewshot") if p.trial.source and p not in whole]
     assert all(p.trial.train.only == CPU_FULL.unseen for p in adapted)
+
+
+def test_retrieval_among_sixteen_is_asked_of_the_reference_alone():
+    """At any number of steps, and of its controls."""
+    runs = [training_of(p.trial) for p in SWEEPS["horizon"].points]
+    runs += [run | {"shuffle_actions": True} for run in runs]
+    for sweep in SWEEPS.values():
+        for p in sweep.points:
+            assert p.trial.eval.other_actions == (15 if training_of(p.trial) in runs else 3)
+            others = replace(p.trial.eval, other_actions=15)
+            assert others == CPU_FULL.eval and all(t.eval.other_actions in (3, 15) for t in p.trial.with_source())
+    whole = replace(CPU_FULL, designs=replace(CPU_FULL.designs, other_actions=None))
+    assert {p.trial.eval.other_actions for s in plan_sweeps(whole, CPU_FULL.axes) for p in s.points} == {15}
 
 
 def test_the_whole_fits_into_about_twelve_hours_of_two_cores():

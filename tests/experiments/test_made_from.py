@@ -11,13 +11,7 @@ from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
 from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
-from experiments.preparing.made_from import (
-    OLD_STAMP,
-    STAMP,
-    dataset_differences,
-    differences,
-    may_replace,
-)
+from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
 from experiments.running.closure import trace
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
@@ -284,7 +278,7 @@ def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp
     before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]
     assert main([*command, "--set", "suite.seed=3", "--set", "suite.scale=0.1", "--set", "suite.validation=5"]) == 2
     said = capsys.readouterr().err
-    assert "suite.seed: 0 -> 3" in said and "suite.scale: 10 -> 50 episodes" in said and "--replace suite" in said
+    assert "suite.seed: 0 -> 3" in said and "suite.scale or suite.fewest: 10 -> 50 episodes" in said and "--replace suite" in said
     assert "suite.validation: 4 -> 5 episodes" in said
     assert contents(out) == before
     assert main([*command, "--set", "suite.seed=3", "--replace", "suite"]) == 0

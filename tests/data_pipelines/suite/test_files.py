@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -23,7 +24,7 @@ from data_pipelines.suite import generate
 from data_pipelines.suite.appearance import draw_appearance
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from data_pipelines.suite.environment import Environment
-from data_pipelines.suite.generate import FEWEST, fingerprint, generate_suite
+from data_pipelines.suite.generate import FEWEST, episode_count, fingerprint, generate_suite
 from data_pipelines.suite.render import positions_of, render_frames
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.tokens.store import TokenStore
@@ -272,6 +273,15 @@ def test_the_fingerprint_follows_everything_the_bytes_depend_on():
     marks += [fingerprint(large, 1.0, 1), fingerprint(large, 1.0, 0, validation=5)]
     assert len(set(marks)) == 5
     assert fingerprint(small, 1.0, 0) == fingerprint(small, 8.0, 0)  # it keeps its size
+    assert fingerprint(small, 1.0, 0) != fingerprint(small, 1.0, 0, fewest=9)
+
+
+def test_sizes_go_evenly_in_the_logarithm_from_the_fewest_to_the_most():
+    small, large = min(EMBODIMENTS, key=lambda e: e.episodes), max(EMBODIMENTS, key=lambda e: e.episodes)
+    assert (episode_count(small, 4.0, 128), episode_count(large, 4.0, 128)) == (128, 2000)
+    assert (episode_count(small, 1.0), episode_count(large, 1.0)) == (FEWEST, 500)
+    middle = min(EMBODIMENTS, key=lambda e: abs(e.episodes - 63))  # half-way, in the logarithm
+    assert episode_count(middle, 4.0, 128) == pytest.approx(math.sqrt(128 * 2000), rel=0.05)
 
 
 @pytest.mark.parametrize(
