@@ -37,10 +37,12 @@ def draw(workspace: Workspace, record: Record) -> None:
 def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.analysis.best_steps import AtBest, judge_at_best
     from experiments.analysis.changes import Change, find_changes
+    from experiments.analysis.growth import Growth, find_growth
     from experiments.optima import Optimum, find_optima
     from experiments.report.fits import FitRow, fit_rows
     from experiments.report.numbers import compute_numbers
     from experiments.report.page import write_report
+    from experiments.report.robots import read_data
     from experiments.report.sweeps import Along
     from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
@@ -64,7 +66,13 @@ def _draw(workspace: Workspace, record: Record) -> None:
     tables = [workspace.results, workspace.fits, *others]
     changes = find_changes(sweeps, provenance, numbers.windows)
     at_best = judge_at_best(sweeps, provenance, numbers.windows)
-    for path, kind, found in ((workspace.changes, Change, changes), (workspace.best_steps, AtBest, at_best)):
+    episodes = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
+    growth = find_growth(sweeps, provenance, numbers.windows, episodes)
+    for path, kind, found in (
+        (workspace.changes, Change, changes),
+        (workspace.best_steps, AtBest, at_best),
+        (workspace.growth, Growth, growth),
+    ):
         if found:
             write_csv(path, kind, found)
             tables.append(path)
@@ -72,7 +80,8 @@ def _draw(workspace: Workspace, record: Record) -> None:
     if optima:
         write_csv(workspace.optima, Optimum, optima)
         tables.append(workspace.optima)
-    write_report(workspace, record, sweeps, rows, optima, Along(changes, at_best), states, provenance, numbers, checked)
+    along = Along(changes, at_best, growth)
+    write_report(workspace, record, sweeps, rows, optima, along, states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
 
 

@@ -216,13 +216,13 @@ def _origin(
     finished: Sequence[str],
     result: dict[str, Any] | None,
 ) -> str:
-    machine = result["run"]["machine"] if result else {}
+    machine, suite = result["run"]["machine"] if result else {}, record.study.suite
     ran = group_by_sources(workspace.trials, finished)
     counted = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
     facts = {
         "command": record.command,
         "data": ", ".join(record.data)
-        or f"embedded suite, scale {record.study.suite.scale:g}, seed {record.study.suite.seed}",
+        or f"embedded suite, scale {suite.scale:g}, from {suite.fewest} episodes, seed {suite.seed}",
         "token store": provenance.store,
         "evaluation manifest": provenance.manifest,
         "tokenizer": provenance.tokenizer,

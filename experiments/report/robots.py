@@ -86,9 +86,14 @@ def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) ->
     return next((p for p in curve(rows, sweep.name, metric, scope=scope) if p.x == sweep.reference_x), None)
 
 
+def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
+    """{robot: how much there is of it}; {} where nobody has counted."""
+    return json.loads(data_summary.read_text()) if data_summary.exists() else {}
+
+
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:
     """A line per robot, and the mean; data.json says how much there was of each."""
-    data = json.loads(data_summary.read_text()) if data_summary.exists() else {}
+    data = read_data(data_summary)
     measured = {r.metric for r in rows if r.sweep == sweep.name}
     metrics = [m for m in COLUMNS if m in measured]
     follows = [m for m in FOLLOWS if any(m in r.follows for r in robots)]

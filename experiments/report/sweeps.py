@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from experiments.analysis.best_steps import AtBest
 from experiments.analysis.changes import Change
+from experiments.analysis.growth import GROWS, Growth
 from experiments.optima import Optimum
 from experiments.report.pieces import pm, table
 from experiments.report.plot_families import ROLES
@@ -28,6 +29,7 @@ class Along:
 
     changes: Sequence[Change] = ()
     best: Sequence[AtBest] = ()
+    growth: Sequence[Growth] = ()
 
 
 def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along: Along) -> str:
@@ -38,7 +40,8 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along
         numbers = _optima(sweep, [o for o in optima if o.sweep == sweep.name])
     elif sweep.several:
         names = all_series(rows, sweep.name).get(POINT, [])
-        numbers = "".join(_series(sweep, rows, name, along.changes) for name in names) + _at_best(sweep, along.best)
+        numbers = "".join(_series(sweep, rows, name, along.changes) for name in names)
+        numbers += _growth(sweep, along.growth) + _at_best(sweep, along.best)
     else:
         numbers = _curve(sweep, rows, along.changes)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
@@ -67,6 +70,29 @@ def _at_best(sweep: Sweep, rows: Sequence[AtBest]) -> str:
         "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other, both ways: the "
         "lowest of several losses on the windows that judge it would flatter a point. Intervals of 95 % are over seeds "
         "and episodes.</p>"
+    )
+
+
+def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
+    """A line per step from one cap to the next, curve and group of robots."""
+    steps: dict[tuple[str, float, float, str], dict[str, Growth]] = {}
+    for row in rows:
+        if row.sweep == sweep.name:
+            steps.setdefault((row.series, row.first, row.last, row.data), {})[row.metric] = row
+    if not steps:
+        return ""
+    metrics = list(dict.fromkeys(m for found in steps.values() for m in found))
+    lines = []
+    for (series, first, last, data), found in steps.items():
+        cells = [f"{f.mean:+.3g} ({f.low:+.3g} to {f.high:+.3g})" if (f := found.get(m)) else "–" for m in metrics]
+        any_of = next(iter(found.values()))
+        whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} without"
+        cells = [cell.replace("-", "\u2212") for cell in cells]
+        lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells])
+    head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics)]
+    return "<h4>Robots whose data grows, and others</h4>" + table(head, lines, text=3) + (
+        "<p>From each point to the next, window by window, of robots that get more trajectories there and of those that "
+        "have no more to give. Intervals of 95 % are over seeds and episodes.</p>"
     )
 
 

@@ -103,6 +103,11 @@ class Workspace:
         return self.root / "best_steps.csv"
 
     @property
+    def growth(self) -> Path:
+        """What more trajectories change for robots that have more, and for those that have not."""
+        return self.root / "growth.csv"
+
+    @property
     def fits(self) -> Path:
         """Coefficients of scaling fits."""
         return self.root / "fits.csv"

@@ -1,0 +1,99 @@
+"""Robots whose data still grows, apart from those whose data is exhausted.
+
+The paper explains the plateau over trajectories by robots that have no more of them. So from each point of an axis that
+caps trajectories to the next, what changes is told for robots that get more and for those that do not: if the paper is
+right, the former alone gain. Paired window by window, as `changes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from experiments.analysis.changes import METRICS
+from experiments.analysis.compare import Side, overall_difference
+from experiments.running.provenance import Provenance
+from experiments.running.trial import Trial, trial_id
+from experiments.sweeps.sweep import POINT, Point, Sweep
+from hma_jax.evaluation.windows import WindowTable
+
+GROWS, EXHAUSTED = "grows", "exhausted"
+
+
+@dataclass(frozen=True)
+class Growth:
+    """The mean at `last` less that at `first`, over the robots whose data grows between them, or is exhausted."""
+
+    sweep: str
+    series: str
+    first: float
+    last: float
+    data: str
+    robots: int
+    metric: str
+    mean: float
+    sem: float
+    low: float
+    high: float
+    seeds: int
+    n: int
+    episodes: int
+
+
+def find_growth(
+    sweeps: Sequence[Sweep],
+    provenance: Provenance,
+    windows: Mapping[str, WindowTable],
+    episodes: Mapping[str, int],
+) -> list[Growth]:
+    """Of axes along which the cap of trajectories changes, between neighbouring points that have seeds in common.
+    `episodes` are the training ones that each robot has. Raises NotComparable."""
+    found = []
+    for sweep in (s for s in sweeps if s.measured):
+        for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
+            own = [p for p in sweep.points if (p.role, p.series, p.scope) == (POINT, series, ())]
+            if len({p.trial.max_trajectories for p in own}) > 1:
+                found += _along(sweep, series, own, provenance, windows, episodes)
+    return found
+
+
+def _along(
+    sweep: Sweep,
+    series: str,
+    points: Sequence[Point],
+    provenance: Provenance,
+    windows: Mapping[str, WindowTable],
+    episodes: Mapping[str, int],
+) -> list[Growth]:
+    there: dict[float, dict[int, tuple[Trial, WindowTable]]] = {}
+    for p in points:
+        if (table := windows.get(trial_id(p.trial, provenance))) is not None:
+            there.setdefault(p.x, {})[p.trial.train.seed] = p.trial, table
+    found = []
+    for first, last in pairwise(sorted(there)):
+        seeds = there[first].keys() & there[last].keys()
+        if not seeds:
+            continue
+        caps = [next(iter(there[x].values()))[0].max_trajectories for x in (first, last)]
+        before, after = ({name: _used(episodes[name], cap) for name in sweep.scope if name in episodes} for cap in caps)
+        groups = {
+            GROWS: [name for name in after if after[name] > before[name]],
+            EXHAUSTED: [name for name in after if after[name] <= before[name]],
+        }
+        b, a = (Side(f"{sweep.axis} {x:g}", {s: there[x][s][1] for s in sorted(seeds)}, "") for x in (first, last))
+        for data, robots in groups.items():
+            for metric in METRICS if robots else ():
+                d = overall_difference(a, b, metric, robots)
+                if d is not None:
+                    found.append(
+                        Growth(
+                            sweep.name, series, first, last, data, len(robots), metric, d.mean, d.sem, d.low, d.high,
+                            d.seeds, d.n, d.episodes,
+                        )
+                    )  # fmt: skip
+    return found
+
+
+def _used(there: int, cap: int | None) -> int:
+    return there if cap is None else min(there, cap)

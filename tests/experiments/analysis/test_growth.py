@@ -1,0 +1,56 @@
+"""Robots whose data still grows are told from those whose data is exhausted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from experiments.analysis.growth import EXHAUSTED, GROWS, find_growth
+from experiments.analysis.paired import NotComparable
+from experiments.report.sweeps import Along, describe
+from experiments.running.trial import trial_id
+from experiments.sweeps.registry import plan_sweeps
+from tests.experiments.fakes import PROVENANCE
+from tests.experiments.judged import WIDE, windows_of
+
+THERE = {"pusher_sand": 3, "arm_sand": 40, "rover_road": 8}
+STUDY = replace(
+    WIDE, datasets=tuple(THERE), trajectory_counts=(1000,), train=replace(WIDE.train, steps=8),
+    designs=replace(WIDE.designs, caps=(2, 8)),
+)  # fmt: skip
+(SWEEP,) = plan_sweeps(STUDY, ("episodes",))
+
+
+def tables(gain: float = -0.5):
+    """Losses that change by `gain` per step of the cap on robots that get more from it, and on no others."""
+    found = {}
+    for point in SWEEP.points:
+        table, capped_before = windows_of(point.trial), [n for n in (2, 8) if n < (point.trial.max_trajectories or 99)]
+        gains = [sum(cap < THERE[name] for cap in capped_before) * gain for name in table.dataset]
+        found[trial_id(point.trial, PROVENANCE)] = replace(table, metrics={"cross_entropy": 5.0 + np.array(gains)})
+    return found
+
+
+def test_only_robots_that_get_more_trajectories_count_as_growing():
+    rows = {(r.series, r.first, r.data): r for r in find_growth([SWEEP], PROVENANCE, tables(), THERE)}
+    first, second, last = sorted({p.x for p in SWEEP.points})
+    for series in {p.series for p in SWEEP.points if p.series}:
+        assert rows[series, first, GROWS].robots == 3 and (series, first, EXHAUSTED) not in rows
+        assert (rows[series, second, GROWS].robots, rows[series, second, EXHAUSTED].robots) == (1, 2)
+        assert rows[series, second, GROWS].mean == pytest.approx(-0.5)
+        assert rows[series, second, EXHAUSTED].mean == pytest.approx(0.0, abs=1e-9)
+        assert rows[series, second, GROWS].last == last and rows[series, first, GROWS].seeds == 3
+
+
+def test_the_page_shows_both_groups():
+    said = describe(SWEEP, [], [], Along(growth=find_growth([SWEEP], PROVENANCE, tables(), THERE)))
+    assert "Robots whose data grows, and others" in said and "1 with more" in said and "2 without" in said
+
+
+def test_other_windows_are_refused_and_other_axes_left_out():
+    found = tables()
+    id = trial_id(next(p.trial for p in SWEEP.points if p.trial.max_trajectories == 8), PROVENANCE)
+    with pytest.raises(NotComparable):
+        find_growth([SWEEP], PROVENANCE, found | {id: replace(found[id], episode=found[id].episode + 1)}, THERE)
+    (width,) = plan_sweeps(WIDE, ("width",))
+    assert not find_growth([width], PROVENANCE, {}, THERE)
