@@ -8,17 +8,19 @@ OUT ?= runs/study
 PRESET ?= cpu
 WORKERS ?= 2
 PORT ?= 8765
+EXTRA ?=
 
 .PHONY: help study play test test-slow clean
 
 help:
-	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS))"
+	@echo "make study      run the scaling study (PRESET=$(PRESET), OUT=$(OUT), WORKERS=$(WORKERS); EXTRA=cuda or tpu)"
 	@echo "make play       drive a trained model in the browser (RUN=a training run, PORT=$(PORT))"
 	@echo "make test       run the tests that take less than about 20 s each"
 	@echo "make test-slow  run the others too"
 	@echo "make clean      remove the environment and caches; results under runs/ stay"
 
-study: $(VENV)/installed
+# EXTRA is what JAX computes on: nothing for the processor, cuda or tpu.
+study: $(VENV)/installed$(addprefix -,$(EXTRA))
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
 play: $(VENV)/installed-play
@@ -47,14 +49,10 @@ $(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/python
 	@$(INSTALL) -e .
 	@touch $@
 
-$(VENV)/installed-play: pyproject.toml constraints.txt | $(BIN)/python
+# With an extra of pyproject.toml.
+$(VENV)/installed-%: pyproject.toml constraints.txt | $(BIN)/python
 	@echo "installing into $(VENV) (about a minute)"
-	@$(INSTALL) -e '.[play]'
-	@touch $@ $(VENV)/installed
-
-$(VENV)/installed-test: pyproject.toml constraints.txt | $(BIN)/python
-	@echo "installing into $(VENV) (about a minute)"
-	@$(INSTALL) -e '.[test]'
+	@$(INSTALL) -e '.[$*]'
 	@touch $@ $(VENV)/installed
 
 $(BIN)/python:

@@ -5,6 +5,8 @@ Columns:
     trial, title, status       its id, what tells it from the others, and a state of the ledger
     config.*                   every setting by its dotted path ("config.train.optimizer.learning_rate"); lists as JSON
     store, manifest, tokenizer, results     what it depends on (`experiments.running.provenance`)
+    windows_drawn              in training: steps times batch. Epochs are not one number: robots differ in windows
+    trajectories               that may be drawn from, of all robots; null where nobody has counted them
     parameters, train_flops, training_loss  the last is the mean over the last steps
     <metric>, <metric>.sem     over all robots that it was judged on, each counting equally
     windows, episodes, robots  that these are means over
@@ -18,7 +20,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +32,21 @@ from hma_jax.evaluation.summary import Summary
 
 
 def trial_row(
-    id: str, title: str, status: str, trial: Trial, provenance: Provenance, result: dict[str, Any] | None, loss: float
+    id: str,
+    title: str,
+    status: str,
+    trial: Trial,
+    provenance: Provenance,
+    result: dict[str, Any] | None,
+    loss: float,
+    there: Mapping[str, int],
 ) -> dict[str, Any]:
-    """One row; `result` is that of result.json (None: there is none), `loss` its training loss."""
+    """One row; `result` is that of result.json (None: there is none), `loss` its training loss, `there` the training
+    trajectories that each robot has."""
     row = {"trial": id, "title": title, "status": status}
     row |= {f"config.{path}": value for path, value in _flat(to_dict(trial))}
     row |= dataclasses.asdict(provenance)
+    row |= {"windows_drawn": trial.train.steps * trial.train.batch, "trajectories": _trajectories(trial, there)}
     if result is None:
         return row
     summary = Summary.from_dict(result["evaluation"])
@@ -45,6 +56,13 @@ def trial_row(
         row |= {metric: stat.mean, f"{metric}.sem": stat.sem}
         row["windows"], row["episodes"] = max(row.get("windows", 0), stat.n), max(row.get("episodes", 0), stat.episodes)
     return row
+
+
+def _trajectories(trial: Trial, there: Mapping[str, int]) -> int | None:
+    if not set(trial.datasets) <= there.keys():
+        return None
+    caps = {name: trial.max_trajectories for name in trial.capped or trial.datasets}
+    return sum(there[name] if caps.get(name) is None else min(there[name], caps[name]) for name in trial.datasets)
 
 
 def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:

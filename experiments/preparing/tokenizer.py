@@ -45,8 +45,9 @@ HELD_OUT = ("val_fraction", "min_val", "max_val", "max_val_fraction")
 OF_FRAMES = ("image_key", "split", "val_split")
 """Facts of a registry entry that say which frames a dataset has for a tokenizer."""
 
-SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames")
-"""The modules that train it; what they import follows (`running.closure`)."""
+SOURCES = ("hma_jax.tokenizers.train", "data_pipelines.loading.frames", "data_pipelines.sources.open")
+"""The modules that train it; what they import follows (`running.closure`), of these three in functions as well: readers
+are imported when a dataset needs them."""
 
 TRAINED, GIVEN = "trained here", "given with --tokenizer, identity"
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import html
 import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -49,27 +50,27 @@ def write_report(
     checked: Check,
 ) -> None:
     """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
-    home = _home(sweeps)
-    reference = trial_id(_reference(home), provenance) if home else ""
+    shown_by = _showing_the_reference(sweeps)
+    reference = trial_id(_reference(shown_by), provenance) if shown_by else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
     shown = reference in finished
-    witness = reference if shown else next(iter(finished), None)
-    result = read_result(workspace.trials / witness) if witness else None
-    robots = robots_of(rows, home, provenance, numbers.windows) if home else []
+    dated = reference if shown else next(iter(finished), None)
+    result = read_result(workspace.trials / dated) if dated else None
+    robots = robots_of(rows, shown_by, provenance, numbers.windows) if shown_by else []
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
     checks = check_study(sweeps, rows, optima, states, robots if shown else [], numbers.outcomes, checked, vocabulary)
     body = [
-        _headline(workspace, record, sweeps, rows, states, home, result),
+        _headline(workspace, record, sweeps, rows, states, shown_by, result),
         draw_box(checks),
         *_curves(workspace, sweeps, rows, optima, along),
         _fits(workspace, numbers),
         _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
         section("Robots, the most controllable first", describe_robots(
-            rows, home, robots, workspace.data_summary
+            rows, shown_by, robots, workspace.data_summary
         )) if shown else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance)),
-        section("How to repeat it", _origin(workspace, record, provenance, finished, result)),
+        section("How to repeat it", _origin(workspace, record, provenance, finished)),
     ]  # fmt: skip
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -85,14 +86,14 @@ def write_report(
 # --- Parts -----------------------------------------------------------------------------------
 
 
-def _home(sweeps: Sequence[Sweep]) -> Sweep | None:
+def _showing_the_reference(sweeps: Sequence[Sweep]) -> Sweep | None:
     """The sweep by which the reference trial is shown: the widest scope on which it stands."""
-    standing = [s for s in sweeps if s.reference_x is not None]
-    return max(standing, key=lambda s: len(s.scope), default=None)
+    those = [s for s in sweeps if s.reference_x is not None]
+    return max(those, key=lambda s: len(s.scope), default=None)
 
 
-def _reference(home: Sweep) -> Trial:
-    return next(p.trial for p in home.points if p.x == home.reference_x)
+def _reference(shown_by: Sweep) -> Trial:
+    return next(p.trial for p in shown_by.points if p.x == shown_by.reference_x)
 
 
 def _headline(
@@ -101,24 +102,24 @@ def _headline(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     states: dict[str, State],
-    home: Sweep | None,
+    shown_by: Sweep | None,
     result: dict[str, Any] | None,
 ) -> str:
     study = record.study
     metrics = drawn_metrics(rows, [s.name for s in sweeps])
     cards = []
-    if home and "perplexity" in metrics:
+    if shown_by and "perplexity" in metrics:
         cards += [
-            card("perplexity, reference", _at_reference(rows, home, "perplexity"),
+            card("perplexity, reference", _at_reference(rows, shown_by, "perplexity"),
                  "s.e. over episodes and seeds"),
-            card("perplexity, untrained", _at_reference(rows, home, "perplexity", UNTRAINED),
+            card("perplexity, untrained", _at_reference(rows, shown_by, "perplexity", UNTRAINED),
                  f"vocabulary size is {study.model.vocab_size:,}"),
         ]  # fmt: skip
-    if home and "delta_psnr" in metrics:
+    if shown_by and "delta_psnr" in metrics:
         cards += [
-            card("ΔPSNR, reference", _at_reference(rows, home, "delta_psnr"),
+            card("ΔPSNR, reference", _at_reference(rows, shown_by, "delta_psnr"),
                  "dB, last frame: true minus random actions"),
-            card("ΔPSNR, shuffled actions", _at_reference(rows, home, "delta_psnr", CONTROL),
+            card("ΔPSNR, shuffled actions", _at_reference(rows, shown_by, "delta_psnr", CONTROL),
                  "dB, must vanish within its error"),
         ]  # fmt: skip
     cards.append(
@@ -139,9 +140,9 @@ def _headline(
     )
 
 
-def _at_reference(rows: Sequence[Row], home: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
+def _at_reference(rows: Sequence[Row], shown_by: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
     """The curve's point where the reference trial stands."""
-    return next((p for p in curve(rows, home.name, metric, role) if p.x == home.reference_x), None)
+    return next((p for p in curve(rows, shown_by.name, metric, role) if p.x == shown_by.reference_x), None)
 
 
 def _curves(
@@ -214,9 +215,9 @@ def _origin(
     record: Record,
     provenance: Provenance,
     finished: Sequence[str],
-    result: dict[str, Any] | None,
 ) -> str:
-    machine, suite = result["run"]["machine"] if result else {}, record.study.suite
+    suite = record.study.suite
+    machines = [read_result(workspace.trials / id)["run"]["machine"] for id in finished]
     ran = group_by_sources(workspace.trials, finished)
     counted = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
     facts = {
@@ -228,10 +229,10 @@ def _origin(
         "tokenizer": provenance.tokenizer,
         "version of the results": str(provenance.results),
         "sources": counted + "; ".join(describe_sources(ran)) if ran else "unknown",
-        "commit": machine.get("commit") or "unknown",
-        "processor": f"{machine.get('processor', 'unknown')}, {machine.get('cores', '?')} cores",
-        "devices": ", ".join(machine.get("devices", [])) or "unknown",
-        "software": ", ".join(f"{k} {v}" for k, v in machine.get("packages", {}).items()),
+        "commit": _each([m.get("commit") or "unknown" for m in machines]),
+        "processor": _each([f"{m.get('processor', 'unknown')}, {m.get('cores', '?')} cores" for m in machines]),
+        "devices": _each([", ".join(m.get("devices", [])) or "unknown" for m in machines]),
+        "software": _each([", ".join(f"{k} {v}" for k, v in m.get("packages", {}).items()) for m in machines]),
         "numbers": workspace.results.name,
     }
     items = "".join(
@@ -239,3 +240,11 @@ def _origin(
     )
     config = html.escape(to_json(record.study))
     return f"<dl>{items}</dl><details><summary>Configuration</summary><pre>{config}</pre></details>"
+
+
+def _each(found: Sequence[str]) -> str:
+    """What trials ran on: once if it is the same for all, otherwise with the number of trials of each."""
+    counts = Counter(found).most_common()
+    if len(counts) == 1:
+        return counts[0][0]
+    return "; ".join(f"{n} trial{'s' * (n > 1)}: {what}" for what, n in counts) or "unknown"

@@ -14,6 +14,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
+from experiments.analysis.scaling import trunk_parameters
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import (
@@ -99,7 +100,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, legend: b
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     show_tally(panel, rows, sweep.name)
-    panel.set_xlabel(sweep.axis + (" · parameters" if sweep.name == "width" else ""))
+    panel.set_xlabel(sweep.axis + (" · trunk parameters" if sweep.name == "width" else ""))
     panel.set_ylabel(LABELS[metric])
     if legend and panel.get_legend_handles_labels()[0]:
         panel.legend(loc="best")
@@ -110,7 +111,8 @@ def _x_axis(panel: Axes, points: list[CurvePoint], sweep: Sweep) -> None:
     panel.set_xscale("log")
     names = [count(p.x) for p in points]
     if sweep.name == "width":
-        names = [f"{p.x}\n{count(p.parameters)}" for p in points]
+        trunks = {p.x: trunk_parameters(p.trial.model) for p in sweep.points}
+        names = [f"{p.x}\n{count(trunks[p.x])}" for p in points]
     panel.set_xticks([p.x for p in points], names)
     panel.xaxis.set_minor_locator(NullLocator())
     if len(points) == 1:

@@ -116,7 +116,7 @@ def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series:
     for x, p in points.items():
         values = [pm(column[x].mean, column[x].sem) for column in columns.values()]
         lines.append([f"{x:,}", f"{p.parameters:,}", *values, str(len(p.seeds))])
-    numbers = table([sweep.axis, "parameters", *(HEADINGS[m] for m in columns), "seeds"], lines)
+    numbers = table([sweep.axis, "parameters, all robots", *(HEADINGS[m] for m in columns), "seeds"], lines)
     return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
 
 
@@ -151,7 +151,7 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
     if any(controls.values()):
         pairs = [[pm(p[0].mean, math.nan) if p else "–", ""] for p in controls.values()]
         lines.append(["default, shuffled actions", "", *(cell for pair in pairs for cell in pair), "1"])
-    head = [sweep.axis, "parameters"]
+    head = [sweep.axis, "parameters, all robots"]
     for metric in columns:
         head += [HEADINGS[metric], "to the default"]
     return table([*head, "seeds"], lines) + (

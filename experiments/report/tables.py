@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from experiments.report.robots import read_data
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.sealed import read_result
@@ -29,11 +30,12 @@ def write_tables(
     from hma_jax.evaluation.windows import FILE
 
     names, rows = titles(sweeps, provenance), []
+    there = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
     for id, trial in unique_trials(sweeps, provenance).items():
         state = states[id].event
         result = read_result(workspace.trials / id) if state == FINISHED else None
         loss = last_loss(result["losses"]).mean if result else 0.0
-        rows.append(trial_row(id, names[id], state, trial, provenance, result, loss))
+        rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, there))
     write_trials(workspace.trial_table, rows)
     found = []
     references = [reference_trial(record.study, seed) for seed in record.study.seeds]

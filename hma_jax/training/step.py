@@ -31,7 +31,8 @@ from hma_jax.training.state import FINITE, TrainState, all_finite
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
-embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end."""
+embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end; perhaps seed
+uint32 [2], `jax.random.key_data` of the key of all draws, so that runs of other seeds are the same program."""
 
 
 def make_train_step(
@@ -101,7 +102,10 @@ def make_train_step(
         return grads, total
 
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, jax.Array]]:
-        key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+        batch = dict(batch)
+        seed = batch.pop("seed", None)
+        key = jax.random.key(config.seed) if seed is None else jax.random.wrap_key_data(seed)
+        key = jax.random.fold_in(key, state.step)
         real_BT = batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         counts = count_targets(masked)

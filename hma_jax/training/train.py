@@ -69,13 +69,16 @@ def train_model(
         today = modernise(described)
         return today | {"provenance": modernise_provenance(today["provenance"])}
 
+    everywhere = NamedSharding(device_mesh, PartitionSpec())
     with jax.set_mesh(device_mesh):
         step = jax.jit(
             make_train_step(declared, table, model, config, execution.accumulate),
             donate_argnums=0,
             # Numbers lie everywhere, so that every process can read them.
-            out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), NamedSharding(device_mesh, PartitionSpec())),
+            out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), everywhere),
         )
+
+        seed = jax.device_put(jax.random.key_data(jax.random.key(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
             """A run may go on for more steps, or fewer, from where the rate did not depend on their number."""
@@ -90,7 +93,7 @@ def train_model(
             steps=config.steps,
             run_dir=run_dir,
             about=Start(describe_run(model, config, table, provenance), to_dict(execution), modernised, records),
-            put_batch=put,
+            put_batch=lambda batch: put(batch) | {"seed": seed},
             options=replace(
                 options,
                 flops_per_step=train_flops_per_step(model, table, config),

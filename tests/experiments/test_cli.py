@@ -1,18 +1,12 @@
 """The command line: one message and the right exit code for every mistake, fast and full help."""
 
-import ast
-import graphlib
 import shlex
 import subprocess
 import sys
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 
-import data_pipelines
-import experiments
-import hma_jax
 from experiments import run_study as study_runs
 from experiments.cli.main import main
 from experiments.preparing import pipeline, windows
@@ -111,33 +105,6 @@ def test_sweep_modules_run_as_programs(module, shown):
         capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == 0 and shown in done.stdout, done.stderr
-
-
-@pytest.mark.parametrize("package", [hma_jax, data_pipelines, experiments], ids=lambda p: p.__name__)
-def test_no_package_imports_in_a_circle(package):
-    """Imports inside functions count too; those for type checking only do not."""
-    root = Path(package.__file__).parent
-    files = {module_name(path, root.parent): path for path in root.rglob("*.py")}
-    graph = {name: imports_of(path, files) - {name} for name, path in files.items()}
-    assert sum(map(len, graph.values())) > len(graph)
-    list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError
-
-
-def module_name(path, root):
-    return ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__")
-
-
-def imports_of(path, known):
-    """Modules of `known` that a file imports."""
-    tree = ast.parse(path.read_text())
-    unseen = [n for n in tree.body if isinstance(n, ast.If) and getattr(n.test, "id", "") == "TYPE_CHECKING"]
-    tree.body = [n for n in tree.body if n not in unseen]
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom):
-            inner = {f"{node.module}.{alias.name}" for alias in node.names} & set(known)
-            found |= inner or ({node.module} & set(known))
-    return found
 
 
 def test_a_study_is_the_scaling_axes_only(capsys):

@@ -182,7 +182,10 @@ def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypat
 
 def test_sources_of_the_tokenizer_are_its_own():
     names = trace(tokenizer_step.SOURCES)
-    assert {"hma_jax.tokenizers.lfq", "data_pipelines.sources.rlds.images", "hma_jax.training.loop"} <= names.keys()
+    assert {
+        "hma_jax.tokenizers.lfq", "data_pipelines.sources.rlds.images", "data_pipelines.sources.rlds.dataset",
+        "data_pipelines.sources.lerobot_dataset", "hma_jax.training.loop",
+    } <= names.keys()
     assert not [name for name in names if name.startswith(("experiments", "hma_jax.model.trunk"))]
 
 

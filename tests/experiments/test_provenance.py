@@ -262,7 +262,12 @@ def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
     with pytest.raises(CodeChanged, match="to be run; differs in hma_jax.a"):
         require_one_closure(workspace.trials, ids[1:], NEW, accept=False)
     require_one_closure(workspace.trials, ids, NEW, accept=True)
-    page = _origin(workspace, record_of(), PROVENANCE, ids, None)
+    result = json.loads((workspace.trials / ids[0] / "result.json").read_text())
+    del result["hash"], result["files"]
+    result["run"]["machine"]["processor"] = "another"
+    write_result(workspace.trials / ids[0], result)
+    page = _origin(workspace, record_of(), PROVENANCE, ids)
+    assert f"{len(ids) - 1} trials: abacus, 2 cores; 1 trial: another, 2 cores" in page
     assert "2 different ones, by hash: " in page and closure_hash(NEW) in page and closure_hash(OLD) in page
 
 

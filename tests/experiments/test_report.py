@@ -2,10 +2,15 @@
 
 import math
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from experiments.analysis.scaling import trunk_parameters
+from experiments.report import plots
 from experiments.report.draw import draw
+from experiments.report.plot_style import count
 from experiments.rows import OVERALL, Row, curve, read_csv, tally, write_csv
 from experiments.sweeps.datasets import plan as plan_datasets
 from experiments.sweeps.width import plan as plan_width
@@ -77,6 +82,27 @@ def test_page_is_self_contained_and_names_what_failed(drawn):
 def test_figures_are_pictures(drawn):
     for name in ("datasets", "trajectories", "width", "scaling"):
         assert (drawn.figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
+    rows, sweep = rows_of(drawn, [plan_width(STUDY)]), plan_width(STUDY)
+    plots.plot_sweep(rows, sweep, tmp_path / "width.png")
+    (figure,) = kept
+    figure.canvas.draw()
+    panels = dict(zip(("perplexity", "delta_psnr"), figure.axes, strict=True))
+    for metric, panel in panels.items():
+        bars = {c.get_label(): c for c in panel.containers}
+        points = curve(rows, "width", metric)
+        shown = bars["mean ± s.e."].lines[0].get_xydata()
+        np.testing.assert_allclose(shown, [(p.x, p.mean) for p in points])
+        assert bars["trained on shuffled actions"].lines[0].get_xdata().tolist() == [sweep.reference_x]
+        low, high = sorted(panel.get_ylim())
+        labelled = [t for t in panel.yaxis.get_ticklabels() if t.get_text() and low <= t.get_position()[1] <= high]
+        assert len(labelled) >= 3
+        trunks = [count(trunk_parameters(replace(STUDY.model, width=p.x))) for p in points]
+        assert [t.get_text().split("\n")[1] for t in panel.get_xticklabels() if t.get_text()] == trunks
 
 
 def test_page_without_any_finished_trial(tmp_path):

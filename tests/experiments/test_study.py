@@ -208,13 +208,16 @@ def test_unknown_preset_lists_the_known():
 def test_paper_preset_has_the_papers_sizes():
     assert PAPER.dataset_counts == (5, 10, 20, 30, 40) and len(PAPER.datasets) == 40
     assert (PAPER.model.frames, PAPER.model.tokens, PAPER.model.layers, PAPER.model.action_tokens) == (12, 256, 32, 64)
+    assert (PAPER.train.steps, PAPER.train.batch, PAPER.tau) == (60_000, 64, 3.0)
+    assert PAPER.widths == (64, 128, 256, 512, 768)
+    assert PAPER.trajectory_counts == tuple(10**n for n in range(1, 7))
     reference = reference_trial(PAPER, 0)
     counts = {
         w: estimate(replace(reference, datasets=PAPER.datasets[:1], model=replace(PAPER.model, width=w)))
-        for w in (256, 1024)
+        for w in (256, 768)
     }
     assert round(counts[256].parameters_one_robot / 1e6, 1) == 43.6
-    assert round(counts[1024].parameters_one_robot / 1e6, 1) == 678.7
+    assert round(counts[768].parameters_one_robot / 1e6, 1) == 383.0
 
 
 def test_declared_table_knows_what_the_registry_knows():

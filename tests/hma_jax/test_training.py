@@ -13,6 +13,8 @@ from hma_jax.training.checkpoints import CheckpointError
 from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.runs import load_run
+from hma_jax.training.state import init_state
+from hma_jax.training.step import make_train_step
 from hma_jax.training.train import train_model
 from tests.tiny import TABLE, batches, shallow_config, train_config
 
@@ -200,3 +202,17 @@ def test_parameters_to_start_from_stay_the_caller_s(tmp_path: Path):
     result = train(tmp_path, initial=given)
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))
     assert equal_trees(given, before) and not equal_trees(given, result.state.params)
+
+
+def test_runs_of_other_seeds_are_one_program():
+    """So that a sweep over seeds compiles once. Without a seed in the batch it is the configuration's."""
+    declared, (batch,) = declare_model(MODEL, TABLE), [next(batches(MODEL)(0))]
+    state = init_state(declared, TABLE, 0)
+    texts, norms = set(), {}
+    for seed in (0, 1):
+        step = jax.jit(make_train_step(declared, TABLE, MODEL, dataclasses.replace(train_config(), seed=seed)))
+        given = batch | {"seed": jax.random.key_data(jax.random.key(seed))}
+        texts.add(step.lower(state, given).as_text())
+        norms[seed] = float(step(state, given)[1]["grad_norm"])
+        assert norms[seed] == pytest.approx(float(step(state, batch)[1]["grad_norm"]), rel=1e-4)
+    assert len(texts) == 1 and abs(norms[0] / norms[1] - 1) > 1e-3

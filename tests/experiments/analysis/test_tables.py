@@ -58,9 +58,10 @@ def test_a_row_per_trial_has_every_setting_and_result(tmp_path):
     (directory, _), (table, _) = two_seeds(tmp_path)
     trial = reference_trial(STUDY, 0)
     other = replace(trial, max_trajectories=None)
+    there = {"arm": 3, "rover": 20, "pusher": 8}
     rows = [
-        trial_row(directory.name, "a", "finished", trial, PROVENANCE, read_result(directory), 2.0),
-        trial_row(trial_id(other, PROVENANCE), "b", "failed", other, PROVENANCE, None, 0.0),
+        trial_row(directory.name, "a", "finished", trial, PROVENANCE, read_result(directory), 2.0, there),
+        trial_row(trial_id(other, PROVENANCE), "b", "failed", other, PROVENANCE, None, 0.0, there),
     ]
     write_trials(tmp_path / "trials.parquet", rows)
     before = (tmp_path / "trials.parquet").read_bytes()
@@ -72,4 +73,9 @@ def test_a_row_per_trial_has_every_setting_and_result(tmp_path):
     assert (one["config.max_trajectories"], two["config.max_trajectories"]) == (8, None)
     assert (one["manifest"], one["robots"], one["windows"], one["training_loss"]) == (PROVENANCE.manifest, 2, 96, 2.0)
     assert one["cross_entropy"] == pytest.approx(table.metrics["cross_entropy"].mean(), rel=1e-6)
+    assert (one["trajectories"], two["trajectories"]) == (3 + 8 + 8, 3 + 20 + 8)
+    assert one["windows_drawn"] == trial.train.steps * trial.train.batch
+    poor = trial_row("c", "c", "failed", replace(trial, capped=("rover",)), PROVENANCE, None, 0.0, {**there, "arm": 30})
+    assert poor["trajectories"] == 30 + 8 + 8
+    assert trial_row("d", "d", "failed", trial, PROVENANCE, None, 0.0, {})["trajectories"] is None
     assert two["status"] == "failed" and two["cross_entropy"] is two["parameters"] is None
