@@ -91,8 +91,8 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
         lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells])
     head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics)]
     return "<h4>Robots whose data grows, and others</h4>" + table(head, lines, text=3) + (
-        "<p>From each point to the next, window by window, of robots that get more trajectories there and of those that "
-        "have no more to give. Intervals of 95 % are over seeds and episodes.</p>"
+        "<p>From each point to the next, window by window, of robots that get more trajectories there and of those "
+        "that have no more to give. Intervals of 95 % are over seeds and episodes.</p>"
     )
 
 
