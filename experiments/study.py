@@ -94,7 +94,7 @@ class DesignConfig:
     shots_after: tuple[int, ...] = (5, 20, 40)  # robots that the model knows by then
     shots_steps: int = 1000  # of adapting
     caps: tuple[int, ...] = (4, 16, 64, 256)  # trajectories per robot at most; the last point has all
-    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference, the last those of every axis
+    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference, those of every axis among them
     long: tuple[int, ...] = ()  # more steps of the reference, of the first seed alone
     compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # steps of the reference whose FLOPs every width may use
     rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the first and last of `budgets`
