@@ -1,12 +1,24 @@
 """What goes wrong with data, as exceptions whose message is complete.
 
-Owns the exception types only. A message says what is wrong, where (file and byte offset, or
-dataset, episode and step) and what to do; the command line prints it as it is.
+Owns the exception types, and how their advice is told from the rest. A message says what is wrong,
+where (file and byte offset, or dataset, episode and step) and what to do; the command line prints it as it is.
 """
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+
+ADVICE = re.compile(r"[.;] (?:Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
+"""The end of a message that says how damage is left out."""
+
+
+def without_advice(text: str) -> str:
+    """The message of an EpisodeError for whoever leaves damage out already: what is wrong and where, as a sentence.
+
+    Not for what a token store keeps: its hash covers the whole message.
+    """
+    return ADVICE.sub(".", text)
 
 
 class DataError(Exception):

@@ -28,7 +28,7 @@ def encode(episode: Episode, layout: Layout) -> bytes:
     """The record of `episode`. Raises UnitError where it contradicts `layout`, naming the field."""
     steps = len(episode.instructions)
     if not steps:
-        raise UnitError(f"{episode.origin}: an episode without a step; leave it out.")
+        raise UnitError(f"{episode.origin}: an episode without a step.")
     rewards = np.zeros(steps, np.float32) if episode.rewards is None else np.asarray(episode.rewards)
     if rewards.shape != (steps,):
         raise UnitError(f"{episode.origin}: {rewards.shape} rewards for {steps} steps.")

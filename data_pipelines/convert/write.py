@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.convert.episode import Conversion, encode
-from data_pipelines.errors import DataError
+from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.claims import claim
 from data_pipelines.publishing.files import publish, sync
 from data_pipelines.publishing.journal import Journal
@@ -31,9 +31,6 @@ from data_pipelines.sources.units import LeftOut, Source, UnitError
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash
 from hma_jax.runtime.locks import Held
-
-ADVICE = re.compile(r" Fetch the file again, or leave [\w ]+ out with --skip-damaged[^.]*\.$")
-"""What the message of a UnitError advises, of no use to whoever followed it."""
 
 CONVERTER = 1
 """Raise it when a converter writes other bytes for the same source."""
@@ -146,7 +143,7 @@ def _write_shards(
                 except UnitError as error:
                     if not skip_damaged:
                         raise
-                    left_out[ADVICE.sub("", str(error))] += 1
+                    left_out[without_advice(str(error))] += 1
                 unit += 1
                 if progress is not None:
                     progress(unit, total, source.units[unit - 1])
@@ -164,9 +161,9 @@ def _finish(
     episodes = sum(s.records for s in shards)
     left_out = dict(sorted(sum((Counter(s.left_out) for s in shards), Counter()).items()))
     if not episodes:
-        reasons = "; ".join(f"{n} x {reason}" for reason, n in left_out.items()) or "it has no unit"
+        reasons = "; ".join(f"{n} x {reason.rstrip('.')}" for reason, n in left_out.items()) or "it has no unit"
         shutil.rmtree(partial)
-        raise DataError(f"{source.description}: no episode can be made of it: {reasons}.")
+        raise DataError(f"{source.description.rstrip('.')}: no episode can be made of it: {reasons}.")
     kept = [(k, s) for k, s in enumerate(shards) if s.records]
     for to, (k, _) in enumerate(kept):
         target = partial / shard_name(name, to, len(kept))

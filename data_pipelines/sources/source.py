@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from data_pipelines.errors import DataError, EpisodeError
+from data_pipelines.errors import DataError, EpisodeError, without_advice
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from data_pipelines.sources.rlds.schema import FlatFeature, closest, field_slice, listing, step_key
 from hma_jax.config import ConfigError, require
@@ -233,7 +233,8 @@ class EpisodeSource(ABC):
         if lost > self.max_skipped:
             raise DataError(
                 f"{self.name}: {lost} episodes are unusable, more than max_skipped={self.max_skipped}. "
-                f"The last: {reason} Raise max_skipped if the rest is worth it."
+                f"The last: {without_advice(reason)} If the rest is worth it, raise the limit: "
+                "--set store.max_skipped=N."
             )
 
 

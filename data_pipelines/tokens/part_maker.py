@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import DataError, without_advice
 from data_pipelines.publishing.claims import Claim, claim
 from data_pipelines.tokens.manifest import SPLITS, LostEpisodes, Manifest
 from data_pipelines.tokens.part_files import FACTS, Part, PartItem, read_part, write_part
@@ -116,5 +116,6 @@ class PartMaker:
         if lost > self.max_lost:
             raise DataError(
                 f"{self.plan.spec.name}: {lost} episodes are unusable, more than max_skipped={self.max_lost}. "
-                f"The last: {losses[-1].reason} Raise max_skipped if the rest is worth it."
+                f"The last: {without_advice(losses[-1].reason)} If the rest is worth it, raise the limit: "
+                "--set store.max_skipped=N."
             )

@@ -120,6 +120,7 @@ def show_store(workspace: Workspace) -> None:
     """What the token store holds, per dataset."""
     import numpy as np
 
+    from data_pipelines.errors import without_advice
     from data_pipelines.tokens.store import TokenStore
 
     store = TokenStore(workspace.store)
@@ -144,4 +145,4 @@ def show_store(workspace: Workspace) -> None:
     console.print(table)
     for name in store.names:
         for loss in store.manifest(name).skipped:
-            console.print(f"[yellow]lost[/] {name}: {escape(loss.reason)}", soft_wrap=True)
+            console.print(f"[yellow]lost[/] {name}: {escape(without_advice(loss.reason))}", soft_wrap=True)

@@ -164,7 +164,11 @@ def test_damage_can_be_left_out_and_is_counted(arm, tmp_path, capsys):
     flip(300)(directory)
     arguments = ("--out", str(tmp_path / "out"), "--data", str(directory), "--set", "store.corrupt=skip")
     assert main(["tokenize", *SMOKE, *arguments]) == 0
-    assert f"{ARM.name}: 1 damaged episodes are left out" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{ARM.name}: 1 damaged episodes are left out" in said
+    assert "checksum of the record's data" in said.split(f"lost {ARM.name}: ")[1] and "corrupt='skip'" not in said
+    manifest = tmp_path / "out" / "tokens" / ARM.name / "manifest.json"
+    assert "corrupt='skip'" in manifest.read_text()  # its hash covers the whole message
     (facts,) = json.loads((tmp_path / "out" / "data.json").read_text()).values()
     assert facts["skipped"] == 1
 
@@ -182,7 +186,8 @@ def test_more_damage_than_allowed_is_an_error_even_so(tmp_path, refused):
     skip = ("--set", "store.corrupt=skip", "--set", "store.min_val=8")  # some of those held out are whole
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip)
     assert "17 episodes are unusable, more than max_skipped=16" in message
-    assert f"episode {bad[16]}" in message
+    assert f"episode {bad[16]}" in message and "corrupt=" not in message
+    assert "If the rest is worth it, raise the limit: --set store.max_skipped=N." in message
     allowed = ("--set", "store.max_skipped=22")
     arguments = map(str, ("tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *skip, *allowed))
     assert main(list(arguments)) == 0

@@ -69,6 +69,25 @@ def test_what_is_left_out_is_told(tmp_path, capsys):
     assert "1 episodes at 10 Hz" in out and "left out 1 x: fewer than 4 frames in a row" in out
 
 
+def test_who_meets_a_damaged_file_is_told_what_this_command_has(tmp_path, capsys):
+    root = write_lerobot(tmp_path / "arm", "v2.1")
+    video = next(root.rglob("episode_000001.mp4"))
+    video.write_bytes(b"no video")
+    command = ["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]
+    assert main(command) == 1
+    error = capsys.readouterr().err
+    assert f"error: {video}: no readable video" in error and "--set" not in error and "corrupt=" not in error
+    assert error.endswith(". Fetch the file again, or add --skip-damaged to leave it out.\n")
+    assert main([*command, "--skip-damaged"]) == 0
+    out = said(capsys)
+    assert f"left out 1 x: {video}: no readable video" in out and "--skip-damaged" not in out
+    next(root.rglob("episode_000000.mp4")).write_bytes(b"no video")
+    assert main([*command, "--skip-damaged", "--name", "none"]) == 1
+    error = capsys.readouterr().err
+    assert "error: LeRobot dataset arm (v2.1), 10 Hz: no episode can be made of it: 1 x " in error
+    assert error.endswith(").\n") and ".;" not in error and ".:" not in error
+
+
 @pytest.mark.parametrize(
     "arguments, code, message",
     [

@@ -124,16 +124,22 @@ def egoexo4d(
 
 def _convert(source: Source, destination: Destination, default_name: str) -> None:
     from data_pipelines.convert.write import convert
+    from data_pipelines.errors import DataError, without_advice
+    from data_pipelines.sources.units import UnitError
 
     name = destination.name or re.sub(r"[^a-z0-9_]+", "_", default_name.lower()).strip("_")
     with step(f"convert {len(source.units)} to {name}") as update:
-        done = convert(
-            source,
-            destination.out,
-            name,
-            skip_damaged=destination.skip_damaged,
-            progress=lambda units, total, unit: update(units, total, unit),
-        )
+        try:
+            done = convert(
+                source,
+                destination.out,
+                name,
+                skip_damaged=destination.skip_damaged,
+                progress=lambda units, total, unit: update(units, total, unit),
+            )
+        except UnitError as error:  # whose own advice is for those who tokenise, too
+            advice = "Fetch the file again, or add --skip-damaged to leave it out."
+            raise DataError(f"{without_advice(str(error))} {advice}") from error
     _say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
     for reason, count in done.left_out.items():
         _say(f"left out {count:,} x: {reason}")
