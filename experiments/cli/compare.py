@@ -9,6 +9,7 @@ from tyro.conf import Positional, arg
 
 from experiments.progress import console, tidy_table
 from experiments.wrote import wrote
+from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -39,10 +40,10 @@ def compare(
     from experiments.analysis.tables import read_side
     from experiments.rows import write_csv
 
+    make_directory(to.parent, "--to")
     first, second = read_side(a), read_side(b)
     rows = analysis.compare(first, second)
     console.print(_table(rows, first, second))
-    to.parent.mkdir(parents=True, exist_ok=True)
     write_csv(to, analysis.Difference, rows)
     wrote(to)
 

@@ -17,6 +17,7 @@ from experiments.study import Study
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.locks import Held, exclusive
+from hma_jax.runtime.outputs import unwritable
 
 
 class Busy(Held):
@@ -142,12 +143,7 @@ class Workspace:
                     held.holder,
                 ) from None
             except OSError as error:
-                there = next(p for p in (self.root, *self.root.parents) if p.exists())
-                what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
-                raise ConfigError(
-                    f"cannot write to {self.root}: {what} ({error.strerror}); choose another --out, in a directory "
-                    "where you may write"
-                ) from error
+                raise unwritable(self.root, error) from error
             yield
 
 

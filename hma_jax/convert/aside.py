@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hma_jax.config import require
+from hma_jax.runtime.outputs import unwritable
 
 
 def require_free(directory: Path) -> None:
@@ -25,13 +26,16 @@ def require_free(directory: Path) -> None:
 def written_aside(directory: Path) -> Iterator[Path]:
     """A new directory to write into, which takes the place of `directory` when the block ends well.
 
-    Raises ConfigError if something is there already.
+    Raises ConfigError if something is there already, or if nothing can be written there.
     """
     require_free(directory)
     directory = Path(directory).absolute()
-    directory.parent.mkdir(parents=True, exist_ok=True)
     aside = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
-    aside.mkdir()
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        aside.mkdir()
+    except OSError as error:
+        raise unwritable(directory, error) from error
     try:
         yield aside
         os.replace(aside, directory)

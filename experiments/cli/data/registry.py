@@ -18,6 +18,7 @@ from experiments.progress import console, step, tidy_table
 from experiments.setting import use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError
+from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts
@@ -118,6 +119,8 @@ def data_inspect(
     if hz is not None and hz <= 0:
         raise ConfigError(f"--hz must be positive, got {hz:g}")
     use_entries(registry)
+    sheets = Path("runs") / "inspect"
+    make_directory(out or sheets)
     with step(f"read {directory}"):
         sample = inspect_dataset(directory, split, episodes=episodes)
     facts = sample.facts
@@ -138,8 +141,8 @@ def data_inspect(
             f"{windows.total:,.0f} windows in the split"
         )
     _print_entry(facts, known, suggestion)
-    folder = out or Path("runs") / "inspect" / facts.name
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = out or sheets / facts.name
+    folder.mkdir(exist_ok=True)
     blank = [c.key for c in facts.cameras if c.is_blank]
     title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
     sheet, aside = folder / SHEET, folder / f".{SHEET}"

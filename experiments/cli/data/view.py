@@ -17,6 +17,7 @@ from experiments.progress import console, step
 from experiments.setting import command, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
+from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
     from data_pipelines.inspection.duplicates import Fingerprint
@@ -60,6 +61,7 @@ def view(
     require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
     require(1 <= shown <= episodes, f"--shown must lie between 1 and --episodes {episodes}, got {shown}")
     use_entries(registry)
+    make_directory(out.parent)
     viewed = []
     for directory in datasets:
         with step(f"read {directory}"):
@@ -71,7 +73,6 @@ def view(
     }  # fmt: skip
     options = [word for name, value in given.items() if value is not None for word in (f"--{name}", f"{value}")]
     again = command("data view", *datasets, "--out", out, *options)
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_file(out, draw_page(viewed, frames, again))
     wrote(out)
     _say_next(viewed, frames, registry)
