@@ -152,10 +152,8 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Remark]:
 
 
 def _first_value(key: str, entry: DatasetSpec | None) -> int:
-    """Where the values of a field begin in the entry's action."""
-    if entry is None or key not in entry.action_keys:
-        return 0
-    return sum(entry.action_dims[: entry.action_keys.index(key)])
+    """Where the values of a chosen field (see `chosen_actions`) begin in the entry's action."""
+    return 0 if entry is None else sum(entry.action_dims[: entry.action_keys.index(key)])
 
 
 def _duplicates(groups: Sequence[tuple[Fingerprint, ...]]) -> list[Remark]:

@@ -13,6 +13,7 @@ from data_pipelines.inspection.duplicates import Fingerprint, find_duplicates, t
 from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.remarks import make_remarks
 from data_pipelines.inspection.suggest import window_facts
+from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.rlds.images import decode_image
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
 
@@ -101,6 +102,29 @@ def test_angles_that_wrap_unless_the_entry_mends_them(tmp_path):
     for form in ("sine_cosine", "unwrapped"):
         mended = replace(SPEC, angles=(2,), angle_form=form)
         assert "wrapping angle" not in remarks_of(tmp_path / form, wrapping, spec=mended)
+
+
+def test_angles_are_numbered_as_the_entry_numbers_them(tmp_path):
+    """Over all its keys, of which each may be a part of a field; fields that it leaves out have no number."""
+    fields = make_spec("toy", (4, 7))
+
+    def change(episode, features):
+        actions = np.random.default_rng(episode).normal(size=(20, 11))
+        actions[:, 9] = (0.5 * np.arange(20) + np.pi) % (2 * np.pi) - np.pi
+        features["steps/action/part_0"], features["steps/action/part_1"] = np.split(actions, [4], axis=1)
+
+    facts = inspect_dataset(write_rlds(tmp_path, fields, [20] * 8, change=change)).facts
+
+    def wrapping_of(entry: DatasetSpec | None) -> list[str]:
+        return [r.text for r in make_remarks(facts, entry, None, ()) if r.title == "wrapping angle"]
+
+    parts = replace(fields, action_keys=("action/part_0[:3]", "action/part_1[:6]"), action_dims=(3, 6))
+    (text,) = wrapping_of(parts)
+    assert text.startswith("action/part_1[:6]: value 5 jumps by a whole turn") and "angles = [8]" in text
+    assert not wrapping_of(replace(parts, angles=(8,), angle_form="sine_cosine"))
+    assert not wrapping_of(replace(parts, action_keys=("action/part_0[:3]",), action_dims=(3,)))
+    (text,) = wrapping_of(None)
+    assert text.startswith("action/part_1: value 5 jumps") and "angles = [5]" in text
 
 
 def test_an_entry_that_names_what_is_not_there(tmp_path):
