@@ -59,6 +59,9 @@ def lerobot(
 ) -> None:
     """A LeRobot dataset, version 2.0, 2.1 or 3.0, with videos or images.
 
+    Every frame of a video becomes a JPEG of its own, so the dataset grows: 289 MB of video became 2.6 GB;
+    --short-side and --camera make it less.
+
     Args:
         source: Its root, with meta, data and videos.
         destination: Where the dataset goes.
