@@ -39,6 +39,8 @@ class Suggestion:
     reasons: tuple[str, ...]
     angles: tuple[int, ...] = ()
     angle_unit: AngleUnit = "radian"
+    episodes: int = 0
+    mean_steps: float = 0.0  # of those that were read
 
     @property
     def angle_form(self) -> AngleForm:
@@ -50,6 +52,7 @@ class Suggestion:
             self.name, self.image_key, self.action_keys, self.action_dims, self.hz,
             split=self.split, video_targets=self.video_targets, version=self.version,
             angles=self.angles, angle_form=self.angle_form, angle_unit=self.angle_unit,
+            episodes=self.episodes, mean_steps=self.mean_steps,
         )  # fmt: skip
 
     def python(self) -> str:
@@ -74,6 +77,7 @@ class Suggestion:
             lines.append(f"        angle_form={_text(self.angle_form)},  # or \"unwrapped\"")
             if self.angle_unit != "radian":
                 lines.append(f"        angle_unit={_text(self.angle_unit)},")
+        lines += [f"        episodes={self.episodes},", f"        mean_steps={self.mean_steps},"]
         return "\n".join([*lines, "    ),"])
 
 
@@ -109,6 +113,7 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
     return Suggestion(
         facts.name, camera.key, keys, dims, hz or NO_RATE, facts.split, facts.version,
         not camera.is_blank, tuple(reasons), angles, unit,
+        episodes=facts.episodes, mean_steps=round(facts.lengths.mean, 1),
     )  # fmt: skip
 
 

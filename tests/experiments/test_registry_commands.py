@@ -57,6 +57,9 @@ def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, 
     out = str(tmp_path / "out")
     common = ["--preset", "smoke", "--out", out, "--data", str(robot), "--set", "model.frames=4"]
     assert main(["tokenize", *common]) == 2
+    assert main(["study", *common, "--registry", entries, "--dry-run"]) == 0
+    plan = " ".join(capsys.readouterr().out.split())
+    assert "to prepare (the tokenizer" in plan and "not counted" not in plan
     assert main(["tokenize", *common, "--registry", entries]) == 0
     manifest = json.loads((tmp_path / "out" / "tokens" / "my_robot" / "manifest.json").read_text())
     assert manifest["spec"]["action_keys"] == ["action[:3]"] and len(manifest["action_mean"]) == 3

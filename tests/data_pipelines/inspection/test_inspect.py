@@ -168,6 +168,7 @@ def test_suggested_python_is_an_entry_that_reads_the_dataset(toy):
     (spec,) = eval(f"({suggestion.python()})", {"DatasetSpec": DatasetSpec})  # what pasting it does
     assert spec == suggestion.spec()
     assert (spec.action_keys, spec.action_dims, spec.hz) == (("action[:2]",), (2,), 4)
+    assert (spec.episodes, spec.mean_steps) == (facts.episodes, round(np.mean(facts.steps), 1))
 
 
 def test_without_a_rate_the_entry_says_where_it_is_missing(toy):
