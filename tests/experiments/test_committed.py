@@ -7,15 +7,22 @@ table alone cannot be: its files are held by their hashes.
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.report.draw import draw, draw_again
-from experiments.rows import read_csv
+from data_pipelines.suite.embodiments import TRAINED
+from experiments.report.draw import draw_again
+from experiments.report.robots import robots_of
+from experiments.rows import OVERALL, read_csv
 from experiments.running.ledger import FINISHED
+from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import POINT
+from hma_jax.evaluation.windows import FILE, WindowTable
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
 STUDIES = sorted(path.parent.name for path in RESULTS.glob("*/study.json"))
@@ -55,26 +62,60 @@ def test_the_first_axis_by_how_much_data_a_robot_has_is_as_the_page_on_designs_s
         assert f"| {line} |" in page, line
 
 
+def horizon_rows() -> list[str]:
+    """The lines of docs/designs.md on the axis `horizon` of cpu-full, from every window's numbers."""
+    workspace = Workspace(RESULTS / "cpu-full")
+    record = load_record(workspace)
+    (sweep,) = plan_sweeps(record.study, ("horizon",))
+    acting = {e.name for e in TRAINED if not e.video_only}
+    ids = {trial_id(p.trial, record.provenance): p for p in sweep.points if p.role == POINT}
+    windows = {id: WindowTable.load(workspace.trials / id / FILE) for id in ids}
+    lines = []
+    for x in sorted({p.x for p in ids.values()}):
+        tables = [windows[id] for id, p in ids.items() if p.x == x]
+        robots = robots_of([], replace(sweep, reference_x=x), record.provenance, windows)
+        follow = [r.follows for r in robots if r.name in acting]
+
+        def mean(metric: str, tables=tables) -> float:
+            return float(np.mean([t.of(name).metrics[metric].mean() for t in tables for name in t.datasets]))
+
+        cells = [
+            f"{x:,}", len(tables), f"{mean('cross_entropy'):.2f}", f"{mean('psnr'):.2f}",
+            sum(r.ahead > 0 for r in robots),
+            sum(f["action_nats"].errors > 3 for f in follow), sum(f["delta_psnr"].errors > 2 for f in follow),
+            *(f"{np.mean([f[metric].mean for f in follow]):.2f}" for metric in ("action_nats", "retrieval")),
+        ]  # fmt: skip
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return lines
+
+
+def test_the_axis_horizon_is_as_the_page_on_designs_says():
+    root = RESULTS.parents[1]
+    page, lines = (root / "docs/designs.md").read_text(), horizon_rows()
+    for line in lines:
+        assert line in page, line
+    of_steps = next(line for line in lines if "| 8,000 |" in line).strip("| ").split(" | ")
+    steps, seeds, _, psnr, ahead, follow, *_ = of_steps
+    table = read_csv(RESULTS / "cpu-full" / "results.csv")
+    (copying,) = {f"{r.mean:.2f}" for r in table if (r.scope, r.metric) == (OVERALL, "psnr_copy")}
+    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; all"
+    assert seeds == "3" and f"{said} {follow}" in " ".join((root / "README.md").read_text().split())
+    assert f"PSNR, copying {copying} dB" in page
+
+
 @pytest.mark.parametrize("name", STUDIES)
-def test_figures_are_drawn_again_from_what_is_kept(name, tmp_path):
+def test_what_is_kept_is_drawn_again(name, tmp_path):
+    """Figures from a table; where trials are kept, tables too, byte for byte, and the page's checks of them hold."""
     shutil.copytree(RESULTS / name, tmp_path / name)
-    figures = {p.name for p in (RESULTS / name / "figures").iterdir()}
-    shutil.rmtree(tmp_path / name / "figures")
     workspace = Workspace(tmp_path / name)
+    figures, kept = {p.name for p in workspace.figures.iterdir()}, workspace.trials.exists()
+    tables = list(workspace.root.glob("*.csv"))
+    shutil.rmtree(workspace.figures)
+    for path in tables if kept else ():
+        path.unlink()
     draw_again(workspace.root)
     assert {p.name for p in workspace.figures.iterdir()} >= figures
-    assert workspace.results.read_bytes() == (RESULTS / name / "results.csv").read_bytes()
-
-
-def test_tables_follow_from_the_trials_that_are_kept(tmp_path):
-    for name in (n for n in STUDIES if (RESULTS / n / "trials").exists()):
-        shutil.copytree(RESULTS / name, tmp_path / name)
-        workspace = Workspace(tmp_path / name)
-        tables = list(workspace.root.glob("*.csv"))
-        for path in tables:
-            path.unlink()
-        draw(workspace, load_record(workspace))
-        for path in tables:
-            assert path.read_bytes() == (RESULTS / name / path.name).read_bytes(), path.name
-        page = workspace.report.read_text()
-        assert "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in page, f"{name}: see its page"
+    for path in tables:
+        assert path.read_bytes() == (RESULTS / name / path.name).read_bytes(), path.name
+    page = workspace.report.read_text()
+    assert not kept or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in page, "see its page"
