@@ -9,6 +9,9 @@ PRESET ?= cpu
 WORKERS ?= 2
 PORT ?= 8765
 EXTRA ?=
+ifneq ($(EXTRA),$(filter cuda tpu,$(EXTRA)))
+$(error EXTRA is '$(EXTRA)': give cuda or tpu, or leave it out for the processor)
+endif
 
 .PHONY: help study play test test-slow clean
 

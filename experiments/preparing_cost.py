@@ -73,7 +73,8 @@ def count_frames(study: Study, name: str) -> Frames | None:
     if robot is not None:
         low, high = robot.seconds
         seconds = (high - low) / math.log(high / low) if high > low else low  # lengths are uniform in the logarithm
-        native = (episode_count(robot, study.suite.scale, study.suite.fewest) + study.suite.validation) * seconds * robot.hz
+        count = episode_count(robot, study.suite.scale, study.suite.fewest) + study.suite.validation
+        native = count * seconds * robot.hz
     elif spec.episodes and (spec.median_steps or spec.mean_steps):
         native = spec.episodes * (spec.mean_steps or spec.median_steps)
     else:

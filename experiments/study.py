@@ -37,6 +37,10 @@ class SuiteConfig:
     seed: int = 0
     validation: int = 24  # held-out episodes of every dataset
 
+    def __post_init__(self):
+        require(self.scale > 0, f"suite.scale must be positive, got {self.scale:g}")
+        require(self.fewest >= 1, f"suite.fewest must be at least 1 episode, got {self.fewest}")
+
 
 @dataclass(frozen=True)
 class StoreConfig:
@@ -94,13 +98,14 @@ class DesignConfig:
     shots_after: tuple[int, ...] = (5, 20, 40)  # robots that the model knows by then
     shots_steps: int = 1000  # of adapting
     caps: tuple[int, ...] = (4, 16, 64, 256)  # trajectories per robot at most; the last point has all
-    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference, those of every axis among them
+    budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference; those of `train` are added
     long: tuple[int, ...] = ()  # more steps of the reference, of the first seed alone
     compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # steps of the reference whose FLOPs every width may use
-    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the first and last of `budgets`
+    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the fewest steps and at those of `train`
     ablation_steps: int | None = None  # of `settings` and `conditioning`; None: as many as every other trial
     end_controls: bool = False  # controls at both ends of an axis, not at the reference alone
-    # Other episodes' actions that all trials but the reference's are judged under; None: as many as `eval` says.
+    # Other episodes' actions that all are judged under but the reference, at any steps, and its control; None: as many
+    # as `eval` says.
     other_actions: int | None = None
 
     def __post_init__(self):

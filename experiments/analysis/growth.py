@@ -14,7 +14,7 @@ from itertools import pairwise
 from experiments.analysis.changes import METRICS
 from experiments.analysis.compare import Side, overall_difference
 from experiments.running.provenance import Provenance
-from experiments.running.trial import Trial, trial_id
+from experiments.running.trial import Trial, trajectories_of, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.evaluation.windows import WindowTable
 
@@ -75,11 +75,11 @@ def _along(
         seeds = there[first].keys() & there[last].keys()
         if not seeds:
             continue
-        caps = [next(iter(there[x].values()))[0].max_trajectories for x in (first, last)]
-        before, after = ({name: _used(episodes[name], cap) for name in sweep.scope if name in episodes} for cap in caps)
+        before, after = (trajectories_of(next(iter(there[x].values()))[0], episodes) for x in (first, last))
+        known = [name for name in sweep.scope if name in before and name in after]
         groups = {
-            GROWS: [name for name in after if after[name] > before[name]],
-            EXHAUSTED: [name for name in after if after[name] <= before[name]],
+            GROWS: [name for name in known if after[name] > before[name]],
+            EXHAUSTED: [name for name in known if after[name] <= before[name]],
         }
         b, a = (Side(f"{sweep.axis} {x:g}", {s: there[x][s][1] for s in sorted(seeds)}, "") for x in (first, last))
         for data, robots in groups.items():
@@ -93,7 +93,3 @@ def _along(
                         )
                     )  # fmt: skip
     return found
-
-
-def _used(there: int, cap: int | None) -> int:
-    return there if cap is None else min(there, cap)

@@ -26,7 +26,7 @@ from typing import Any
 
 from data_pipelines.publishing.files import write_file
 from experiments.running.provenance import Provenance
-from experiments.running.trial import Trial
+from experiments.running.trial import Trial, trajectories_of
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.summary import Summary
 
@@ -46,7 +46,9 @@ def trial_row(
     row = {"trial": id, "title": title, "status": status}
     row |= {f"config.{path}": value for path, value in _flat(to_dict(trial))}
     row |= dataclasses.asdict(provenance)
-    row |= {"windows_drawn": trial.train.steps * trial.train.batch, "trajectories": _trajectories(trial, there)}
+    used = trajectories_of(trial, there)
+    row["windows_drawn"] = trial.train.steps * trial.train.batch
+    row["trajectories"] = sum(used.values()) if used.keys() == set(trial.datasets) else None
     if result is None:
         return row
     summary = Summary.from_dict(result["evaluation"])
@@ -56,13 +58,6 @@ def trial_row(
         row |= {metric: stat.mean, f"{metric}.sem": stat.sem}
         row["windows"], row["episodes"] = max(row.get("windows", 0), stat.n), max(row.get("episodes", 0), stat.episodes)
     return row
-
-
-def _trajectories(trial: Trial, there: Mapping[str, int]) -> int | None:
-    if not set(trial.datasets) <= there.keys():
-        return None
-    caps = {name: trial.max_trajectories for name in trial.capped or trial.datasets}
-    return sum(there[name] if caps.get(name) is None else min(there[name], caps[name]) for name in trial.datasets)
 
 
 def write_trials(path: Path, rows: Iterable[dict[str, Any]]) -> None:

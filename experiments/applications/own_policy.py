@@ -177,9 +177,9 @@ def markdown(rows: list[tuple[str, float, float, float]]) -> str:
 def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bool, float]]]:
     """What `read_trials` reads. Every policy's outcomes are kept in `out` and made once. Raises ConfigError where they
     were made with other settings."""
-    claim(out, run, asdict(settings))
     simulator = load_simulator(run)
     robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
+    claim(out, run, simulator.model.params, asdict(settings))
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():
         with step(f"record {settings.demonstrations} demonstrations"):

@@ -226,13 +226,13 @@ def main() -> None:
     run, out = asked.pop("run"), asked.pop("out")
     search = SearchConfig(candidates=asked.pop("candidates"), iterations=asked.pop("iterations"))
     settings = Settings(search=search, **asked)
-    claim(out, run, asdict(settings))
-    (out / "trials").mkdir(exist_ok=True)
     decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)
     simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = start_seeds(settings.make_task(), settings.starts)
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
+    claim(out, run, simulator.model.params, asdict(settings))
+    (out / "trials").mkdir(exist_ok=True)
     trials: dict[str, list[dict]] = {}
     for way in (*CLONED, RANDOM):
         path = out / "trials" / f"{way.replace(' ', '_')}.json"

@@ -224,10 +224,12 @@ def main() -> None:
     asked = vars(parser.parse_args())
     run, out, seeds = asked.pop("run"), asked.pop("out"), tuple(range(asked.pop("seeds")))
     settings = Settings(seeds=seeds, **asked)
-    claim(out, run, asdict(settings), grows=("seeds",))
-    trials_dir = out / "trials"
-    trials_dir.mkdir(parents=True, exist_ok=True)
     simulator = load_simulator(run, episodes=BATCH, history=1)
+    simulator.robot(settings.robot)  # a mistyped name claims nothing
+    settings.make_task()
+    claim(out, run, simulator.model.params, asdict(settings), grows=("seeds",))
+    trials_dir = out / "trials"
+    trials_dir.mkdir(exist_ok=True)
     data = make_data(settings, simulator, out)
     trials: Trials = {}
     first = sorted(range(len(CONDITIONS)), key=lambda i: i not in (FEW, ALL, MOST, CONTROL))  # what counts most
@@ -241,7 +243,7 @@ def main() -> None:
                 write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
     write_results(settings, trials, quality_of(data, settings.given), out)
-    write_settings(out, run, asdict(settings))
+    write_settings(out, run, simulator.model.params, asdict(settings))
     draw_strips([data[kind].images[:2] for kind in KINDS], KINDS, out / "frames.png")
     wrote(out / TRIALS, out / ERRORS, out / "summary.csv", out / "table.md", out / "synthetic.png", out / "frames.png")
 

@@ -10,7 +10,7 @@ import html
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ def write_report(
             rows, shown_by, robots, workspace.data_summary
         )) if shown else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance)),
-        section("How to repeat it", _origin(workspace, record, provenance, finished)),
+        section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
     ]  # fmt: skip
     page = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -215,9 +215,10 @@ def _origin(
     record: Record,
     provenance: Provenance,
     finished: Sequence[str],
+    results: Mapping[str, Mapping[str, Any]],
 ) -> str:
     suite = record.study.suite
-    machines = [read_result(workspace.trials / id)["run"]["machine"] for id in finished]
+    machines = [results[id]["run"]["machine"] for id in finished]
     ran = group_by_sources(workspace.trials, finished)
     counted = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
     facts = {

@@ -43,7 +43,7 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along
         numbers = "".join(_series(sweep, rows, name, along.changes) for name in names)
         numbers += _growth(sweep, along.growth) + _at_best(sweep, along.best)
     else:
-        numbers = _curve(sweep, rows, along.changes)
+        numbers = _curve(sweep, rows, along.changes) + _growth(sweep, along.growth)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
     return (
         f"{heading}<p>{html.escape(sweep.question)} "
@@ -88,11 +88,11 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
         any_of = next(iter(found.values()))
         whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} without"
         cells = [cell.replace("-", "\u2212") for cell in cells]
-        lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells])
-    head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics)]
+        lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells, str(any_of.seeds)])
+    head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics), "seeds"]
     return "<h4>Robots whose data grows, and others</h4>" + table(head, lines, text=3) + (
         "<p>From each point to the next, window by window, of robots that get more trajectories there and of those "
-        "that have no more to give. Intervals of 95 % are over seeds and episodes.</p>"
+        "that have no more to give. Intervals of 95 % are over episodes, and over seeds where there are several.</p>"
     )
 
 

@@ -85,6 +85,16 @@ def training_of(trial: Trial) -> dict[str, Any]:
     return fields
 
 
+def trajectories_of(trial: Trial, there: Mapping[str, int]) -> dict[str, int]:
+    """{robot: training trajectories that windows may be drawn of}, of the trial's robots that `there` counts."""
+    capped, most = trial.capped or trial.datasets, trial.max_trajectories
+    return {
+        name: there[name] if most is None or name not in capped else min(there[name], most)
+        for name in trial.datasets
+        if name in there
+    }
+
+
 def trial_id(trial: Trial, provenance: Provenance) -> str:
     """The name of a trial: equal exactly when everything that determines it is equal."""
     return stable_hash({"trial": _identity(trial), "provenance": to_dict(provenance)})

@@ -5,7 +5,7 @@ Question: perplexity and delta PSNR of the reference model after more and more s
 Paper figure: none.
 Command: python -m experiments.sweeps.horizon --preset cpu-full
 Cost: one run per seed, and its decay branches; `--dry-run` prints it.
-Expected outcome: perplexity falls, then rises on robots with few trajectories; delta PSNR rises.
+Expected outcome: perplexity falls, and rises again on robots with few trajectories; delta PSNR rises.
 """
 
 from __future__ import annotations

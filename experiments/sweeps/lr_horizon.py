@@ -1,7 +1,7 @@
 """Does the best learning rate stay where it is as training gets longer?
 
-Question: held-out loss over learning rates at the shortest and at the longest number of steps. muP carries a rate
-    over width; nothing carries it over the horizon.
+Question: held-out loss over learning rates at the fewest of `designs.budgets` and at the study's own steps. muP
+    carries a rate over width; nothing carries it over the horizon.
 Paper figure: none.
 Command: python -m experiments.sweeps.lr_horizon --preset cpu-full
 Cost: one run per further rate and seed, with a branch at the fewest steps; `--dry-run` prints it.

@@ -111,7 +111,7 @@ def judge_less(study: Study, sweep: Sweep) -> Sweep:
             trial = replace(trial, source=judged(trial.source))
         if trial.eval != study.eval or stable_hash(training_of(trial)) in whole:
             return trial
-        return replace(trial, eval=replace(trial.eval, other_actions=few))
+        return replace(trial, eval=replace(trial.eval, other_actions=min(few, trial.eval.other_actions)))
 
     return replace(sweep, points=tuple(replace(point, trial=judged(point.trial)) for point in sweep.points))
 

@@ -32,7 +32,7 @@ from hma_jax.training.state import FINITE, TrainState, all_finite
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
 embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end; perhaps seed
-uint32 [2], `jax.random.key_data` of the key of all draws, so that runs of other seeds are the same program."""
+uint32 [2], not the number but the `jax.random.key_data` of its key, so that runs of other seeds are one program."""
 
 
 def make_train_step(

@@ -9,6 +9,7 @@ import pytest
 
 from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
 from data_pipelines.suite.generate import episode_count
+from experiments.analysis.scaling import surface_of
 from experiments.cost import plan_trials
 from experiments.preparing_cost import estimate_preparing
 from experiments.presets import CPU_FULL, PAPER
@@ -114,6 +115,11 @@ def test_every_width_spends_the_same_compute():
         assert max(spent) < 1.01 * min(spent)
 
 
+def test_the_surface_over_size_and_data_has_every_width():
+    """The reference, which is judged under more actions, too."""
+    assert {t.model.width for t, _ in surface_of(list(SWEEPS.values()), PROVENANCE).values()} == set(CPU_FULL.widths)
+
+
 def test_trajectories_are_counted_as_they_are():
     there = [episode_count(e, CPU_FULL.suite.scale, CPU_FULL.suite.fewest) for e in TRAINED]
     for cap in (4, 64, 10_000):
@@ -140,6 +146,8 @@ def test_retrieval_among_sixteen_is_asked_of_the_reference_alone():
             assert p.trial.eval.other_actions == (15 if training_of(p.trial) in runs else 3)
             others = replace(p.trial.eval, other_actions=15)
             assert others == CPU_FULL.eval and all(t.eval.other_actions in (3, 15) for t in p.trial.with_source())
+    none = replace(CPU_FULL, eval=replace(CPU_FULL.eval, other_actions=0))
+    assert {p.trial.eval.other_actions for s in plan_sweeps(none, ("width",)) for p in s.points} == {0}
     whole = replace(CPU_FULL, designs=replace(CPU_FULL.designs, other_actions=None))
     assert {p.trial.eval.other_actions for s in plan_sweeps(whole, CPU_FULL.axes) for p in s.points} == {15}
 

@@ -23,7 +23,7 @@ from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import REFUSED, Ledger
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.runner import Job, run_missing
-from experiments.running.sealed import write_result
+from experiments.running.sealed import read_result, write_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, find_record, save_record
 from experiments.setting import StudyArguments, make_setting
@@ -266,7 +266,7 @@ def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
     del result["hash"], result["files"]
     result["run"]["machine"]["processor"] = "another"
     write_result(workspace.trials / ids[0], result)
-    page = _origin(workspace, record_of(), PROVENANCE, ids)
+    page = _origin(workspace, record_of(), PROVENANCE, ids, {id: read_result(workspace.trials / id) for id in ids})
     assert f"{len(ids) - 1} trials: abacus, 2 cores; 1 trial: another, 2 cores" in page
     assert "2 different ones, by hash: " in page and closure_hash(NEW) in page and closure_hash(OLD) in page
 

@@ -75,7 +75,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     simulator = load_simulator(run_directory, episodes=config.batch)
     robot = simulator.robot(config.task.robot)
     require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
-    claim(out, run_directory, {"config": to_dict(config)}, file="judge.json")
+    claim(out, run_directory, simulator.model.params, {"config": to_dict(config)}, file="judge.json")
     size, stride, task = simulator.tokenizer.image_size, robot.stride, config.task
     policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads
 

@@ -141,8 +141,9 @@ def _convert(source: Source, destination: Destination, default_name: str) -> Non
                 progress=lambda units, total, unit: update(units, total, unit),
             )
         except UnitError as error:  # whose own advice is for those who tokenise, too
-            advice = "Fetch the file again, or add --skip-damaged to leave it out."
-            raise DataError(f"{without_advice(str(error))} {advice}") from error
+            rest = without_advice(str(error))
+            advice = "Fetch the file again, or add" if rest != str(error) else "Add"
+            raise DataError(f"{rest} {advice} --skip-damaged to leave it out.") from error
     _say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
     for reason, count in done.left_out.items():
         _say(f"left out {count:,} x: {reason}")

@@ -53,4 +53,5 @@ def test_other_windows_are_refused_and_other_axes_left_out():
     with pytest.raises(NotComparable):
         find_growth([SWEEP], PROVENANCE, found | {id: replace(found[id], episode=found[id].episode + 1)}, THERE)
     (width,) = plan_sweeps(WIDE, ("width",))
-    assert not find_growth([width], PROVENANCE, {}, THERE)
+    judged = {trial_id(p.trial, PROVENANCE): windows_of(p.trial) for p in width.points}
+    assert not find_growth([width], PROVENANCE, judged, dict.fromkeys(width.scope, 8))

@@ -12,11 +12,13 @@ import pytest
 from experiments.applications import SHIPPED, plan_actions
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import ALL, CONDITIONS, CONTROL, FEW, MOST, share_closed
+from experiments.applications.made_with import hash_of
 from experiments.applications.plan_actions import decided
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.tasks import find_task
 from experiments.applications.synthetic import Settings, choose
 from hma_jax.config.json import from_dict
+from hma_jax.training.runs import load_model
 
 ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / "experiments" / "results"
@@ -71,7 +73,9 @@ def test_an_episode_ends_when_nothing_can_change_its_outcome():
 
 def from_settings(kind: type, path: Path):
     values = json.loads(path.read_text())
-    assert values.pop("run") == SHIPPED.name and set(values) == {f.name for f in fields(kind)}
+    assert values.pop("run") == SHIPPED.name
+    assert values.pop("weights") == hash_of(load_model(SHIPPED).params)
+    assert set(values) == {f.name for f in fields(kind)}
     return from_dict(kind, values)
 
 
