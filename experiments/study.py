@@ -101,7 +101,7 @@ class DesignConfig:
     budgets: tuple[int, ...] = (1000, 2000, 4000, 8000)  # steps of the reference; those of `train` are added
     long: tuple[int, ...] = ()  # more steps of the reference, of the first seed alone
     compute: tuple[int, ...] = (500, 1000, 2000, 4000)  # steps of the reference whose FLOPs every width may use
-    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at the fewest steps and at those of `train`
+    rate_factors: tuple[float, ...] = (0.5, 1.0, 2.0)  # of the learning rate, at fewest steps and at those of `train`
     ablation_steps: int | None = None  # of `settings` and `conditioning`; None: as many as every other trial
     end_controls: bool = False  # controls at both ends of an axis, not at the reference alone
     # Other episodes' actions that all are judged under but the reference, at any steps, and its control; None: as many
