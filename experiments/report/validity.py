@@ -239,7 +239,7 @@ def _prediction(outcome: Outcome) -> Check:
         text += "; its trials have not run."
     else:
         verdict = "bad" if outcome.marks or not outcome.inside else "good"
-        text += f"; came: {outcome.observed:.3f} ({outcome.seeds} seeds), {'inside' if outcome.inside else 'outside'}."
+        text += f"; came: {outcome.observed:.3f} ({outcome.seeds} seed{'s' * (outcome.seeds != 1)}), {'inside' if outcome.inside else 'outside'}."
     if outcome.marks:
         verdict, text = "bad", f"{text} But: {'; '.join(outcome.marks)}."
     return Check("A prediction written down before.", verdict, text)
