@@ -56,8 +56,8 @@ def same_numbers(config, params, back: Run) -> None:
     assert back.table.names == TABLE.names
     np.testing.assert_array_equal(back.table.statistics(), TABLE.statistics())
     ours, theirs = everything(config, params), everything(back.model, back.params)
-    for name, want in ours.items():
-        np.testing.assert_allclose(theirs[name], want, rtol=0, atol=1e-5 * np.abs(want).max(), err_msg=name)
+    for name, want in ours.items():  # equal but for rounding: 1.2e-5 of the largest was seen on one processor
+        np.testing.assert_allclose(theirs[name], want, rtol=0, atol=3e-5 * np.abs(want).max(), err_msg=name)
 
 
 def test_a_discrete_model_keeps_mup_at_the_base_width_of_the_release(tmp_path):
