@@ -217,6 +217,7 @@ def test_runs_of_other_seeds_are_one_program(monkeypatch):
     assert len(texts) == 1
 
 
+@pytest.mark.slow  # the draws of a run with its seed in the batch are on record: tests/golden/test_first_steps.py
 def test_a_seed_in_the_batch_is_that_of_the_configuration():
     declared, (batch,) = declare_model(MODEL, TABLE), [next(batches(MODEL)(0))]
     state = init_state(declared, TABLE, 0)
