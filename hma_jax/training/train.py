@@ -77,7 +77,6 @@ def train_model(
             # Numbers lie everywhere, so that every process can read them.
             out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), everywhere),
         )
-
         seed = jax.device_put(jax.random.key_data(jax.random.key(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
