@@ -101,7 +101,7 @@ CPU_FULL = replace(
     widths=(16, 24, 32, 48, 64),  # over a decade of trunk parameters
     transfer=TransferConfig(rates=5, factor=math.sqrt(2), widths=(16, 48, 64), datasets=10, steps=500),
     designs=DesignConfig(
-        budgets=(500, 1000, 2000, 4000, 8000), long=(16_000, 32_000), compute=(500, 1000, 2000, 4000),
+        budgets=(500, 1000, 2000, 4000, 8000, 16_000), long=(32_000,), compute=(500, 1000, 2000, 4000),
         ablation_steps=2000, shots_steps=500, end_controls=True, other_actions=3,
     ),
     axes=(
