@@ -20,7 +20,7 @@ from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
 from experiments.running.sealed import read_result
-from experiments.running.trial import trial_id
+from experiments.running.trial import last_loss, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ConfigError
 
@@ -35,8 +35,6 @@ UNTRAINED = "untrained"
 
 TRAINING, LOSS = "training", "loss"
 """Scope and metric of the objective on the trial's own mixture, averaged over its last steps."""
-LAST = 0.1
-"""The part of a run's steps that these are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +106,7 @@ def _rows(
     parts = [(point.role, Summary.from_dict(result["evaluation"]))]
     if result["untrained"]:
         parts.append((UNTRAINED, Summary.from_dict(result["untrained"])))
-    rows = [row(point.role, TRAINING, LOSS, last_loss(result["losses"]))]
+    rows = [row(point.role, TRAINING, LOSS, training_loss(result))]
     for role, summary in parts:
         judged = [name for name in point.scope or sweep.scope if name in summary.datasets]  # those with windows
         scopes = {OVERALL: summary.over(judged)}
@@ -118,11 +116,11 @@ def _rows(
     return rows
 
 
-def last_loss(losses: Sequence[float]) -> Stat:
-    """The mean of a run's last steps."""
-    from hma_jax.evaluation.statistics import mean_and_sem
+def training_loss(result: dict[str, Any]) -> Stat:
+    """The mean of a run's last steps. Results of earlier versions hold the loss of every step instead."""
+    from hma_jax.evaluation.statistics import Stat
 
-    return mean_and_sem(losses[-max(round(LAST * len(losses)), 1) :])
+    return Stat(**(result.get("training_loss") or last_loss(result["losses"])))
 
 
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:

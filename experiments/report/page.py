@@ -24,7 +24,7 @@ from experiments.report.robots import Robot, describe_robots, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import Along, describe
 from experiments.report.validity import Check, check_study, draw_box
-from experiments.rows import UNTRAINED, CurvePoint, Row, curve
+from experiments.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
 from experiments.running.agreement import describe as describe_sources
 from experiments.running.agreement import group_by_sources
 from experiments.running.attempts import State
@@ -199,14 +199,14 @@ def _trial_table(
         cells = ["–", "–", "–", "–"]
         if state.event == FINISHED:
             result = read_result(workspace.trials / id)
-            run, losses = result["run"], result["losses"]
+            run, loss = result["run"], training_loss(result)
             cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
-                     f"{losses[-1]:.3f}"]  # fmt: skip
+                     f"{loss.mean:.3f}"]  # fmt: skip
         message = html.escape(state.message)
         status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
         lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
     done = sum(states[id].event == FINISHED for id in names)
-    head = ["id", "trial", "status", "parameters", "train FLOPs", "time", "last loss"]
+    head = ["id", "trial", "status", "parameters", "train FLOPs", "time", "training loss"]
     return f"<p>{done} of {len(lines)} finished.</p>" + table(head, lines, text=3)
 
 

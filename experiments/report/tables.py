@@ -26,7 +26,7 @@ def write_tables(
     from experiments.analysis.controllability import Controlled, controllability
     from experiments.analysis.tables import read_trials
     from experiments.analysis.trials import trial_row, write_trials
-    from experiments.rows import last_loss, write_csv
+    from experiments.rows import training_loss, write_csv
     from hma_jax.evaluation.windows import FILE
 
     names, rows = titles(sweeps, provenance), []
@@ -34,7 +34,7 @@ def write_tables(
     for id, trial in unique_trials(sweeps, provenance).items():
         state = states[id].event
         result = read_result(workspace.trials / id) if state == FINISHED else None
-        loss = last_loss(result["losses"]).mean if result else 0.0
+        loss = training_loss(result).mean if result else 0.0
         rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, there))
     write_trials(workspace.trial_table, rows)
     found = []

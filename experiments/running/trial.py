@@ -11,9 +11,10 @@ A trial's directory holds
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, int, int], None]
 """Called as progress(phase, done, total)."""
+
+LAST = 0.1
+"""The part of a run's steps over which its training loss is averaged."""
 
 
 @dataclass(frozen=True)
@@ -342,7 +346,7 @@ def run_trial(
     result = {
         "evaluation": evaluation.summary.to_dict(),
         "untrained": untrained,
-        "losses": trained.losses,
+        "training_loss": last_loss(trained.losses),
         "parameters": declared.count(),
         "train_flops": train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
         "run": {
@@ -358,6 +362,13 @@ def run_trial(
         record_end(directory)
         write_result(directory, result)
     return result
+
+
+def last_loss(losses: Sequence[float]) -> dict[str, Any]:
+    """The mean of a run's last steps, as a `Stat`'s fields; the log has the loss of each."""
+    from hma_jax.evaluation.statistics import mean_and_sem
+
+    return dataclasses.asdict(mean_and_sem(losses[-max(round(LAST * len(losses)), 1) :]))
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation) -> None:

@@ -15,7 +15,7 @@ from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
 from experiments.running.provenance import Provenance, Start, TrialRecord
 from experiments.running.sealed import write_result
-from experiments.running.trial import Trial, write_samples
+from experiments.running.trial import Trial, last_loss, write_samples
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study, TransferConfig
 from experiments.sweeps.registry import SCALING, plan_sweeps
@@ -103,7 +103,7 @@ def result_of(trial: Trial, without: Sequence[str] = ()) -> dict:
     return {
         "evaluation": evaluation,
         "untrained": dict.fromkeys(trial.evaluated, first) if trial.measure_untrained else None,
-        "losses": [5.0] * 18 + [4.0 + off**2 / 10, 3.0 + off**2 / 10],
+        "training_loss": last_loss([5.0] * 18 + [4.0 + off**2 / 10, 3.0 + off**2 / 10]),
         "parameters": 100 * model.width**2,
         "train_flops": 1e9 * model.width,
         "run": {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.running.sealed import write_result
-from experiments.running.trial import Trial, trial_id
+from experiments.running.trial import Trial, last_loss, trial_id
 from hma_jax.config import ExecutionConfig
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.summary import summarise
@@ -24,7 +24,7 @@ def write_trial(trials: Path, trial: Trial, windows: WindowTable, provenance=PRO
                                                     "execution": to_dict(ExecutionConfig())}))  # fmt: skip
     windows.save(directory / FILE, directory.name)
     evaluation = summarise(windows, trial.eval.perplexity_group).to_dict()
-    result = {"evaluation": evaluation, "untrained": None, "losses": [3.0, 2.0], "parameters": 10, "train_flops": 1e9}
+    result = {"evaluation": evaluation, "untrained": None, "training_loss": last_loss([3.0, 2.0]), "parameters": 10, "train_flops": 1e9}
     write_result(directory, result)
     return directory
 
