@@ -1,13 +1,15 @@
 """From finished trials to tidy rows: one row per (sweep, x, seed, role, scope, metric).
 
-The CSV holds what is determined by the trials only (no clocks), so a study that was killed
-and resumed writes the same bytes as one that was not. Plots and tables are made from it.
+results.csv has those of the means over robots; robots.parquet has those of each robot, which are forty times as many.
+They hold what is determined by the trials only (no clocks), so a study that was killed and resumed writes the same
+bytes as one that was not. Plots and tables are made from them.
 """
 
 from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 import os
 from collections import defaultdict
@@ -16,11 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from data_pipelines.publishing.files import write_file
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
 from experiments.running.sealed import read_result
 from experiments.running.trial import last_loss, trial_id
+from experiments.running.workspace import Workspace
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ConfigError
 
@@ -67,6 +71,11 @@ class Row:
     tokenizer: str
     results: int = 0  # version of what trials compute (`results_version`); 0 before they were numbered
     code: str = ""  # hash of the sources that the trial ran (`closure`)
+
+    @property
+    def of_robot(self) -> bool:
+        """Whether it is of one robot, and not of all that the sweep judges."""
+        return self.scope not in (OVERALL, TRAINING, "")
 
 
 def collect(
@@ -121,6 +130,38 @@ def training_loss(result: dict[str, Any]) -> Stat:
     from hma_jax.evaluation.statistics import Stat
 
     return Stat(**(result.get("training_loss") or last_loss(result["losses"])))
+
+
+def write_rows(workspace: Workspace, rows: Iterable[Row]) -> None:
+    """results.csv and robots.parquet, each whole or not at all."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = list(rows)
+    write_csv(workspace.results, Row, (r for r in rows if not r.of_robot))
+    of_robots = [r for r in rows if r.of_robot]
+    columns = {f.name: [getattr(r, f.name) for r in of_robots] for f in dataclasses.fields(Row)}
+    content = io.BytesIO()
+    pq.write_table(pa.table(columns), content, compression="zstd", write_page_checksum=True)
+    write_file(workspace.robots, content.getvalue())
+
+
+def read_rows(workspace: Workspace) -> list[Row]:
+    """What `write_rows` wrote; earlier versions wrote all into results.csv. Raises ConfigError for a damaged table."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    rows = read_csv(workspace.results)
+    if not workspace.robots.exists():
+        return rows
+    try:
+        of_robots = pq.read_table(workspace.robots, page_checksum_verification=True).to_pylist()
+        return rows + [Row(**record) for record in of_robots]
+    except (pa.ArrowException, OSError, TypeError) as error:
+        raise ConfigError(
+            f"{workspace.robots}: not a table of rows ({error}); restore the file, or remove it and draw it again from "
+            "the trials with `hma report`"
+        ) from error
 
 
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:

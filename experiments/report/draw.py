@@ -46,16 +46,16 @@ def _draw(workspace: Workspace, record: Record) -> None:
     from experiments.report.sweeps import Along
     from experiments.report.tables import write_tables
     from experiments.report.validity import check_numbers
-    from experiments.rows import Row, collect, read_csv, write_csv
+    from experiments.rows import collect, read_rows, write_csv, write_rows
 
     provenance = record.provenance
     if provenance is None:
         raise ConfigError(f"the study in {workspace.root} has not run yet; run `{record.command}`")
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
-    written = read_csv(workspace.results) if workspace.results.exists() else []
-    write_csv(workspace.results, Row, collect(sweeps, provenance, workspace.trials, states))
-    rows = read_csv(workspace.results)  # figures show what the file says
+    written = read_rows(workspace) if workspace.results.exists() else []
+    write_rows(workspace, collect(sweeps, provenance, workspace.trials, states))
+    rows = read_rows(workspace)  # figures show what the files say
     numbers = compute_numbers(workspace, sweeps, provenance)
     checked = check_numbers(written, rows, numbers.results, numbers.windows, record.study.eval.perplexity_group)
     if checked.verdict == "bad":
@@ -63,7 +63,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
     others = write_tables(workspace, record, sweeps, states, provenance)
-    tables = [workspace.results, workspace.fits, *others]
+    tables = [workspace.results, workspace.robots, workspace.fits, *others]
     changes = find_changes(sweeps, provenance, numbers.windows)
     at_best = judge_at_best(sweeps, provenance, numbers.windows)
     episodes = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
@@ -107,7 +107,7 @@ def draw_again(out: Path) -> None:
     Where its trials are not, as with results that are kept for the record, its figures are drawn from its table,
     and table and page stay as they are.
     """
-    from experiments.rows import read_csv
+    from experiments.rows import read_rows
 
     workspace = Workspace(out.absolute())
     record = load_record(workspace)
@@ -115,6 +115,6 @@ def draw_again(out: Path) -> None:
         draw(workspace, record)
         return
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
-    draw_figures(workspace, sweeps, read_csv(workspace.results))
+    draw_figures(workspace, sweeps, read_rows(workspace))
     console.print(f"no trials in {short(workspace.root)}: drawn from its table, as it is; the page stays as it is")
     wrote(workspace.figures)

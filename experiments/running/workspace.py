@@ -76,7 +76,13 @@ class Workspace:
 
     @property
     def results(self) -> Path:
+        """Means over robots, a line for each point, seed and metric."""
         return self.root / "results.csv"
+
+    @property
+    def robots(self) -> Path:
+        """The same of every robot."""
+        return self.root / "robots.parquet"
 
     @property
     def trial_table(self) -> Path:

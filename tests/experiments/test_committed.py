@@ -11,12 +11,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from data_pipelines.suite.embodiments import TRAINED
 from experiments.report.draw import draw_again
 from experiments.report.robots import robots_of
-from experiments.rows import OVERALL, read_csv
+from experiments.rows import OVERALL, read_rows
 from experiments.running.ledger import FINISHED
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
@@ -44,7 +45,7 @@ def test_tables_are_those_that_were_kept():
 
 @pytest.mark.parametrize("name", sorted(p.parent.name for p in RESULTS.glob("*/results.csv")))
 def test_every_trial_of_a_table_is_finished_and_judged(name):
-    rows = read_csv(RESULTS / name / "results.csv")
+    rows = read_rows(Workspace(RESULTS / name))
     assert {r.status for r in rows} == {FINISHED}
     assert all(r.metric for r in rows)
     assert len({r.manifest for r in rows}) == 1, "judged on different windows"
@@ -53,7 +54,7 @@ def test_every_trial_of_a_table_is_finished_and_judged(name):
 def test_the_first_axis_by_how_much_data_a_robot_has_is_as_the_page_on_designs_says():
     folder = RESULTS / "cpu-full-horizon"
     windows = {name: d["windows"] for name, d in json.loads((folder / "data.json").read_text()).items()}
-    rows = [r for r in read_csv(folder / "results.csv") if r.metric == "cross_entropy" and r.role == "point"]
+    rows = [r for r in read_rows(Workspace(folder)) if r.metric == "cross_entropy" and r.role == "point"]
     page = (RESULTS.parents[1] / "docs/designs.md").read_text()
     for least, most in ((0, 400), (400, 2000), (2000, 10**9)):
         mine = [r for r in rows if least <= windows.get(r.scope, -1) < most]
@@ -96,7 +97,7 @@ def test_the_axis_horizon_is_as_the_page_on_designs_says():
         assert line in page, line
     of_steps = next(line for line in lines if "| 8,000 |" in line).strip("| ").split(" | ")
     steps, seeds, _, psnr, ahead, follow, *_ = of_steps
-    table = read_csv(RESULTS / "cpu-full" / "results.csv")
+    table = read_rows(Workspace(RESULTS / "cpu-full"))
     (copying,) = {f"{r.mean:.2f}" for r in table if (r.scope, r.metric) == (OVERALL, "psnr_copy")}
     said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; all"
     assert seeds == "3" and f"{said} {follow}" in " ".join((root / "README.md").read_text().split())
@@ -109,13 +110,15 @@ def test_what_is_kept_is_drawn_again(name, tmp_path):
     shutil.copytree(RESULTS / name, tmp_path / name)
     workspace = Workspace(tmp_path / name)
     figures, kept = {p.name for p in workspace.figures.iterdir()}, workspace.trials.exists()
-    tables = list(workspace.root.glob("*.csv"))
+    tables = [*workspace.root.glob("*.csv"), *workspace.root.glob("*.parquet")]
     shutil.rmtree(workspace.figures)
     for path in tables if kept else ():
         path.unlink()
     draw_again(workspace.root)
     assert {p.name for p in workspace.figures.iterdir()} >= figures
     for path in tables:
-        assert path.read_bytes() == (RESULTS / name / path.name).read_bytes(), path.name
+        before = RESULTS / name / path.name
+        same = path.read_bytes() == before.read_bytes()
+        assert same or path.suffix == ".parquet" and pq.read_table(path).equals(pq.read_table(before)), path.name
     page = workspace.report.read_text()
     assert not kept or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in page, "see its page"

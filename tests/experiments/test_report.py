@@ -11,7 +11,8 @@ from experiments.analysis.scaling import trunk_parameters
 from experiments.report import plots
 from experiments.report.draw import draw
 from experiments.report.plot_style import count
-from experiments.rows import OVERALL, Row, curve, read_csv, tally, write_csv
+from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
+from experiments.running.workspace import Workspace
 from experiments.sweeps.datasets import plan as plan_datasets
 from experiments.sweeps.width import plan as plan_width
 from hma_jax.config import ConfigError
@@ -37,13 +38,18 @@ def test_rows_carry_hashes_and_average_over_the_scope(drawn):
     assert (first.store, first.results, first.code) == (PROVENANCE.store, PROVENANCE.results, "c0de")
 
 
-def test_csv_reads_back_what_was_written(drawn, tmp_path):
-    rows = rows_of(drawn, [plan_width(STUDY)])
-    write_csv(tmp_path / "a.csv", Row, rows)
-    again = read_csv(tmp_path / "a.csv")
-    write_csv(tmp_path / "b.csv", Row, again)
-    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
-    assert [r for r in again if r.metric] == [r for r in rows if r.metric]
+def test_tables_read_back_what_was_written(drawn, tmp_path):
+    rows, a, b = rows_of(drawn, [plan_width(STUDY)]), Workspace(tmp_path / "a"), Workspace(tmp_path / "b")
+    a.root.mkdir(), b.root.mkdir()
+    write_rows(a, rows)
+    again = read_rows(a)
+    write_rows(b, again)
+    assert a.results.read_bytes() == b.results.read_bytes() and a.robots.read_bytes() == b.robots.read_bytes()
+    assert {repr(r) for r in again} == {repr(r) for r in rows}
+    assert {r.scope for r in read_csv(a.results)} == {OVERALL, "training", ""}
+    a.robots.write_bytes(a.robots.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match="robots.parquet: not a table of rows.*`hma report`"):
+        read_rows(a)
 
 
 def test_curve_joins_seeds_and_windows(drawn):
