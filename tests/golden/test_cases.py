@@ -28,11 +28,22 @@ def keep_small_programs():
 
 VARIANTS = {"08d_mar_joint_actions", "08e_mar_mup_unit_width"}
 """Cases that say little beyond others (of 08d: 08c its sampler, 07 its joint actions); `make test-slow` has them."""
+LARGE = {
+    "01b_discrete_concat_modulate_mup", "01d_discrete_loss_mup", "05_discrete_generation", "07_discrete_joint_actions",
+    "08b_mar_loss", "08c_mar_generation", "09b_tokenizer_five_levels", "10a_vae", "10b_vae_decoder_32groups",
+    "13_discrete_train_steps",
+}  # fmt: skip
+"""Cases that take three times as long when compiled as users compile; so compiled, `make test-slow` has them."""
 
 
 @pytest.mark.exact
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in VARIANTS)) for n in CASES])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in VARIANTS | LARGE)) for n in CASES])
 def test_the_official_release_s_numbers(name: str):
+    assert verify.main([str(HERE / name)]) == 0
+
+
+@pytest.mark.parametrize("name", sorted(LARGE))
+def test_the_official_release_s_numbers_compiled_quickly(name: str):
     assert verify.main([str(HERE / name)]) == 0
 
 
