@@ -66,8 +66,9 @@ class StoreConfig:
 class TransferConfig:
     """The grid of the learning-rate sweep (`transfer_lr`), on a smaller trial if so declared."""
 
-    rates: int = 5  # per width; an odd number, so that the study's own rate is in the middle
+    rates: int = 5  # per width; an odd number, so that one is in the middle
     factor: float = 2.0  # between one rate and the next
+    shift: int = 0  # how many rates the middle is above the study's own
     widths: tuple[int, ...] = ()  # (): those of the study
     datasets: int | None = None  # only the first so many; None: all
     steps: int | None = None  # None: as many as every other trial

@@ -11,6 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from experiments.progress import console
 from experiments.running.workspace import Workspace, load_record
+from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 
@@ -119,4 +120,4 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
         f"{curve.name} at {prediction.x[0]:,.0f} {curve.axes[0]}: {prediction.mean:.4f} nats per token, "
         f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}", soft_wrap=True, highlight=False,
     )  # fmt: skip
-    wrote(path, then=f"git add {shlex.quote(str(path))} && git commit, and only then run the trials")
+    wrote(path, then=f"git add {shlex.quote(short(path))} && git commit, and only then run the trials")

@@ -44,7 +44,7 @@ def plan(study: Study) -> Sweep:
         f"transfer.widths: at least three, model.mup.base_width {base} among them, are needed; got {widths}",
     )
     names = study.dataset_names()[: grid.datasets]
-    rates = [reference * grid.factor**k for k in range(-(grid.rates // 2), grid.rates // 2 + 1)]
+    rates = [reference * grid.factor ** (grid.shift + k) for k in range(-(grid.rates // 2), grid.rates // 2 + 1)]
     mup = parametrisations(study)
 
     def trial(role: str, width: int, rate: float, seed: int) -> Trial:
