@@ -73,13 +73,14 @@ def play(
     def truth(robot: Robot) -> SuiteSimulator | None:
         return true_simulator(simulator, [robot]) if has_truth(robot) else None
 
-    app = make_app(simulator, truth)
+    app, ended = make_app(simulator, truth), threading.Event()
 
     def say(actual: int) -> None:
         shown = "localhost" if host == "127.0.0.1" else host
         console.print(f"drive it at http://{shown}:{actual} (end with Ctrl-C)", soft_wrap=True)
         if visitors > 1:  # the first one need not wait until it is compiled for all
-            threading.Thread(target=warm_up_more, args=(simulator, 1), daemon=True).start()
+            # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.
+            threading.Thread(target=warm_up_more, args=(simulator, 1, None, ended.is_set)).start()
 
     try:
         asyncio.run(serve(app, host, port, say))
@@ -87,3 +88,5 @@ def play(
         console.print("stopped")
     except OSError as error:
         raise ConfigError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error
+    finally:
+        ended.set()

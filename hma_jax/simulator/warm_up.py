@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from hma_jax.simulator.programs import padded
@@ -21,10 +23,13 @@ def warm_up(simulator: Simulator, together: int | None = None) -> None:
     warm_up_more(simulator, 0, together)
 
 
-def warm_up_more(simulator: Simulator, above: int, most: int | None = None) -> None:
-    """Compiles for more than `above` episodes that advance together, up to `most` or all; from any thread."""
+def warm_up_more(
+    simulator: Simulator, above: int, most: int | None = None, ended: Callable[[], bool] = lambda: False
+) -> None:
+    """Compiles for more than `above` episodes that advance together, up to `most` or all, unless it is `ended` before;
+    from any thread."""
     for together in sizes(len(simulator)):
-        if above < together <= (most or len(simulator)):
+        if above < together <= (most or len(simulator)) and not ended():
             simulator.compile(together)
 
 

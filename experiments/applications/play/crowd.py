@@ -32,6 +32,9 @@ REPLIES = 16
 SEND_SECONDS = 10.0
 """That a message may take until the visitor's computer has it."""
 
+PARTING_SECONDS = 1.0
+"""That a page which loses its seat has to hear of it."""
+
 LINGER_SECONDS = 120.0
 """That a seat is kept for a visitor whose connection was lost."""
 
@@ -77,6 +80,14 @@ class Visitor:
         self.socket = self.transport = None
 
 
+async def _say_goodbye(socket: web.WebSocketResponse, transport: asyncio.Transport | None, why: str) -> None:
+    """Then the connection is ended, whether the page listens or not."""
+    with contextlib.suppress(ConnectionError, RuntimeError, TimeoutError):
+        await asyncio.wait_for(socket.send_str(json.dumps({"type": "gone", "message": why})), PARTING_SECONDS)
+    if transport is not None:
+        transport.abort()
+
+
 class Crowd:
     """The visitors of one simulator."""
 
@@ -86,6 +97,7 @@ class Crowd:
         self._free = list(range(len(simulator)))
         self._wanted = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "simulator")
+        self._ending: set[asyncio.Task[None]] = set()
 
     # --- Coming and going --------------------------------------------------------------------------
 
@@ -94,7 +106,8 @@ class Crowd:
         now = time.monotonic()
         if token in self.visitors:
             visitor = self.visitors[token]
-            visitor.abort()  # the same page in a second window takes over
+            # The same page in a second window takes over. The first is told, or it would come back and take over again.
+            self._part(visitor, "this goes on in another window")
             visitor.active = now
             return visitor
         if not self._free:
@@ -103,13 +116,21 @@ class Crowd:
         self.visitors[visitor.token] = visitor
         return visitor
 
+    def _part(self, visitor: Visitor, why: str) -> None:
+        """Tells a visitor's page, if one is connected, that it has no seat any more, and ends its connection."""
+        if visitor.socket is not None:
+            ending = asyncio.create_task(_say_goodbye(visitor.socket, visitor.transport, why))
+            self._ending.add(ending)
+            ending.add_done_callback(self._ending.discard)
+        visitor.socket = visitor.transport = visitor.replies = None
+
     def _make_room(self, now: float) -> None:
         """Frees the seat of whoever is away for the longest, if anybody is."""
         away = [v for v in self.visitors.values() if v.socket is None or now - v.active > IDLE_SECONDS]
         if not away:
             raise Full
         gone = min(away, key=lambda v: (v.socket is not None, v.active))
-        gone.tell({"type": "gone", "message": "your seat was given to another visitor; reload the page"})
+        self._part(gone, "your seat was given to another visitor; reload the page")
         self.dismiss(gone)
 
     def leave(self, visitor: Visitor, socket: web.WebSocketResponse) -> None:

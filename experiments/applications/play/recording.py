@@ -54,9 +54,11 @@ class Recording:
         return len(self) < MOST_FRAMES
 
     def copy(self) -> Recording:
-        """As it is now, for another thread to read."""
+        """As it is now, for another thread to read, even while frames are being added or taken back."""
         other = Recording(self.robot)
-        other._images, other._chunks = self._images[:], self._chunks[:]
+        images, chunks = self._images[:], self._chunks[:]
+        frames = min(len(images), len(chunks) + 1)
+        other._images, other._chunks = images[:frames], chunks[: max(frames - 1, 0)]
         return other
 
     def drop(self, frames: int) -> None:

@@ -117,29 +117,36 @@ async def _drive(request: web.Request) -> web.StreamResponse:
     sockets.add(socket)
     try:
         visitor = crowd.enter(request.query.get("token"))
+        await _converse(crowd, visitor, socket, request.transport)
     except Full:
         await socket.send_str(json.dumps({"type": "full", "message": "all seats are taken; try again later"}))
         await socket.close(code=1013)
+    finally:
         sockets.discard(socket)
-        return socket
+    return socket
+
+
+async def _converse(
+    crowd: Crowd, visitor: Visitor, socket: web.WebSocketResponse, transport: asyncio.Transport | None
+) -> None:
     replies: asyncio.Queue[str] = asyncio.Queue(REPLIES)
-    visitor.socket, visitor.transport, visitor.replies = socket, request.transport, replies
+    visitor.socket, visitor.transport, visitor.replies = socket, transport, replies
     sending = asyncio.create_task(crowd.send(visitor, socket, replies))
-    robot = visitor.seat.robot
-    visitor.tell({"type": "hello", "token": visitor.token, "robot": robot.name if robot else None, "start": visitor.seat.start})
+    robot, start = visitor.seat.robot, visitor.seat.start
+    visitor.tell({"type": "hello", "token": visitor.token, "robot": robot.name if robot else None, "start": start})
     try:
         await _listen(crowd, visitor, socket)
     finally:
-        sockets.discard(socket)
         crowd.leave(visitor, socket)
         sending.cancel()
-    return socket
 
 
 async def _listen(crowd: Crowd, visitor: Visitor, socket: web.WebSocketResponse) -> None:
     faults = 0
     async for message in socket:
         await crowd.room_for(visitor)
+        if visitor.socket is not socket:  # its seat, or its visitor, went elsewhere
+            return
         if message.type != WSMsgType.TEXT or not crowd.wish(visitor, _parsed(message.data)):
             faults += 1
             visitor.tell({"type": "error", "message": "that message makes no sense"})
@@ -160,7 +167,8 @@ def _parsed(data: str) -> dict:
 async def _recording(request: web.Request) -> web.Response:
     """A download of what a visitor recorded: kind mp4, or rlds as a zip."""
     visitor = request.app[CROWD].visitors.get(request.match_info["token"])
-    recording = visitor.seat.recording.copy() if visitor and visitor.seat.recording else None
+    recording = visitor.seat.recording if visitor else None  # read once: the simulator's thread may take it away
+    recording = recording.copy() if recording else None
     kinds: dict[str, tuple[Callable[[], bytes], str, str]] = {}
     if recording is not None and len(recording) > 1:
         kinds = {

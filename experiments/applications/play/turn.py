@@ -25,6 +25,10 @@ Truth = Callable[[Robot], SuiteSimulator | None]
 """The true simulator of a robot, where there is one."""
 
 
+LARGEST = 3e38
+"""Number of an action that single precision holds."""
+
+
 @dataclass(frozen=True)
 class Wish:
     """What a visitor asked for, checked for its form only."""
@@ -92,10 +96,9 @@ def _start(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> N
     starts = [start for start in simulator.starts if start.robot == robot.name]
     number, seed = whole(values.get("start", 0)), whole(values.get("seed", 0))
     require(number < len(starts), f"{robot.name} has {len(starts)} starts, no {number}")
+    true = None if seat.truth is None else _begun(truth, robot, starts[number])  # may fail: before anything changes
     simulator.reset(starts[number], seeds=[seed], episodes=[seat.episode])
-    seat.robot, seat.start, seat.recorded, seat.recording = robot, number, False, None
-    if seat.truth is not None:
-        seat.truth = _begun(truth, robot, starts[number])
+    seat.robot, seat.start, seat.truth, seat.recorded, seat.recording = robot, number, true, False, None
 
 
 def _begun(truth: Truth, robot: Robot, start: Any) -> SuiteSimulator | None:
@@ -115,7 +118,7 @@ def _rewind(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> 
     simulator.rewind(frames, [seat.episode])
     if seat.truth is not None:
         seat.truth.rewind(frames)
-    if seat.recording is not None:
+    if seat.recorded and seat.recording is not None:  # a finished one is kept as it is
         seat.recording.drop(frames)
 
 
@@ -180,12 +183,13 @@ def numbers(value: Any) -> np.ndarray:
     """ConfigError for what is no list of numbers."""
     flat = isinstance(value, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
     require(flat and len(value) <= 4096, "an action is a list of numbers")
-    return np.clip(np.array(value, np.float64), -3e38, 3e38).astype(np.float32)
+    return np.array([min(max(v, -LARGEST), LARGEST) for v in value], np.float32)  # ints may have any number of digits
 
 
 def whole(value: Any) -> int:
     """ConfigError for what is no whole number from 0 to 2^32 - 1."""
-    require(isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**32, f"{value!r:.80} is no whole number in range")
+    fits = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**32
+    require(fits, "a whole number from 0 to 2^32 - 1 is expected")
     return value
 
 

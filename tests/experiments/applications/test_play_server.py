@@ -17,6 +17,7 @@ from experiments.applications.play import crowd as crowd_module
 from experiments.applications.play import server
 from experiments.applications.play.crowd import REPLIES, Visitor
 from experiments.applications.play.turn import Seat
+from hma_jax.config import require
 from tests.experiments.applications.serving import Player, ask, hear, serving
 
 
@@ -73,6 +74,63 @@ def test_a_lost_connection_finds_its_episode_again():
     serving(test)
 
 
+def test_a_second_window_takes_over_and_the_first_is_told():
+    async def test(client):
+        first, second = Player(client), Player(client)
+        await first.enter()
+        await first.drive(0.5, 1)
+        assert (await second.enter(token=first.token, begin=False))["token"] == first.token
+        assert (await hear(first.socket))["type"] == "gone", "or it would come back and take over again"
+        assert (await hear(first.socket))["type"] == "closed"
+        assert len(await second.drive(0.5, 1)) == 1
+
+    serving(test)
+
+
+class FakeTruth:
+    """A true simulator whose frames are as bright as the steps it made; a pusher's cannot begin."""
+
+    def __init__(self, robot):
+        self.robot = robot
+
+    def reset(self, start):
+        require(self.robot.name == "arm", "no true simulator begins there")
+        self.made = [0]
+
+    def step(self, chunks):
+        assert [c.shape[-1] for c in chunks] == [self.robot.action_dim]
+        self.made.append(self.made[-1] + 1)
+
+    def rewind(self, frames):
+        del self.made[len(self.made) - frames :]
+
+    def reach(self, _):
+        return len(self.made) - 1
+
+    @property
+    def images(self):
+        return np.full((1, 8, 8, 3), 40 * self.made[-1], np.uint8)
+
+
+def test_the_true_simulator_goes_along_and_a_start_that_fails_changes_nothing():
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        begun = await ask(player.socket, type="truth", on=True)
+        assert begun["count"] == 2 and "psnr" in begun
+        first, second = [await ask(player.socket, type="act", action=[0.5] * 7) for _ in range(2)]
+        assert len({begun["true"], first["true"], second["true"]}) == 3
+        back = await ask(player.socket, type="rewind", frames=9)
+        assert (back["count"], back["true"]) == (2, begun["true"]), "no further than both can"
+        failed = await ask(player.socket, type="start", robot="pusher", start=0)
+        assert failed["type"] == "error" and "no true simulator begins there" in failed["message"]
+        on = await ask(player.socket, type="act", action=[0.5] * 7)
+        assert (on["type"], on["true"], on["count"]) == ("frame", first["true"], 3)
+        assert "true" not in await ask(player.socket, type="truth", on=False)
+
+    serving(test, truth=FakeTruth)
+
+
 def test_rewinding_and_the_same_actions_give_the_same_frames():
     async def test(client):
         player = Player(client)
@@ -108,7 +166,7 @@ NONSENSE = [
     '{"type": "start"}', '{"type": "start", "robot": "walker"}', '{"type": "start", "robot": {}}',
     '{"type": "start", "robot": "arm", "start": 99}', '{"type": "start", "robot": "arm", "start": -1}',
     '{"type": "start", "robot": "arm", "seed": 1e300}', '{"type": "rewind", "frames": -5}', '{"type": "rewind", "frames": "x"}',
-    '{"type": "truth", "on": true}',
+    '{"type": "truth", "on": true}', '{"type": "act", "action": [1' + "0" * 400 + ", 0, 0, 0, 0, 0, 0]}",
 ]  # fmt: skip
 
 
@@ -124,7 +182,7 @@ def test_malformed_messages_are_errors_of_their_sender_alone(monkeypatch):
             answer = await hear(hostile.socket)
             assert answer["type"] in ("error", "frame") and len(json.dumps(answer)) < 5000, (text, answer)
             if answer["type"] == "frame":
-                assert "1e999" in text and answer["clipped"], text
+                assert ("1e999" in text or len(text) > 400) and answer["clipped"], text
         await hostile.socket.send_bytes(b"\0" * 100)
         assert (await hear(hostile.socket))["type"] == "error"
         assert len(await player.drive(0.5, 2)) == len(await hostile.drive(0.5, 2)) == 2
@@ -256,6 +314,7 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
         await player.drive(0.45, 1)
         assert (await ask(player.socket, type="record", on=False))["recorded"] == 4
         await player.drive(0.5, 1)
+        assert (await ask(player.socket, type="rewind", frames=2))["recorded"] == 4, "a finished recording stays as it is"
 
         video = await (await client.get(f"/recording/{player.token}/mp4")).read()
         import av
