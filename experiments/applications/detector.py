@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -93,7 +94,7 @@ class Detector:
             with np.load(path, allow_pickle=False) as file:
                 weights = {name: jnp.asarray(file[name], jnp.float32) for name in file.files if name != "robots"}
                 return cls(weights, [str(name) for name in file["robots"]])
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ConfigError(
                 f"{path} is no detector ({error}); make one with python -m experiments.applications.detector RUN"
             ) from error

@@ -20,6 +20,7 @@ import numpy as np
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector, enlarged, known_robots, make_detector
 from experiments.applications.endurance.tables import Row, over_robots
+from experiments.applications.made_with import claim
 from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.applications.tables import write_rows
@@ -95,6 +96,7 @@ def main() -> None:
     options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
     simulator = load_simulator(asked.run, **options)
     robots, weights = known_robots(simulator.robots), asked.out / WEIGHTS
+    claim(asked.out, asked.run, simulator.model.params, {})  # a detector knows frames as one tokenizer shows them
     if not weights.exists():
         make_detector(list(robots), simulator.tokenizer, asked.out)
     detector, rows, short = Detector.load(weights), [], []

@@ -33,9 +33,9 @@ from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
-from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.intervals import Interval
 from experiments.applications import SHIPPED
+from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.made_with import claim
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Search
@@ -55,6 +55,7 @@ from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.progress import Pace, step
 from experiments.wrote import wrote
+from hma_jax.config import require
 from hma_jax.simulator.folder import find_decode
 from hma_jax.simulator.robots import Robot
 
@@ -87,6 +88,10 @@ class Settings:
     steps: int = 2000  # of training of the cloned policies
     batch: int = 32
     learning_rate: float = 2e-3
+
+    def __post_init__(self):
+        require(self.execute >= 1, f"--execute must be at least 1 frame, got {self.execute}")
+        require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
 
     def make_task(self) -> Task:
         return find_task(self.robot, self.task, self.frames, self.hold)
@@ -152,12 +157,10 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
 
 
 def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval, float]]:
-    """Success of each way of acting, and seconds per plan (median over starts)."""
-    points = tuple(np.array([[t["success"] for t in found]], float) for found in trials.values())
-    starts = points[0].shape[1]
-    panel = Panel(np.full(starts, "robot"), np.arange(starts), points, ((0,),) * len(points))
+    """Success of each way of acting, over its starts, and seconds per plan (median over starts)."""
+    rates = [rate_interval(np.array([t["success"] for t in found], float)) for found in trials.values()]
     seconds = [float(np.median([t["seconds"] for t in found])) for found in trials.values()]
-    return list(zip(trials, bootstrap_intervals(panel), seconds, strict=True))
+    return list(zip(trials, rates, seconds, strict=True))
 
 
 def write_results(trials: Mapping[str, Sequence[dict]], out: Path) -> None:
@@ -179,7 +182,7 @@ def markdown(found: Sequence[tuple[str, Interval, float]]) -> str:
     lines = ["| acting | success | 95 % interval | seconds per plan |", "|---|---|---|---|"]
     for way, r, seconds in found:
         took = f"{seconds:.1f}" if seconds else ""
-        lines.append(f"| {way} | {r.mean:.2f} | {max(r.low, 0.0):.2f} to {min(r.high, 1.0):.2f} | {took} |")
+        lines.append(f"| {way} | {r.mean:.2f} | {r.low:.2f} to {r.high:.2f} | {took} |")
     return "\n".join(lines) + "\n"
 
 
@@ -200,7 +203,7 @@ def draw(found: Sequence[tuple[str, Interval, float]], path: Path) -> None:
     with plt.rc_context(STYLE):
         figure, panel = plt.subplots(figsize=(6.4, 2.9), layout="constrained")
         places, mean = np.arange(len(found))[::-1], np.array([r.mean for _, r, _ in found])
-        low, high = (np.clip([getattr(r, end) for _, r, _ in found], 0, 1) for end in ("low", "high"))
+        low, high = (np.array([getattr(r, end) for _, r, _ in found]) for end in ("low", "high"))
         colours = [COLOURS["perplexity"] if "in the model" in way else MUTED for way, _, _ in found]
         panel.barh(places, mean, color=colours, height=0.62)
         panel.errorbar(mean, places, xerr=[mean - low, high - mean], fmt="none", color=INK, capsize=3)

@@ -101,10 +101,11 @@ class Settings:
 
 def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
     """The 100 trajectories as recorded, generated, and generated under shuffled actions; made once, kept in `out`."""
-    sets = {kind: out / f"{kind}.npz" for kind in KINDS}
+    sets, size = {kind: out / f"{kind}.npz" for kind in KINDS}, simulator.tokenizer.image_size
+    stride = simulator.robot(settings.robot).stride
     if not sets["recorded"].exists():
         with step(f"record {settings.trajectories} trajectories"):
-            save_demonstrations(record_far(settings), sets["recorded"])
+            save_demonstrations(record_far(settings, stride, size), sets["recorded"])
     recorded = load_demonstrations(sets["recorded"])
     for kind, shift in (("generated", 0), ("shuffled", 1)):
         if not sets[kind].exists():
@@ -114,15 +115,16 @@ def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, 
             save_demonstrations(replace(recorded, images=images), sets[kind])
     held_out = out / "held_out.npz"
     if not held_out.exists():
-        save_demonstrations(record_far(settings, seed=1), held_out)
+        save_demonstrations(record_far(settings, stride, size, seed=1), held_out)
     return {kind: load_demonstrations(path) for kind, path in {**sets, "held_out": held_out}.items()}
 
 
-def record_far(settings: Settings, seed: int = 0) -> Demonstrations:
+def record_far(settings: Settings, stride: int, image_size: int, seed: int = 0) -> Demonstrations:
     """Successes of the expert that begin far enough from the goal."""
     task = settings.make_task()
     count = MOST_TRIED * settings.trajectories
-    made = record(task, count, noise=settings.noise, only_successes=True, seed=seed)
+    how = {"noise": settings.noise, "only_successes": True, "stride": stride, "image_size": image_size}
+    made = record(task, count, seed=seed, **how)
     far = np.flatnonzero(away_at_start(task, made.seeds) >= settings.least)[: settings.trajectories]
     enough = len(far) == settings.trajectories
     require(enough, f"{task.robot}: hardly an episode begins {settings.least:g} from its goal")
@@ -161,14 +163,16 @@ def without_first(demos: Demonstrations, frames: int) -> Demonstrations:
     return replace(demos, lengths=demos.lengths - frames, **shifted)
 
 
-def run_trial(settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update) -> dict:
+def run_trial(
+    settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], stride: int, seed: int, update
+) -> dict:
     """Trains one policy and judges it: {success, distance} by start, {error} by held-out trajectory."""
     dropped, task = 0 if settings.with_given else settings.given, settings.make_task()
     demos = choose(condition, data, seed, dropped)
     fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
     policy = clone(demos, BcConfig(frames=1, fit=fit), seed, update)
     starts = start_seeds(task, settings.starts, least=settings.least)
-    found = run_policy(task, policy, starts, demos.images.shape[2])
+    found = run_policy(task, policy, starts, demos.images.shape[2], stride)
     errors = action_errors(policy, data["held_out"], scale_of(data["recorded"]))
     return {
         "success": found.success.astype(int).tolist(),
@@ -225,7 +229,7 @@ def main() -> None:
     run, out, seeds = asked.pop("run"), asked.pop("out"), tuple(range(asked.pop("seeds")))
     settings = Settings(seeds=seeds, **asked)
     simulator = load_simulator(run, episodes=BATCH, history=1)
-    simulator.robot(settings.robot)  # a mistyped name claims nothing
+    stride = simulator.robot(settings.robot).stride  # a mistyped name claims nothing
     settings.make_task()
     claim(out, run, simulator.model.params, asdict(settings), grows=("seeds",))
     trials_dir = out / "trials"
@@ -240,7 +244,7 @@ def main() -> None:
             if not path.exists():
                 note = f"{CONDITIONS[i].name}, seed {seed}{pace(n, len(jobs))}"
                 report = lambda done, total, said, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {said}")
-                write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, seed, report)))
+                write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, stride, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
     write_results(settings, trials, quality_of(data, settings.given), out)
     write_settings(out, run, simulator.model.params, asdict(settings))

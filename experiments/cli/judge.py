@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -62,7 +63,6 @@ def judge(
     from experiments.applications.judging.outcomes import read_outcomes, write_outcomes
     from experiments.applications.judging.page import draw_scatter, write_page
     from experiments.applications.judging.summary import summarise, write_summary
-    from experiments.applications.policies.learning import FitConfig
     from experiments.applications.policies.tasks import find_task
 
     if labels is not None:
@@ -77,11 +77,11 @@ def judge(
     config = JudgeConfig(
         find_task(robot, task, frames),
         starts,
-        batch or starts,
+        starts if batch is None else batch,
         seed,
         demonstrations=demonstrations,
         ladder=ladder,
-        head=HeadConfig(fit=FitConfig(steps=head_steps)),
+        head=replace(HeadConfig(), fit=replace(HeadConfig().fit, steps=head_steps)),
     )
     judged = judge_run(run, out, config, step)
     summary = summarise(judged)
@@ -89,9 +89,10 @@ def judge(
     write_summary(summary, out / "agreement.json")
     draw_scatter(summary, out / "scatter.png")
     command = (
-        f"hma judge {run} --robot {robot} --task {task} --starts {starts} --frames {config.task.frames} "
+        f"hma judge {shlex.quote(str(run))} --robot {robot} --task {task} --starts {starts} "
+        f"--batch {config.batch} --frames {config.task.frames} "
         f"--demonstrations {demonstrations} --steps {steps} --head-steps {head_steps} --cloned {cloned} "
-        f"--diffusion {diffusion} --seed {seed} --out {out}"
+        f"--diffusion {diffusion} --seed {seed} --out {shlex.quote(str(out))}"
     )
     page = write_page(judged, summary, out, command)
     blind = write_blind(judged, out)

@@ -170,10 +170,10 @@ class RobotVectorEnv(VectorEnv):
         simulator, again = self._task.simulator, self._over.copy()
         simulator.step([None if over else action for action, over in zip(actions, again, strict=True)])
         clipped = np.array([bool(names) for names in simulator.clipped])
+        rewards, done = self._task.judge(simulator)  # before others begin: a start does not count, as after `reset`
         if again.any():
             self._task.begin(self.np_random, np.flatnonzero(again).tolist(), None)
         self._steps = np.where(again, 0, self._steps + 1)
-        rewards, done = self._task.judge(simulator)
         terminated = done & ~again
         truncated = ~again & (self._steps >= self._task.max_steps)
         self._over = terminated | truncated

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import html
 import io
 import json
@@ -72,7 +73,8 @@ def write_blind(judged: Judged, out: Path, clips: int = 60) -> Path:
     for number, (policy, world, start) in enumerate(chosen):
         film = judged.rollouts(policy, world).images[start]
         pictures.append(f'<img hidden alt="clip {number}" data-clip="{number}" src="{data_uri(_film(film), "webp")}">')
-    page = f"{judged.config.task.robot}-{judged.config.task.name}-{judged.config.seed}-{clips}"
+    drawn = hashlib.sha256("".join(pictures).encode()).hexdigest()[:12]  # labels are of these clips and of no others
+    page = f"{judged.config.task.robot}-{judged.config.task.name}-{judged.config.seed}-{clips}-{drawn}"
     content = (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><meta name="viewport" '
         f'content="width=device-width, initial-scale=1"><title>Success or not?</title>'

@@ -56,6 +56,7 @@ class JudgeConfig:
 
     def __post_init__(self):
         require(self.starts % self.batch == 0, f"{self.starts} starts cannot be run {self.batch} at a time")
+        require(self.batch >= 2, "with one episode at a time the control has no other episode to take actions from")
 
 
 @dataclass(frozen=True)
@@ -75,9 +76,9 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     simulator = load_simulator(run_directory, episodes=config.batch)
     robot = simulator.robot(config.task.robot)
     require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
+    policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads  # may refuse the ladder
     claim(out, run_directory, simulator.model.params, {"config": to_dict(config)}, file="judge.json")
     size, stride, task = simulator.tokenizer.image_size, robot.stride, config.task
-    policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads
 
     def demonstrations() -> Demonstrations:
         short = replace(task, frames=config.demonstration_frames)

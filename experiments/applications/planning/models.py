@@ -38,11 +38,12 @@ class Model(Protocol):
 class LearnedModel:
     """A simulator of B episodes, all of them copies of one that has seen the last `CONTEXT` frames.
 
-    Candidates share their seed: what differs between them, their actions have done.
+    Candidates share their seed: what differs between them, their actions have done. So do plans that see as many
+    frames: what a planner does depends on what it sees alone.
     """
 
     def __init__(self, simulator: Simulator, robot: Robot):
-        self._simulator, self._robot, self._seed = simulator, robot, 0
+        self._simulator, self._robot = simulator, robot
         self._present = None
 
     def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:

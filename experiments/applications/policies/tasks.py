@@ -92,7 +92,7 @@ def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int 
     task = Task(robot, name)
     # A tool that wanders passes over the mark; one that was steered there stays.
     task = replace(task, frames=16, hold=4) if name != OWN else task
-    return replace(task, frames=frames or task.frames, hold=hold or task.hold)
+    return replace(task, frames=task.frames if frames is None else frames, hold=task.hold if hold is None else hold)
 
 
 def stack(states: Sequence[State]) -> State:

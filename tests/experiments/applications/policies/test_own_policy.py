@@ -22,6 +22,7 @@ from experiments.applications.own_policy import (
 )
 from experiments.applications.policies.demonstrations import Demonstrations
 from hma_jax.config import ConfigError
+from hma_jax.model.hma import declare_model
 from hma_jax.model.params import path_name
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
@@ -53,13 +54,15 @@ def test_windows_are_parts_of_episodes_with_the_actions_given_at_their_frames():
 
 def test_heads_are_added_and_nothing_else_changes():
     model = parts()[0]
-    bare = replace(model, run=replace(model.run, model=replace(model.config, action_heads=False)))
+    config = replace(model.config, action_heads=False)
+    params = declare_model(config, model.table).init(1)
+    bare = replace(model, run=replace(model.run, model=config, params=params))
     known = {path_name(p): x for p, x in jax.tree_util.tree_leaves_with_path(bare.params)}
     params, config = with_heads(bare, 0)
-    assert config.action_heads
-    for path, x in jax.tree_util.tree_leaves_with_path(params):
-        if path_name(path) in known:
-            np.testing.assert_array_equal(x, known[path_name(path)])
+    made = {path_name(p): x for p, x in jax.tree_util.tree_leaves_with_path(params)}
+    assert config.action_heads and known.keys() < made.keys()
+    for name, x in known.items():
+        np.testing.assert_array_equal(made[name], x)
 
 
 def test_the_page_says_what_came():
