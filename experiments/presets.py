@@ -103,7 +103,7 @@ CPU_FULL = replace(
     transfer=TransferConfig(rates=7, factor=math.sqrt(2), shift=3, widths=(16, 48, 64), datasets=10, steps=500),
     designs=DesignConfig(
         budgets=(500, 1000, 2000, 4000, 8000, 16_000), long=(32_000,), compute=(500, 1000, 2000, 4000),
-        ablation_steps=2000, shots_steps=500, end_controls=True, other_actions=3,
+        ablation_steps=2000, shots_steps=500, end_controls=True, other_actions=3, rate_factors=(1.0, 2.0, 4.0),
     ),
     axes=(
         "horizon", "dilution", "transfer", "newcomers", "episodes", "width", "compute", "lr", "lr_horizon", "fewshot",

@@ -256,10 +256,11 @@ def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
 
 
 def all_series(rows: Iterable[Row], sweep: str) -> dict[str, list[str]]:
-    """{role: its series}, of a sweep with several curves, in the order of the rows."""
+    """{role: its series}, of a sweep with several curves of trained models, in the order of the rows."""
     found: dict[str, list[str]] = {}
     for r in rows:
-        if r.sweep == sweep and r.series and r.series not in found.setdefault(r.role, []):
+        of_curve = r.sweep == sweep and r.series and r.role != UNTRAINED
+        if of_curve and r.series not in found.setdefault(r.role, []):
             found[r.role].append(r.series)
     return found
 
