@@ -56,6 +56,17 @@ def test_rates_surround_that_of_the_study():
     rates = sorted({p.x for p in lr.plan(CPU).points})
     assert rates == pytest.approx([1e-3, 2e-3, 4e-3, 8e-3, 16e-3])
     assert rates[2] == CPU.train.optimizer.learning_rate
+    higher = sorted({p.x for p in lr.plan(override(CPU, ("transfer.shift=2",))).points})
+    assert higher == pytest.approx([4e-3, 8e-3, 16e-3, 32e-3, 64e-3])
+
+
+def test_the_horizon_s_curves_are_of_trained_models(tmp_path):
+    """The reference among its trials measures what an untrained model says, too, which is no curve of rates."""
+    workspace = finished_study(tmp_path, STUDY, axes=("lr_horizon",))
+    draw(workspace, record_of(axes=("lr_horizon",)))
+    found = list(csv.DictReader(workspace.optima.open()))
+    assert {row["role"] for row in found} == {POINT} and len({row["series"] for row in found}) == 2
+    assert (workspace.figures / "lr_horizon.png").exists()
 
 
 def test_the_smaller_trial_is_as_declared():
