@@ -35,7 +35,8 @@ class StudyArguments:
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: runs/PRESET)")] = None
     """Directory for everything that is written."""
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]", help_behavior_hint="(default: the simulated suite)")] = ()
-    """Your RLDS directories, paths or URLs such as gs://... Their names must be in the registry."""
+    """Your datasets: RLDS directories (paths, or URLs such as gs://...), LeRobot folders, robomimic files. Their names
+    must be in the registry."""
     registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None
     """TOML file with registry entries of your own, as `hma data inspect --entry` writes it."""
     mixture: Annotated[str | None, arg(metavar="NAME"), UNSET] = None

@@ -44,7 +44,7 @@ def view(
     """Write one HTML page about datasets: clips with their actions, statistics, windows, what stands out.
 
     Args:
-        datasets: RLDS directories, paths or URLs.
+        datasets: RLDS directories (paths or URLs), LeRobot folders, robomimic files.
         out: The page, a single file that needs nothing else.
         split: The split to look at; the registry's, or train, if not given.
         hz: Native rate of the frames, if the registry does not know the dataset or is wrong.
