@@ -6,7 +6,8 @@ intervals are percentiles over bootstraps of seeds x episodes (`measured`).
 
 Points that cannot tell the form from another are refused, with the reason: fewer than four positions on an axis, a
 loss that does not fall, an exponent at the end of what was searched. What is only doubtful is said beside the
-numbers: one seed per point, a coefficient that a good part of the bootstraps leaves at its bound.
+numbers: one seed per point, a coefficient that a good part of the bootstraps leaves at its bound, points that lie off
+the curve by more than seeds scatter, an exponent that hangs on the first position.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 from experiments.analysis.measured import Measured
 from experiments.analysis.powerlaw import ALPHA, FLOOR, fit_draws, predict_log
@@ -26,6 +28,9 @@ LEAST = 4
 NAMES = (("A", "alpha"), ("B", "beta"))
 WIDE = 4.0
 """An exponent whose interval spans more than this factor is hardly told; it is said."""
+
+UNLIKELY = 0.05
+"""A lack of fit that chance makes more rarely is said."""
 
 OFTEN = 0.05
 """The part of the bootstraps at a bound from which a coefficient's interval is called open: it then ends there."""
@@ -101,7 +106,9 @@ def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: b
     found = _coefficients(theta, thetas, centre)
     refused, doubts = _verdict(measured, theta, thetas)
     wide = [c for c in found if c.name in ("alpha", "beta") and c.high > WIDE * c.low]
-    doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide if not refused)
+    if not refused:
+        doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide)
+        doubts += _misfit(measured, residuals) + _first_position(measured, found, weight)
     return PowerFit(
         measured.axes, measured.trial, refused, doubts, found, residuals, noise, theta, thetas, centre
     )
@@ -161,6 +168,38 @@ def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> 
 
     values, draws = named(theta), named(thetas)
     return tuple(Coefficient(n, float(values[n]), *map(float, interval(draws[n]))) for n in values)
+
+
+def _misfit(measured: Measured, residuals: np.ndarray) -> tuple[str, ...]:
+    """Whether positions lie off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
+    takes trials for independent, which branches of one run are not quite."""
+    points, count = measured.points, np.bincount(measured.points)
+    left, free = len(count) - 1 - 2 * len(measured.axes), int((count - 1).sum())
+    mean = np.bincount(points, residuals) / count
+    scatter = float(((residuals - mean[points]) ** 2).sum())
+    if left < 1 or free < 2 or scatter == 0:
+        return ()
+    ratio = float((count * mean**2).sum()) / left / (scatter / free)
+    chance = float(scipy.stats.f.sf(ratio, left, free))
+    if chance >= UNLIKELY:
+        return ()
+    said = f"points lie off the curve by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"
+    return (f"{said}: over the whole range the loss is not of this form",)
+
+
+def _first_position(measured: Measured, found: tuple[Coefficient, ...], weight: np.ndarray) -> tuple[str, ...]:
+    """Whether the exponent over one axis hangs on the first position, where a power law need not hold yet."""
+    x = measured.x[:, 0]
+    keep = x > x.min()
+    if len(measured.axes) > 1 or len(np.unique(x[keep])) < LEAST:
+        return ()
+    log_x = np.log(measured.x[keep])
+    values = measured.value[keep]
+    theta, _ = fit_draws(log_x - log_x.mean(0), values, values[None], weight[keep])
+    alpha = next(c for c in found if c.name == "alpha")
+    if alpha.low <= theta[2] <= alpha.high:
+        return ()
+    return (f"without the first position alpha is {theta[2]:.2g} and E {np.exp(theta[0]):.2g}",)
 
 
 def _verdict(measured: Measured, theta: np.ndarray, thetas: np.ndarray) -> tuple[str, tuple[str, ...]]:

@@ -2,8 +2,9 @@
 
 Each size's run gives its loss at several budgets, by its decay branches; between them the loss is interpolated in
 the logarithm (modified Akima, no further out than TOLERANCE). At one budget the loss over log N is fitted by a
-parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A parabola whose minimum lies at an end of the
-sizes, or that opens downwards, is refused: the best size may lie beyond.
+parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A budget at which the smallest or the largest size
+has the lowest loss, or whose parabola has no minimum between them, is refused: the best size may lie beyond. A parabola
+through losses that only flatten has a minimum, too.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     if len(sizes) < LEAST_SIZES:
         few = f"{len(sizes)} sizes; at least {LEAST_SIZES} are needed"
         return Budget(flops, sizes, loss, refused=few), np.array([])
-    least = int(np.argmin(loss))
+    least, at_end = int(np.argmin(loss)), np.isin(np.argmin(logs, 0), (0, len(sizes) - 1))  # at_end [1 + R]
     first = max(min(least - NEAR, len(sizes) - 2 * NEAR - 1), 0)
     near = slice(first, first + 2 * NEAR + 1)
     sizes, loss, logs = sizes[near], loss[near], logs[near]
@@ -134,11 +135,11 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     falling = np.where(logs[0] < logs[-1], x[0], x[-1])
     lowest = np.where(opens_up, np.clip(lowest, x[0], x[-1]), falling)
     common = dict(parabola=parabolas[:, 0], centre=float(x.mean()))
-    if not opens_up[0] or lowest[0] in (x[0], x[-1]):
-        end = "smallest" if lowest[0] == x[0] else "largest"
+    if at_end[0] or not opens_up[0] or lowest[0] in (x[0], x[-1]):
+        end = "smallest" if (least == 0 if at_end[0] else lowest[0] == x[0]) else "largest"
         refused = f"the {end} size is best: the minimum may lie beyond"
         return Budget(flops, sizes, loss, **common, refused=refused), lowest
-    part = float(np.isin(lowest[1:], (x[0], x[-1])).mean())
+    part = float((at_end[1:] | np.isin(lowest[1:], (x[0], x[-1]))).mean())
     doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OFTEN else ""
     best = Coefficient("N_opt", *(float(np.exp(v)) for v in (lowest[0], *interval(lowest[1:]))))
     return Budget(flops, sizes, loss, **common, best=best, doubt=doubt), lowest

@@ -3,10 +3,14 @@
 Episodes are drawn by `bootstrap`: all trials are judged on the same frozen windows, so that a draw takes the same ones
 for all of them, and what makes an episode hard moves the whole curve and not its shape. Seeds are drawn here, since a
 fit is made to every trial and not to the mean over seeds: an outlier among them then weighs little.
+
+Where every seed is judged on robots of its own, how hard these are is taken out: each seed is shifted, in the
+logarithm, to the mean level of all. Their windows differ, so that seeds alone are drawn.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from experiments.analysis.bootstrap import Panel, make_panel, resample
+from experiments.analysis.paired import NotComparable
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
 
@@ -29,21 +34,14 @@ class Measured:
     x: np.ndarray  # [n, K]
     run: np.ndarray  # [n], str: points of one run (a trial and its decay branches) share their seeds' luck
     trial: tuple[str, ...]  # n ids
-    panel: Panel  # of their windows: each trial a point of its own, with one seed
+    seed: np.ndarray  # [n], int
+    value: np.ndarray  # [n]: mean over windows, then over robots
+    panel: Panel | None  # of their windows, each trial a point with one seed; None where seeds have other windows
 
     def __post_init__(self):
-        lengths = {len(self.x), len(self.run), len(self.trial), len(self.panel.points)}
+        lengths = {len(x) for x in (self.x, self.run, self.trial, self.seed, self.value)}
+        lengths |= {len(self.panel.points)} if self.panel else set()
         require(len(lengths) == 1, f"the columns of measured trials differ in length: {sorted(lengths)}")
-
-    @cached_property
-    def seed(self) -> np.ndarray:
-        """[n], int."""
-        return np.array([own for (own,) in self.panel.seeds])
-
-    @cached_property
-    def value(self) -> np.ndarray:
-        """[n]: mean over windows, then over robots."""
-        return resample(self.panel, 1, over_seeds=False, over_episodes=False).value
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -52,10 +50,12 @@ class Measured:
 
     def only(self, chosen: np.ndarray) -> Measured:
         """The trials where `chosen` [n] holds."""
-        at = np.flatnonzero(chosen)
-        points, seeds = (tuple(column[i] for i in at) for column in (self.panel.points, self.panel.seeds))
-        panel = Panel(self.panel.robot, self.panel.episode, points, seeds)
-        return Measured(self.axes, self.x[at], self.run[at], tuple(self.trial[i] for i in at), panel)
+        at, panel = np.flatnonzero(chosen), self.panel
+        if panel is not None:
+            points, seeds = (tuple(column[i] for i in at) for column in (panel.points, panel.seeds))
+            panel = Panel(panel.robot, panel.episode, points, seeds)
+        trial = tuple(self.trial[i] for i in at)
+        return Measured(self.axes, self.x[at], self.run[at], trial, self.seed[at], self.value[at], panel)
 
     def seeds_per_point(self) -> int:
         """The least that any position has."""
@@ -85,7 +85,10 @@ class Measured:
         With a single seed nothing is known of the spread, and the loss keeps it.
         """
         number = int(rng.integers(2**31))
-        means_Rn = resample(self.panel, draws, number, over_seeds=False, over_episodes=episodes).drawn
+        if self.panel is None:
+            means_Rn = np.repeat(self.value[None], draws, 0)
+        else:
+            means_Rn = resample(self.panel, draws, number, over_seeds=False, over_episodes=episodes).drawn
         found = means_Rn.copy()
         for run in np.unique(self.run):
             own_run = self.run == run
@@ -113,25 +116,44 @@ class Place:
     run: str
     seed: int
     x: tuple[float, ...]
+    scope: tuple[str, ...]  # the robots that it is judged on
 
 
 def measure(
-    axes: Sequence[str],
-    places: Sequence[Place],
-    tables: Mapping[str, WindowTable],
-    scope: Sequence[str],
-    metric: str = "cross_entropy",
+    axes: Sequence[str], places: Sequence[Place], tables: Mapping[str, WindowTable], metric: str = "cross_entropy"
 ) -> Measured:
-    """The losses of trials at `places` from their `tables` of windows, over the datasets of `scope`.
+    """The losses of trials at `places` from their `tables` of windows, each over its own robots.
 
-    Raises NotComparable unless all were judged on the same windows.
+    Raises NotComparable unless trials of the same robots were judged on the same windows.
     """
     require(len(places) > 0, "no finished trial to measure")
-    panel = make_panel([{place.seed: tables[place.trial]} for place in places], metric, scope)
+    groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
+    for i, place in enumerate(places):
+        groups[place.scope].append(i)
+    panels = {
+        scope: make_panel([{places[i].seed: tables[places[i].trial]} for i in own], metric, scope)
+        for scope, own in groups.items()
+    }
+    value = np.zeros(len(places))
+    for scope, own in groups.items():
+        value[own] = resample(panels[scope], 1, over_seeds=False, over_episodes=False).value
+    seed = np.array([place.seed for place in places])
+    x = np.array([place.x for place in places], float).reshape(len(places), len(axes))
+    panel = next(iter(panels.values())) if len(panels) == 1 else None
     return Measured(
-        tuple(axes),
-        np.array([place.x for place in places], float).reshape(len(places), len(axes)),
-        np.array([place.run for place in places]),
-        tuple(place.trial for place in places),
-        panel,
-    )
+        tuple(axes), x, np.array([place.run for place in places]), tuple(place.trial for place in places), seed,
+        value if panel else _levelled(value, x, seed), panel,
+    )  # fmt: skip
+
+
+def _levelled(value: np.ndarray, x: np.ndarray, seed: np.ndarray) -> np.ndarray:
+    """Values [n], those of each seed times a factor that gives all seeds one level, over the positions that all of them
+    have. Raises NotComparable where there is none."""
+    points = np.unique(x, axis=0, return_inverse=True)[1].ravel()
+    shared = set.intersection(*(set(points[seed == s].tolist()) for s in np.unique(seed)))
+    if not shared:
+        raise NotComparable("every seed was judged on other robots, and no position has a finished trial of each")
+    logs, common = np.log(value), np.isin(points, list(shared))
+    level = {s: logs[common & (seed == s)].mean() for s in np.unique(seed)}
+    mean = np.mean(list(level.values()))
+    return np.exp(logs + np.array([mean - level[s] for s in seed]))

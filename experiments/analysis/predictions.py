@@ -20,7 +20,7 @@ import numpy as np
 from data_pipelines.publishing.files import write_file
 from experiments.analysis.fits import DRAWS, LEVEL, interval
 from experiments.analysis.measured import Place, measure
-from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_at
+from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_near
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.evaluation.windows import WindowTable
@@ -78,14 +78,15 @@ def predict(
     ids = tuple(p.trial for p in held_out)
     there = [id for id in ids if id in windows]
     require(not there, f"{', '.join(there)} has a result already: a prediction is made before its trial is run")
-    others = Curve(curve.name, curve.axes, curve.scope, tuple(p for p in curve.places if p.trial not in ids))
+    others = Curve(curve.name, curve.axes, tuple(p for p in curve.places if p.trial not in ids))
     fitted = fit_curve(others, windows, draws, episodes=False)
     fit = fitted.fit
     require(not fit.refused, f"{curve.name}: nothing can be predicted: {fit.refused}")
     x = np.array([held_out[0].x])
-    noise = noise_at(fitted.measured) / np.sqrt(len(ids))
+    noise, freedom = noise_near(fitted.measured, x[0])
     require(np.isfinite(noise), f"{curve.name}: one seed per point: the interval of a prediction needs their noise")
-    spread = np.exp(noise * np.random.default_rng(1).standard_normal(len(fit.thetas)))
+    luck = np.random.default_rng(1).standard_t(freedom, len(fit.thetas)) / np.sqrt(len(ids))
+    spread = np.exp(noise * luck)
     low, high = interval(fit.all_at(x)[:, 0] * spread)
     return Prediction(
         curve.name, curve.axes, tuple(map(float, x[0])), ids, float(fit.at(x)[0]), float(low), float(high), LEVEL,
@@ -109,7 +110,7 @@ def compare(
         marks.append("the study does not plan its trials")
     if finished and len(finished) < len(prediction.trials):
         marks.append(f"{len(finished)} of its {len(prediction.trials)} trials finished")
-    observed = float(measure(curve.axes, finished, windows, curve.scope, LOSS).value.mean()) if finished else None
+    observed = float(measure(curve.axes, finished, windows, LOSS).value.mean()) if finished else None
     return Outcome(prediction, observed, len(finished), tuple(marks))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.analysis.fits import DRAWS, PowerFit, fit_power
 from experiments.analysis.isoflop import IsoFlop, fit_isoflop
-from experiments.analysis.measured import Measured, Place, measure
+from experiments.analysis.measured import PRIOR, Measured, Place, measure
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
@@ -31,14 +31,15 @@ LOSS = "cross_entropy"
 
 TRUNK, WINDOWS, FLOPS = "trunk parameters", "windows seen", "training FLOPs"
 
+OTHER_ROBOTS = "every seed is judged on other robots, how hard these are is taken out: intervals are over seeds alone"
+
 
 @dataclass(frozen=True)
 class Curve:
-    """Trials on one axis, or two, judged on `scope`; `places` are those that the study plans."""
+    """Trials on one axis, or two; `places` are those that the study plans."""
 
     name: str  # such as "width", and "-<series>" after it
     axes: tuple[str, ...]
-    scope: tuple[str, ...]
     places: tuple[Place, ...]
 
     def finished(self, windows: Mapping[str, WindowTable]) -> tuple[Place, ...]:
@@ -55,10 +56,10 @@ class Fitted:
 
 
 def curves_of(sweeps: Sequence[Sweep], provenance: Provenance) -> list[Curve]:
-    """One for every sweep over a number and each of its series."""
+    """One for every sweep along which a loss may fall as a power, and each of its series."""
     found = []
     for sweep in sweeps:
-        if not sweep.measured:
+        if not sweep.measured or sweep.valley:
             continue
         lines: dict[str, list[Point]] = defaultdict(list)
         for point in sweep.points:
@@ -85,10 +86,10 @@ def surface_of(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, tup
         return {}
     group = max(both, key=len)
     places = tuple(
-        Place(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)))
+        Place(id, _run_of(t), t.train.seed, (float(trunk_parameters(t.model)), _seen(t)), t.evaluated)
         for id, t in group.items()
     )
-    curve = Curve("joint", (TRUNK, WINDOWS), next(iter(group.values())).evaluated, places)
+    curve = Curve("joint", (TRUNK, WINDOWS), places)
     return {id: (trial, curve) for id, trial in group.items()}
 
 
@@ -97,8 +98,11 @@ def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRA
     places = curve.finished(windows)
     if not places:
         return Fitted(curve, None, PowerFit(curve.axes, (), f"no finished trial has a {LOSS} of its windows"))
-    measured = measure(curve.axes, places, windows, curve.scope, LOSS)
-    return Fitted(curve, measured, fit_power(measured, draws, episodes=episodes))
+    measured = measure(curve.axes, places, windows, LOSS)
+    fit = fit_power(measured, draws, episodes=episodes)
+    if measured.panel is None and not fit.refused:
+        fit = replace(fit, doubts=(*fit.doubts, OTHER_ROBOTS))
+    return Fitted(curve, measured, fit)
 
 
 def fit_study(
@@ -127,7 +131,7 @@ def fit_budgets(
     places = [replace(p, x=(p.x[0], flops[p.trial])) for p in curve.finished(windows)]
     if not places:
         return None, None
-    measured = measure((TRUNK, FLOPS), places, windows, curve.scope, LOSS)
+    measured = measure((TRUNK, FLOPS), places, windows, LOSS)
     return measured, fit_isoflop(measured, draws=draws)
 
 
@@ -137,10 +141,10 @@ def _curve(sweep: Sweep, series: str, points: Sequence[Point], provenance: Prove
 
     def place(p: Point) -> Place:
         x = float(trunk_parameters(p.trial.model)) if wider else float(p.x)
-        return Place(trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,))
+        return Place(trial_id(p.trial, provenance), _run_of(p.trial), p.trial.train.seed, (x,), p.scope or sweep.scope)
 
     name = "-".join(filter(None, (sweep.name, series)))
-    return Curve(name, (TRUNK if wider else sweep.axis,), sweep.scope, tuple(map(place, points)))
+    return Curve(name, (TRUNK if wider else sweep.axis,), tuple(map(place, points)))
 
 
 @lru_cache
@@ -179,6 +183,12 @@ def _without_steps(trial: Trial) -> dict[str, Any]:
     return values
 
 
-def noise_at(measured: Measured) -> float:
-    """Standard deviation over seeds of the logarithm of a trial's loss, over all positions."""
-    return float(np.sqrt(np.nanmean(measured.noise() ** 2)))
+def noise_near(measured: Measured, x: np.ndarray) -> tuple[float, float]:
+    """(standard deviation over seeds of the logarithm of a trial's loss, its degrees of freedom) at the position of
+    several seeds that is nearest to `x` [K]: it may grow along the axis. (nan, nan) where there is none."""
+    count = np.bincount(measured.points)[measured.points]
+    if not (count > 1).any():
+        return float("nan"), float("nan")
+    away = np.linalg.norm(np.log(measured.x) - np.log(x), axis=1)
+    nearest = int(np.argmin(np.where(count > 1, away, np.inf)))
+    return float(measured.noise()[nearest]), float(count[nearest] - 1 + PRIOR)

@@ -46,9 +46,11 @@ def plan(study: Study) -> Sweep:
         study.dataset_names(),
         tuple(points),
         question="How wide should a model be for a given amount of compute? Along a curve every model spends the same "
-        "training FLOPs: wide ones see fewer windows.",
+        "training FLOPs: wide ones see fewer windows. All have one learning rate, which is too low for the shortest "
+        "runs, those of wide models on little compute: their loss is an upper bound.",
         gain="compute",
         title="Equal compute",
+        valley=True,
     )
 
 

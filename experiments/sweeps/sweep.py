@@ -42,6 +42,7 @@ class Sweep:
     labels: tuple[str, ...] = ()  # an axis of names: x counts into these
     reference_x: int | None = None  # where the reference trial stands, if it does
     base: str = ""  # of several series, the one whose best x the others are to use
+    valley: bool = False  # the loss is expected to be lowest within, not at the end
 
     @property
     def several(self) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from experiments.analysis.bootstrap import Panel
+from experiments.analysis.bootstrap import Panel, resample
 from experiments.analysis.measured import Measured
 
 DATASETS, EPISODES = 10, 8
@@ -23,11 +25,20 @@ def measured(
     values = loss[:, None] * (hard / hard.mean() + 0.01 * rng.standard_normal((len(loss), len(hard))))
     robot, episode = np.repeat([f"robot{d}" for d in range(DATASETS)], EPISODES), np.tile(np.arange(EPISODES), DATASETS)
     names = tuple((i % seeds,) for i in range(len(x)))
+    panel = Panel(robot, episode, tuple(row[None] for row in values), names)
     return Measured(
         ("trunk parameters", "windows")[: x.shape[1]], x,
         run=np.array([f"{row[0]:.0f}" for row in x]), trial=tuple(f"t{i}" for i in range(len(x))),
-        panel=Panel(robot, episode, tuple(row[None] for row in values), names),
+        seed=np.array([seed for (seed,) in names]),
+        value=resample(panel, 1, over_seeds=False, over_episodes=False).value, panel=panel,
     )  # fmt: skip
+
+
+def scaled(points: Measured, factors: dict[int, float]) -> Measured:
+    """The same, the losses of some trials times a factor."""
+    by = np.array([factors.get(i, 1.0) for i in range(len(points.trial))])
+    values = tuple(values * factor for values, factor in zip(points.panel.points, by, strict=True))
+    return replace(points, value=points.value * by, panel=replace(points.panel, points=values))
 
 
 def sizes(count: int, span: float = 30.0) -> np.ndarray:

@@ -6,7 +6,7 @@ from scipy.optimize import minimize
 
 from experiments.analysis import powerlaw
 from experiments.analysis.fits import fit_power, weight_of
-from tests.experiments.analysis.curves import measured, power, sizes
+from tests.experiments.analysis.curves import measured, power, scaled, sizes
 
 
 @pytest.fixture
@@ -59,16 +59,32 @@ def test_episodes_widen_the_interval_of_the_level(rng):
 def test_one_run_that_went_wrong_does_not_bend_the_curve(rng):
     x = sizes(6)
     points = measured(x, power(x, 1.5, (1.0, 0.5)), 2e-3, 3, rng)
-    points.panel.points[4][:] *= 1.2  # far beyond the noise
+    points = scaled(points, {4: 1.2})  # far beyond the noise
     assert fit_power(points, 20)["alpha"].value == pytest.approx(0.5, abs=0.06)
+
+
+def test_points_of_another_form_are_said(rng):
+    """A loss that falls faster and faster in the logarithm, as at the start of training."""
+    x, loss = sizes(5), np.array([4.44, 4.26, 4.04, 3.81, 3.60])
+    fit = fit_power(measured(x, loss, 5e-4, 3, rng), 100)
+    assert not fit.refused
+    assert any("lie off the curve by more than seeds scatter" in doubt for doubt in fit.doubts)
+    assert any("without the first position alpha is" in doubt for doubt in fit.doubts)
+
+
+def test_points_of_the_form_are_said_to_lie_off_it_no_more_often_than_chance_has_it(rng):
+    x, said = sizes(6), 0
+    for _ in range(40):
+        fit = fit_power(measured(x, power(x, 1.5, (1.0, 0.5)), 2e-3, 3, rng), 2)
+        said += any("lie off the curve" in doubt for doubt in fit.doubts)
+    assert said <= 6  # 2 expected of 40 with p = 0.05; more than 6 once in 100
 
 
 def test_a_noisy_point_weighs_less(rng):
     x = sizes(5)
     points = measured(x, power(x, 1.5, (1.0, 0.5)), 1e-3, 4, rng)
     last = np.flatnonzero(points.x[:, 0] == points.x[:, 0].max())
-    for i, factor in zip(last, (0.9, 0.95, 0.98, 1.04), strict=True):
-        points.panel.points[i][:] *= factor
+    points = scaled(points, dict(zip(last.tolist(), (0.9, 0.95, 0.98, 1.04), strict=True)))
     noise = points.noise()
     assert noise[last[0]] > 2 * noise[0]
     weight = weight_of(noise)

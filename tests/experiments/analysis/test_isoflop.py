@@ -43,6 +43,16 @@ def test_a_best_size_at_the_end_is_refused():
     assert all("the largest size is best" in b.refused and b.best is None for b in fit.budgets)
 
 
+def test_a_loss_that_only_flattens_has_no_best_size():
+    """A parabola through it has a minimum all the same."""
+    sizes = np.array([16.0, 24, 32, 48, 64]) ** 2 * 20
+    x = np.array([(n, c) for n in sizes for c in BUDGETS])
+    loss = 3 + 1.5 * (x[:, 0] / sizes[0]) ** -1.0
+    fit = fit_isoflop(measured(x, loss, 1e-3, 3, np.random.default_rng(5)), BUDGETS, draws=20)
+    assert fit.exponent is None and "0 of 5 budgets" in fit.refused
+    assert all("the largest size is best" in budget.refused for budget in fit.budgets)
+
+
 def test_noise_that_leaves_no_minimum_is_said():
     fit = fit_isoflop(runs(np.random.default_rng(3), noise=0.1), np.geomspace(6e10, 6e12, 4), draws=50)
     assert any(b.doubt or b.refused for b in fit.budgets)

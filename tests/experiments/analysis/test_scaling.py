@@ -11,10 +11,12 @@ from experiments.analysis.scaling import (
     WINDOWS,
     curves_of,
     fit_budgets,
+    fit_curve,
     fit_study,
     surface_of,
     trunk_parameters,
 )
+from experiments.presets import CPU_FULL
 from experiments.report.fits import describe_fits, fit_rows
 from experiments.report.plot_fits import plot_fits, plot_isoflop
 from experiments.running.trial import trial_id
@@ -71,6 +73,31 @@ def test_other_sweeps_keep_their_own_axis():
     curves = curves_of(plan_sweeps(WIDE, ("trajectories", "lr")), PROVENANCE)
     assert [c.name for c in curves] == ["trajectories"]  # a learning rate is no scale
     assert {p.x[0] for p in curves[0].places} == set(WIDE.trajectory_counts)
+
+
+def test_compute_is_no_power_of_the_width():
+    """At equal compute the loss rises again beyond the best width; `fit_budgets` says where that is."""
+    study = replace(CPU_FULL, axes=("width", "compute"))
+    assert [c.name for c in curves_of(plan_sweeps(study, study.axes), PROVENANCE)] == ["width"]
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1), (0, 1, 2)])
+def test_seeds_that_judge_other_robots_are_fitted_together(seeds):
+    """How hard their robots are is taken out, by position; the shape is the same for all of them."""
+    (curve,) = (c for c in curves_of(plan_sweeps(CPU_FULL, ("dilution",)), PROVENANCE))
+    assert len({p.scope for p in curve.places}) == 3
+    windows = {}
+    for place in curve.places:
+        if place.seed in seeds:
+            hard = 1 + 0.3 * place.seed
+            loss = hard * (2 + (place.x[0] / 5) ** -0.7)
+            robots = np.repeat(place.scope, 2)
+            zeros = np.zeros(len(robots), int)
+            metrics = {"cross_entropy": np.full(len(robots), loss)}
+            windows[place.trial] = WindowTable(robots, np.tile([0, 1], len(place.scope)), zeros, zeros + 4, metrics)
+    fitted = fit_curve(curve, windows, draws=10)
+    assert fitted.fit["alpha"].value == pytest.approx(0.7, abs=0.02)
+    assert ("how hard these are is taken out" in " ".join(fitted.fit.doubts)) == (len(seeds) > 1)
 
 
 def test_branches_of_widths_make_a_surface(branches):
