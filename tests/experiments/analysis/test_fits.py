@@ -65,7 +65,7 @@ def test_one_run_that_went_wrong_does_not_bend_the_curve(rng):
 
 def test_points_of_another_form_are_said(rng):
     """A loss that falls faster and faster in the logarithm, as at the start of training."""
-    x, loss = sizes(5), np.array([4.44, 4.26, 4.04, 3.81, 3.60])
+    x, loss = sizes(5), np.array([4.50, 4.44, 4.20, 3.85, 3.50])
     fit = fit_power(measured(x, loss, 5e-4, 3, rng), 100)
     assert not fit.refused
     assert any("lie off the curve by more than seeds scatter" in doubt for doubt in fit.doubts)
