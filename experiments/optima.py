@@ -1,7 +1,9 @@
 """Where each of several curves is lowest, and what it costs to take another's best point.
 
 For learning rates: how far off the rate that is best at the base width is at the others. Only
-points of the grid are compared: an optimum between them is not interpolated.
+points of the grid are compared: an optimum between them is not interpolated. The lowest of several noisy losses is a
+choice with an error of its own: which rates are as good as the best is told from the seeds, and what a choice costs is
+judged on seeds that it was not made by.
 """
 
 from __future__ import annotations
@@ -9,6 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+
+import scipy.stats
 
 from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference
 from experiments.running.ledger import DIVERGED, FINISHED
@@ -30,9 +34,13 @@ class Optimum:
     edge: str  # "edge": the best is at an end of what was tried, so that it may lie beyond; or ""
     loss: float
     seed_sem: float  # over seeds, nan for one
+    near_low: float  # the lowest and highest x that seeds do not tell from the best; x itself with one seed
+    near_high: float
     moved: float  # steps of the grid from the best x of the base series, downwards negative; nan without one
     transferred_x: float  # the best x of the base series in the same role; nan without one
-    penalty: float  # loss there minus `loss`; inf if it diverged, nan if it has no result
+    # By how much the loss is higher there than at the best x, both chosen by the other seeds where there are several;
+    # inf if it diverged, nan if it has no result.
+    penalty: float
     penalty_seed_sem: float
 
 
@@ -49,8 +57,9 @@ def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
                     s: lowest(points, diverged(rows, sweep.name, role, s)) for s, points in curves.items()
                 }
                 base = best.get(sweep.base)
+                of_base = curves.get(sweep.base, [])
                 found += [
-                    _optimum(rows, sweep.name, metric, role, s, curves[s], point, base)
+                    _optimum(rows, sweep.name, metric, role, s, curves[s], point, base, of_base)
                     for s, point in best.items()
                     if point
                 ]
@@ -83,22 +92,54 @@ def _optimum(
     points: Sequence[CurvePoint],
     best: CurvePoint,
     base: CurvePoint | None,
+    of_base: Sequence[CurvePoint],
 ) -> Optimum:
     transferred, moved, penalty, error = math.nan, math.nan, math.nan, math.nan
+    lost = diverged(rows, sweep, role, series)
+    near = [p.x for p in points if p.x not in lost and as_good(p, best)]
     if base:
         transferred, grid = base.x, sorted({r.x for r in rows if r.sweep == sweep})
         moved = grid.index(best.x) - grid.index(base.x)
         there = next((p for p in points if p.x == base.x), None)
-        if base.x in diverged(rows, sweep, role, series):
+        if base.x in lost:
             penalty = math.inf
         elif there:
-            penalty, error = difference(there, best)
+            penalty, error = chosen_by_others(points, of_base, lost) or difference(there, best)
     return Optimum(
         sweep, metric, role, series, best.x,
         edge="edge" if best.x in ends(rows, sweep, role, series) else "",
-        loss=best.mean, seed_sem=best.seed_sem, moved=moved,
+        loss=best.mean, seed_sem=best.seed_sem, near_low=min(near), near_high=max(near), moved=moved,
         transferred_x=transferred, penalty=penalty, penalty_seed_sem=error,
     )  # fmt: skip
+
+
+def as_good(point: CurvePoint, best: CurvePoint) -> bool:
+    """Whether seeds do not tell it from the best, with 95 % and one side, paired."""
+    if point.x == best.x:
+        return True
+    mean, error = difference(point, best)
+    seeds = len(point.seeds.keys() & best.seeds.keys())
+    return seeds > 1 and not mean > scipy.stats.t.isf(0.05, seeds - 1) * error
+
+
+def chosen_by_others(
+    points: Sequence[CurvePoint], of_base: Sequence[CurvePoint], lost: set[float]
+) -> tuple[float, float] | None:
+    """(what a curve loses by the base's best x instead of its own, standard error over seeds): for each seed both are
+    chosen by the other seeds. None with fewer than two seeds that every point of both curves has."""
+    own, base = ({p.x: p.seeds for p in curve if p.x not in lost} for curve in (points, of_base))
+    base = {x: seeds for x, seeds in base.items() if x in own}
+    shared = set.intersection(*(set(seeds) for seeds in (*own.values(), *base.values()))) if base else set()
+    if len(shared) < 2:
+        return None
+    lost_by = []
+    for seed in sorted(shared):
+        others = shared - {seed}
+        best, transferred = (min(c, key=lambda x, c=c: sum(c[x][s] for s in others)) for c in (own, base))
+        lost_by.append(own[transferred][seed] - own[best][seed])
+    mean = sum(lost_by) / len(lost_by)
+    spread = sum((d - mean) ** 2 for d in lost_by) / (len(lost_by) - 1)
+    return mean, math.sqrt(spread / len(lost_by))
 
 
 def _of(rows: Iterable[Row], sweep: str, role: str, series: str) -> list[Row]:

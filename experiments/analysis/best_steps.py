@@ -26,7 +26,8 @@ LOSS = "cross_entropy"
 
 @dataclass(frozen=True)
 class AtBest:
-    """A point judged at the steps chosen on other episodes; `chosen` lists steps and how often each was, 'n x m'."""
+    """A point judged at the steps chosen on other episodes; `chosen` lists steps and how often each was, 'n x m'.
+    `edge`: "edge" where the fewest or the most steps that were tried were chosen, so that others may suit it better."""
 
     sweep: str
     x: float
@@ -39,13 +40,15 @@ class AtBest:
     n: int
     episodes: int
     chosen: str
+    edge: str
 
 
 def judge_at_best(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[AtBest]:
-    """Of sweeps whose curves differ in steps: points and seeds that have at least two of them. Raises NotComparable."""
+    """Of sweeps whose curves differ in nothing but steps: points and seeds that have at least two of them. Raises
+    NotComparable."""
     found = []
     for sweep in sweeps:
-        if not (sweep.measured and sweep.several):
+        if not (sweep.measured and sweep.several) or sweep.valley:
             continue
         there: dict[float, dict[int, dict[int, WindowTable]]] = defaultdict(lambda: defaultdict(dict))
         for point in sweep.points:
@@ -65,6 +68,8 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
         composed[seed], steps = cross_fit(tables, sweep.scope)
         chosen.update(steps)
     listed = ", ".join(f"{steps} x {count}" for steps, count in sorted(chosen.items()))
+    tried = {steps for tables in seeds.values() for steps in tables}
+    edge = "edge" if {min(tried), max(tried)} & chosen.keys() else ""
     rows = []
     for metric in METRICS:
         if not all(metric in t.metrics for t in composed.values()):
@@ -72,9 +77,9 @@ def _judge(sweep: Sweep, x: float, seeds: Mapping[int, Mapping[int, WindowTable]
         panel = make_panel([composed], metric, sweep.scope)
         if not panel.known.any():
             continue
-        (i,) = bootstrap_intervals(panel.rows(panel.known))  # robots without actions have no action-nats
+        (i,) = bootstrap_intervals(panel.rows(panel.known))
         rows.append(
-            AtBest(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed)
+            AtBest(sweep.name, x, metric, i.mean, i.sem, i.low, i.high, len(seeds), i.n, i.episodes, listed, edge)
         )
     return rows
 

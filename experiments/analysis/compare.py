@@ -54,18 +54,29 @@ class Difference:
 def compare(a: Side, b: Side) -> list[Difference]:
     """Every metric, nats first, overall and by robot, of the robots that both were judged on.
 
-    Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things.
+    Metrics of tokens are left out where the tokenizers are known to differ: the same nats are then of other things; of
+    retrieval those where the true actions were to be told from another number of others.
     Raises NotComparable, naming the first window that differs.
     """
     pairs = _pairs(a, b)
     first = pairs[0][0]
     robots = require_same_windows(first, pairs[0][1])
     shared = [m for m in first.metrics if all(m in table.metrics for pair in pairs for table in pair)]
-    foreign = OF_TOKENS if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer else ()
+    foreign = set(OF_TOKENS if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer else ())
+    if not all(_same_chance(*pair, robots) for pair in pairs):
+        foreign |= {m for m in shared if m.startswith("retrieval")}
     found = []
     for metric in nats_first(m for m in shared if m not in (*foreign, *NOT_OF_MODELS)):
         found += _of_metric(metric, *_panels(pairs, metric, robots))
     return found
+
+
+def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
+    """Whether the true actions are told from as many others, in every window of `robots`."""
+    if not all("retrieval_chance" in table.metrics for table in (a, b)):
+        return True
+    (panel_a,), (panel_b,) = (make_panel([{0: table}], "retrieval_chance", robots).points for table in (a, b))
+    return np.array_equal(panel_a, panel_b, equal_nan=True)
 
 
 def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:

@@ -2,7 +2,8 @@
 
 The paper explains the plateau over trajectories by robots that have no more of them. So from each point of an axis that
 caps trajectories to the next, what changes is told for robots that get more and for those that do not: if the paper is
-right, the former alone gain. Paired window by window, as `changes`.
+right, the former alone gain. Paired window by window, as `changes`. Only where every robot keeps its share of the
+windows drawn: under a mixture that weighs robots by what is used of them, those without more lose some to the others.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from experiments.analysis.changes import METRICS
 from experiments.analysis.compare import Side, overall_difference
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of, trial_id
+from experiments.sweeps.robots import UNIFORM
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.evaluation.windows import WindowTable
 
@@ -53,9 +55,14 @@ def find_growth(
     for sweep in (s for s in sweeps if s.measured):
         for series in dict.fromkeys(p.series for p in sweep.points if p.role == POINT):
             own = [p for p in sweep.points if (p.role, p.series, p.scope) == (POINT, series, ())]
-            if len({p.trial.max_trajectories for p in own}) > 1:
+            if len({p.trial.max_trajectories for p in own}) > 1 and all(keeps_shares(p.trial) for p in own):
                 found += _along(sweep, series, own, provenance, windows, episodes)
     return found
+
+
+def keeps_shares(trial: Trial) -> bool:
+    """Whether each robot's share of the windows drawn does not depend on how many trajectories are used."""
+    return trial.tau >= UNIFORM or trial.weighed == "all"
 
 
 def _along(

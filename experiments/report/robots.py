@@ -142,7 +142,7 @@ def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool) -> str
         )
     return said + (
         "PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of repeating the "
-        "last given frame. Errors are standard errors over episodes and seeds."
+        "last given frame. Errors are standard errors over episodes and seeds; those of <em>ahead</em> over episodes."
     )
 
 

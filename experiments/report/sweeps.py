@@ -64,11 +64,13 @@ def _at_best(sweep: Sweep, rows: Sequence[AtBest]) -> str:
     for x, found in points.items():
         cells = [f"{f.mean:.3g} ({f.low:.3g} to {f.high:.3g})" if (f := found.get(m)) else "–" for m in metrics]
         any_of = next(iter(found.values()))
-        lines.append([f"{x:,}", *cells, str(any_of.seeds), any_of.chosen])
+        chosen = any_of.chosen + (" (an end of what was tried)" if any_of.edge else "")
+        lines.append([f"{x:,}", *cells, str(any_of.seeds), chosen])
     head = [sweep.axis, *(CHANGED[m] for m in metrics), "seeds", "steps chosen, and how often"]
     return "<h4>At the number of steps that suits each point</h4>" + table(head, lines) + (
         "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other, both ways: the "
-        "lowest of several losses on the windows that judge it would flatter a point. Intervals of 95 % are over seeds "
+        "lowest of several losses on the windows that judge it would flatter a point. Where an end of what was tried "
+        "was chosen, other steps may suit the point better still. Intervals of 95 % are over seeds "
         "and episodes.</p>"
     )
 
@@ -180,6 +182,7 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
             _bold(o.series, o.series == sweep.base),
             LOSSES[o.metric],
             f"{o.x:.3g}" + (f" <span class=failed>{o.edge}</span>" if o.edge else ""),
+            "" if o.near_low == o.near_high else f"{o.near_low:.3g} to {o.near_high:.3g}",
             _moved(o.moved),
             pm(o.loss, o.seed_sem),
             "–" if math.isnan(o.transferred_x) else f"{o.transferred_x:.3g}",
@@ -188,12 +191,13 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
         for o in optima
     ]
     kind = "width" if sweep.name == "lr" else "curve"
-    head = ["", "curve", "loss", "best rate", "steps moved", "lowest", f"base {kind}'s best rate", "penalty"]
+    head = ["", "curve", "loss", "best rate", "as good", "steps moved", "lowest", f"base {kind}'s best rate", "penalty"]
     return f"<p>{_transfer(optima, kind)}</p>" + table(head, lines, text=3) + (
         f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the "
         f"loss is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the "
-        "held-out loss is in nats per token. Errors are over seeds, where there are several; the grid is not "
-        "interpolated. "
+        "held-out loss is in nats per token; where there are several seeds, both rates are chosen by the others and "
+        "judged on the one left out. Errors are over seeds; the grid is not interpolated. <em>As good</em>: rates that "
+        "seeds do not tell from the best (95 %, paired). "
         "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
         "beyond.</p>"
     )
@@ -206,7 +210,8 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
         own = [o for o in optima if o.role == role and o.metric == "cross_entropy" and not math.isnan(o.moved)]
         if own:
             far = max(own, key=lambda o: abs(o.moved))
-            open_ended = ", at an end of the grid, so perhaps further" if far.edge else ""
+            ends = far.edge or any(o.edge for o in own if o.moved == 0)
+            open_ended = ", at an end of the grid, so perhaps further" if ends else ""
             steps = f"{abs(far.moved):.0f} step{'s' * (abs(far.moved) != 1)}"
             parts.append(f"{words}: the best rate of {len(own)} {kind}s moves by at most {steps}{open_ended}")
     return f"{'; '.join(parts)} (held-out loss)." if parts else ""

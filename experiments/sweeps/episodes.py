@@ -1,7 +1,7 @@
 """What does more data per robot buy, told by what is really there?
 
 Question: perplexity and delta PSNR as every robot's trajectories are capped; x is how many there are then in all,
-    the sum over robots of the smaller of cap and what it has. At fewer and at more steps: where data is scarce the
+    the sum over robots of the smaller of cap and what it has. At a quarter, half and all of the steps: where data is scarce the
     best number of steps is smaller, and is to be chosen on other episodes than those judged.
 Paper figure: 6, middle.
 Command: python -m experiments.sweeps.episodes --preset cpu-full
@@ -21,7 +21,7 @@ from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, referenc
 def plan(study: Study) -> Sweep:
     """All robots at every point, judged on all; the last point has all trajectories."""
     caps = (*study.designs.caps, None)
-    budgets = sorted({study.train.steps // 4, study.train.steps} - {0})
+    budgets = sorted({study.train.steps // 4, study.train.steps // 2, study.train.steps} - {0})
 
     def point(seed: int, cap: int | None, steps: int) -> Point:
         trial = reference_trial(study, seed, steps)

@@ -19,8 +19,9 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.stats
 
-from hma_jax.config import ExecutionConfig, ModelConfig
+from hma_jax.config import ExecutionConfig, ModelConfig, require
 from hma_jax.evaluation.metrics import factored_cross_entropy, mean_over_frames
 from hma_jax.generation import next_frame_outputs
 from hma_jax.model.embodiments import EmbodimentTable
@@ -40,6 +41,10 @@ make the frames no likelier as they are."""
 LISTENS, DIFFERS = 2.0, 3.0
 """Standard errors from which on a difference counts: of holding a dimension still, and (of many changes the best one) of
 a change back."""
+
+
+FEWEST = 4
+"""Episodes: of fewer their spread is hardly known."""
 
 
 @dataclass(frozen=True)
@@ -70,15 +75,21 @@ class Change:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean loss under a change less the loss as recorded, with its standard error."""
+    """Mean loss under a change less the loss as recorded, with its standard error over so many `episodes`."""
 
     mean: float
     sem: float
+    episodes: int
 
     @property
     def errors(self) -> float:
-        """In standard errors."""
-        return self.mean / self.sem if self.sem > 0 else float(np.sign(self.mean)) * np.inf if self.mean else 0.0
+        """In standard errors, of a normal distribution: as unlikely as it is by Student's t with few episodes."""
+        if self.mean == 0:
+            return 0.0
+        if not self.sem > 0:
+            return float(np.sign(self.mean)) * np.inf
+        tail = scipy.stats.t.sf(abs(self.mean) / self.sem, self.episodes - 1)
+        return float(np.sign(self.mean) * scipy.stats.norm.isf(tail))
 
 
 @dataclass(frozen=True)
@@ -105,7 +116,10 @@ def find_effects(judge: Judge, actions: np.ndarray, mean: np.ndarray, episode: S
     """One per dimension of `actions` [n, T, stride, A], whose windows are of `episode` [n].
 
     What helps most is changed back first, and the rest is judged again: a wrong dimension makes others look wrong.
+    Raises ConfigError for fewer than FEWEST episodes, of which nothing could be said.
     """
+    there = len(set(episode))
+    require(there >= FEWEST, f"{there} episodes; what actions do is told from at least {FEWEST}")
     count, losses = actions.shape[-1], judge(actions)
     found: dict[int, tuple[Change, Difference]] = {}
     while len(found) < count:
@@ -147,8 +161,8 @@ def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
     x, of = np.asarray(differences, np.float64), np.unique(np.asarray(episode), return_inverse=True)[1]
     sums = np.bincount(of, x - x.mean())
     groups = len(sums)
-    spread = np.sqrt((sums**2).sum() * groups / max(groups - 1, 1)) / len(x)
-    return Difference(float(x.mean()), float(spread) if groups > 1 else float("nan"))
+    spread = np.sqrt((sums**2).sum() * groups / (groups - 1)) / len(x)
+    return Difference(float(x.mean()), float(spread), groups)
 
 
 def make_loss(

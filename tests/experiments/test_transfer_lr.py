@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.optima import find_optima
+from experiments.optima import as_good, chosen_by_others, find_optima
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
-from experiments.rows import LOSS, TRAINING, curve, read_csv
+from experiments.rows import LOSS, TRAINING, CurvePoint, curve, read_csv
 from experiments.study import TransferConfig, override
 from experiments.sweeps import lr
 from experiments.sweeps.sweep import POINT, STANDARD, unique_trials
@@ -102,6 +102,30 @@ def test_optima_line_up_with_mup_and_cost_nothing(tmp_path):
     assert optima[STANDARD, "width 16"].penalty == 0.0  # its own optimum
     training = optima_of(rows, LOSS)
     assert training[STANDARD, "width 8"].penalty == pytest.approx(0.1)
+
+
+def point(x: float, *losses: float) -> CurvePoint:
+    return CurvePoint(x, sum(losses) / len(losses), 0.0, 0.0, dict(enumerate(losses)), 100)
+
+
+def test_rates_that_seeds_do_not_tell_apart_are_as_good():
+    best = point(2.0, 1.00, 1.10, 1.20)
+    assert as_good(best, best)
+    assert as_good(point(1.0, 1.02, 1.09, 1.23), best)  # ahead on one seed of three
+    assert not as_good(point(4.0, 1.05, 1.15, 1.25), best)  # behind by as much on each, whatever the seeds' own level
+    assert not as_good(point(1.0, 1.0), point(2.0, 0.9)), "one seed tells nothing: the best alone stands"
+
+
+def test_what_a_choice_costs_is_judged_on_seeds_that_it_was_not_made_by():
+    """Of noise alone, the lowest of several losses would always seem to gain; the choice of other seeds does not."""
+    own = [point(1.0, 1.0, 1.2, 1.1), point(2.0, 1.2, 1.0, 1.1)]
+    base = [point(1.0, 0.5, 0.5, 0.5), point(2.0, 0.9, 0.9, 0.9)]
+    mean, error = chosen_by_others(own, base, set())
+    # Left out 0 the others choose 2, which costs it 0.2; left out 1 they choose 1, which costs 0.2; the base stays at 1.
+    assert mean == pytest.approx((1.0 - 1.2 + 0 + 0) / 3) and error > 0
+    assert chosen_by_others([point(1.0, 1.0), point(2.0, 2.0)], base, set()) is None
+    clear = [point(1.0, 1.3, 1.4, 1.5), point(2.0, 1.0, 1.1, 1.2)]
+    assert chosen_by_others(clear, base, set()) == (pytest.approx(0.3), pytest.approx(0.0, abs=1e-9))
 
 
 def test_an_optimum_at_the_end_of_the_grid_is_marked(tmp_path):

@@ -56,6 +56,19 @@ def test_several_seeds_are_paired_by_name_and_their_scatter_counts():
     assert one.seeds == 1
 
 
+def test_retrieval_among_other_numbers_is_not_compared():
+    """The true actions are found by chance once in four, or once in sixteen."""
+
+    def among(side, number):
+        chance = {"retrieval": np.zeros(len(side.seeds[0])), "retrieval_chance": np.full(len(side.seeds[0]), 1 / number)}
+        return replace(side, seeds={s: replace(t, metrics=t.metrics | chance) for s, t in side.seeds.items()})
+
+    a, b = sides()
+    alike, other = compare(among(a, 4), among(b, 4)), compare(among(a, 4), among(b, 16))
+    assert any(r.metric == "retrieval" for r in alike)
+    assert not any(r.metric.startswith("retrieval") for r in other) and any(r.metric == "action_nats" for r in other)
+
+
 def test_nats_of_other_tokens_are_not_compared():
     a, b = sides()
     assert {r.metric for r in compare(a, b)} == {"cross_entropy", "action_nats"}

@@ -15,7 +15,7 @@ from tests.experiments.judged import WIDE, windows_of
 
 THERE = {"pusher_sand": 3, "arm_sand": 40, "rover_road": 8}
 STUDY = replace(
-    WIDE, datasets=tuple(THERE), trajectory_counts=(1000,), train=replace(WIDE.train, steps=8),
+    WIDE, tau=1000.0, datasets=tuple(THERE), trajectory_counts=(1000,), train=replace(WIDE.train, steps=8),
     designs=replace(WIDE.designs, caps=(2, 8)),
 )  # fmt: skip
 (SWEEP,) = plan_sweeps(STUDY, ("episodes",))
@@ -40,6 +40,22 @@ def test_only_robots_that_get_more_trajectories_count_as_growing():
         assert rows[series, second, GROWS].mean == pytest.approx(-0.5)
         assert rows[series, second, EXHAUSTED].mean == pytest.approx(0.0, abs=1e-9)
         assert rows[series, second, GROWS].last == last and rows[series, first, GROWS].seeds == 3
+
+
+def test_no_growth_is_told_where_robots_shares_of_the_windows_change():
+    def under(**change):
+        points = tuple(replace(p, trial=replace(p.trial, **change)) for p in SWEEP.points)
+        before = {trial_id(p.trial, PROVENANCE): t for p, t in zip(SWEEP.points, tables_of_points(), strict=True)}
+        found = {trial_id(q.trial, PROVENANCE): before[trial_id(p.trial, PROVENANCE)]
+                 for p, q in zip(SWEEP.points, points, strict=True)}  # fmt: skip
+        return find_growth([replace(SWEEP, points=points)], PROVENANCE, found, THERE)
+
+    assert not under(tau=3.0) and under(tau=3.0, weighed="all")
+
+
+def tables_of_points():
+    by_id = tables()
+    return [by_id[trial_id(p.trial, PROVENANCE)] for p in SWEEP.points]
 
 
 def test_the_page_shows_both_groups():

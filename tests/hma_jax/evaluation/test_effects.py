@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hma_jax.evaluation.effects import Change, find_effects
+from hma_jax.config import ConfigError
+from hma_jax.evaluation.effects import Change, Difference, find_effects
 
 DIM, WINDOWS = 4, 48
 WEIGHTS = np.array([1.0, 0.5, -0.8, 0.0])
@@ -56,6 +57,15 @@ def test_where_nothing_is_wrong_nothing_is_found():
 def test_what_is_wrong_is_found_and_nothing_else(wrong: Change, expected: dict[int, Change]):
     effects = find(wrong(recorded(), np.zeros(DIM)))
     assert {e.dimension: e.better for e in effects if e.better is not None} == expected
+
+
+def test_few_episodes_say_less_and_too_few_nothing():
+    """A mean is as many standard errors from zero as Student's t with so few episodes makes of it."""
+    few, many = Difference(0.3, 0.1, 4), Difference(0.3, 0.1, 1000)
+    assert many.errors == pytest.approx(3.0, abs=0.02) and 1.8 < few.errors < 2.0
+    assert Difference(-0.3, 0.1, 4).errors == -few.errors and Difference(0.0, 0.0, 4).errors == 0.0
+    with pytest.raises(ConfigError, match="3 episodes; what actions do is told from at least 4"):
+        find_effects(lambda actions: np.ones(len(actions)), recorded(), np.zeros(DIM), np.arange(WINDOWS) % 3)
 
 
 def test_a_model_that_is_deaf_ignores_every_dimension():
