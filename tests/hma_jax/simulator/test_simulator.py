@@ -9,7 +9,7 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.generation import rollout
-from hma_jax.simulator.warm_up import warm_up
+from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
 from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, actions, parts, simulator, start
 from tests.tiny import TABLE
 
@@ -230,3 +230,13 @@ def test_a_window_of_the_model_is_all_of_a_start_that_is_seen():
     cut = type(long)(long.robot, long.images[4:], long.actions[4:])
     np.testing.assert_array_equal(sim.reset(cut), one)
     assert sim.counts == (CONFIG.frames - 1,)
+
+
+def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
+    class Compiling(list):
+        def compile(self, together):
+            compiled.append(together)
+
+    compiled: list[int] = []
+    warm_up_more(Compiling(range(16)), 1, ended=lambda: len(compiled) == 2)
+    assert compiled == [n for n in sizes(16) if n > 1][:2] and len(sizes(16)) > 3
