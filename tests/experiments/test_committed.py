@@ -4,6 +4,7 @@ A study that is kept with its trials (per-window numbers and all) is drawn again
 table alone cannot be: its files are held by their hashes.
 """
 
+import csv
 import hashlib
 import json
 import shutil
@@ -96,12 +97,41 @@ def test_the_axis_horizon_is_as_the_page_on_designs_says():
     for line in lines:
         assert line in page, line
     of_steps = next(line for line in lines if "| 8,000 |" in line).strip("| ").split(" | ")
-    steps, seeds, _, psnr, ahead, follow, *_ = of_steps
+    steps, seeds, _, psnr, ahead, follow, changed, *_ = of_steps
     table = read_rows(Workspace(RESULTS / "cpu-full"))
-    (copying,) = {f"{r.mean:.2f}" for r in table if (r.scope, r.metric) == (OVERALL, "psnr_copy")}
-    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; all"
-    assert seeds == "3" and f"{said} {follow}" in " ".join((root / "README.md").read_text().split())
+    (copying,) = {f"{r.mean:.2f}" for r in table if (r.sweep, r.scope, r.metric) == ("horizon", OVERALL, "psnr_copy")}
+    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; other"
+    said = f"{said} actions cost nats on {follow} of the 36 with any, dB on {changed}."
+    assert seeds == "3" and said in " ".join((root / "README.md").read_text().split())
     assert f"PSNR, copying {copying} dB" in page
+
+
+def rates_rows() -> list[str]:
+    """The lines of docs/designs.md on the axis `lr` of cpu-full, of held-out nats."""
+    with open(RESULTS / "cpu-full" / "optima.csv", newline="") as file:
+        found = [r for r in csv.DictReader(file) if (r["sweep"], r["metric"]) == ("lr", "cross_entropy")]
+    lines = []
+    for r in found:
+        best, low, high, nats, moved, penalty, error = (
+            float(r[name]) for name in ("x", "near_low", "near_high", "loss", "moved", "penalty", "penalty_seed_sem")
+        )
+        near = "" if low == high else f"{low:.3g} to {high:.3g}"
+        words = {"point": "muP", "standard": "standard"}[r["role"]]
+        cells = [words, r["series"].removeprefix("width "), f"{best:.3g}", near, f"{moved:+.0f}" if moved else "0"]
+        lines.append(f"| {' | '.join([*cells, f'{nats:.3f}', f'{penalty:.3f} ± {error:.3f}'])} |")
+    return lines
+
+
+def test_the_axis_lr_is_as_the_page_on_designs_says():
+    page, lines = (RESULTS.parents[1] / "docs/designs.md").read_text(), rates_rows()
+    assert len(lines) == 6
+    for line in lines:
+        assert line in page, line
+    moved = {"muP": [], "standard": []}
+    for line in lines:
+        cells = line.strip("| ").split(" | ")
+        moved[cells[0]].append(int(cells[4]))
+    assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}  # as README says
 
 
 @pytest.mark.parametrize("name", STUDIES)
