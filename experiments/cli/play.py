@@ -74,18 +74,19 @@ def play(
         return true_simulator(simulator, [robot]) if has_truth(robot) else None
 
     app, ended = make_app(simulator, truth), threading.Event()
+    # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.
+    compiling = threading.Thread(target=warm_up_more, args=(simulator, 1, None, ended.is_set))
 
     def say(actual: int) -> None:
         shown = "localhost" if host == "127.0.0.1" else host
         console.print(f"drive it at http://{shown}:{actual} (end with Ctrl-C)", soft_wrap=True)
         if visitors > 1:  # the first one need not wait until it is compiled for all
-            # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.
-            threading.Thread(target=warm_up_more, args=(simulator, 1, None, ended.is_set)).start()
+            compiling.start()
 
     try:
         asyncio.run(serve(app, host, port, say))
     except KeyboardInterrupt:
-        console.print("stopped")
+        console.print("stopped" + ", as soon as a program is compiled" * compiling.is_alive())
     except OSError as error:
         raise ConfigError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error
     finally:
