@@ -1,8 +1,8 @@
 """What does more data per robot buy, told by what is really there?
 
 Question: perplexity and delta PSNR as every robot's trajectories are capped; x is how many there are then in all,
-    the sum over robots of the smaller of cap and what it has. At a quarter, half and all of the steps: where data is scarce the
-    best number of steps is smaller, and is to be chosen on other episodes than those judged.
+    the sum over robots of the smaller of cap and what it has. At a quarter, half and all of the steps: where data is
+    scarce the best number of steps is smaller, and is to be chosen on other episodes than those judged.
 Paper figure: 6, middle.
 Command: python -m experiments.sweeps.episodes --preset cpu-full
 Cost: one training run per cap and seed, with a branch for every number of steps; `--dry-run` prints it.
