@@ -7,8 +7,9 @@ difference of true rates between a policy and one that the other world ranks oth
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,12 +67,9 @@ def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed:
     Intervals are quantiles of `draws` bootstrap resamples of policies and starts, and of starts alone. A start drawn is
     drawn in both worlds and for all policies. Draws in which a measure is not defined are left out.
     """
-    rng = np.random.default_rng(seed)
     policies, starts = true_PM.shape
     found: tuple[dict[str, list[float]], ...] = ({name: [] for name in MEASURES}, {name: [] for name in MEASURES})
-    for _ in range(draws):
-        columns = rng.integers(starts, size=starts)
-        rows = rng.integers(policies, size=policies)
+    for rows, columns in _resamples(policies, starts, draws, seed):
         rates = true_PM[:, columns].mean(1), learned_PM[:, columns].mean(1)
         for kept, which in zip(found, (rows, slice(None)), strict=True):
             for name, measure in MEASURES.items():
@@ -82,6 +80,35 @@ def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed:
         {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in found
     )
     return Agreement(both, alone)
+
+
+def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS, seed: int = 0) -> Interval:
+    """How many of the episodes `among_PM` are `same_PM`, both bool [P, M] of P policies at the same M starts.
+
+    Episodes of one policy, and of one start, resemble each other, so the interval is over other policies and starts;
+    but nowhere narrower than Wilson's, which holds at 0 and 1, where resampling knows no spread.
+    """
+    alike = same_PM & among_PM
+    wilson = rate_interval(same_PM[among_PM])
+    drawn = np.array(
+        [
+            alike[rows][:, columns].sum() / max(int(among_PM[rows][:, columns].sum()), 1)
+            for rows, columns in _resamples(*same_PM.shape, draws, seed)
+            if among_PM[rows][:, columns].any()
+        ]
+    )
+    clustered = _interval(wilson.mean, drawn, {"n": wilson.n, "episodes": wilson.episodes})
+    if not math.isfinite(clustered.low):
+        return wilson
+    return dataclasses.replace(clustered, low=min(clustered.low, wilson.low), high=max(clustered.high, wilson.high))
+
+
+def _resamples(policies: int, starts: int, draws: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Policies and starts, drawn with replacement."""
+    rng = np.random.default_rng(seed)
+    for _ in range(draws):
+        columns = rng.integers(starts, size=starts)
+        yield rng.integers(policies, size=policies), columns
 
 
 def _interval(value: float, drawn: np.ndarray, size: dict[str, int]) -> Interval:

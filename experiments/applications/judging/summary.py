@@ -8,9 +8,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from data_pipelines.publishing.files import write_file
 from experiments.analysis.intervals import Interval
-from experiments.applications.judging.agreement import agree, rate_interval
+from experiments.applications.judging.agreement import agree, rate_interval, share
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
 
@@ -35,11 +37,11 @@ def summarise(judged: Judged) -> dict[str, Any]:
     each = {name: successes(judged.outcomes, judged.policies, *column) for name, column in COLUMNS.items()}
     reference = each["true, by state"]
     compared = {name: agree(reference, each[column]) for name, column in COMPARED.items()}
-    learned = each["learned, by head"]
+    same = each["learned, by head"] == reference
     alike = {
-        "all episodes": learned == reference,
-        "those that truly succeed": learned[reference],
-        "those that truly fail": ~learned[~reference],
+        "all episodes": np.ones_like(same),
+        "those that truly succeed": reference,
+        "those that truly fail": ~reference,
     }
     return {
         "robot": judged.config.task.robot,
@@ -58,7 +60,7 @@ def summarise(judged: Judged) -> dict[str, Any]:
             }
             for name, found in compared.items()
         },
-        "episodes alike": {name: _plain(rate_interval(same.ravel())) for name, same in alike.items() if same.size},
+        "episodes alike": {name: _plain(share(same, among)) for name, among in alike.items() if among.any()},
         "head": judged.head.measured,
         "episodes per second": {world: round(1 / s, 3) for world, s in judged.seconds.items()},
     }

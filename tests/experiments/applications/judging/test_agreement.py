@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.applications.judging.agreement import agree, pearson, rank_violation, rate_interval, spearman
+from experiments.applications.judging.agreement import agree, pearson, rank_violation, rate_interval, share, spearman
 from experiments.applications.judging.head import auroc
 
 
@@ -33,6 +33,19 @@ def test_intervals_of_rates_hold_at_the_ends():
     none, some = rate_interval(np.zeros(50)), rate_interval(np.arange(50) < 25)
     assert none.low == pytest.approx(0, abs=1e-12) and none.high == pytest.approx(0.0713, abs=1e-3)
     assert (some.low, some.high) == (pytest.approx(0.3664, abs=1e-3), pytest.approx(0.6336, abs=1e-3))
+
+
+def test_a_share_of_episodes_takes_policies_and_starts_for_what_varies():
+    rng = np.random.default_rng(0)
+    everything = np.ones((8, 50), bool)
+    by_policy = np.repeat(np.arange(8) < 4, 50).reshape(8, 50)  # four policies are judged rightly, four wrongly
+    scattered = rng.permutation(by_policy.ravel()).reshape(8, 50)
+    clustered, alone = share(by_policy, everything, draws=500), share(scattered, everything, draws=500)
+    assert clustered.mean == alone.mean == 0.5
+    assert clustered.high - clustered.low > 3 * (alone.high - alone.low)
+    wilson = rate_interval(np.ones(50))
+    always = share(everything, everything & (np.arange(8)[:, None] == 0), draws=500)  # all of one policy, all alike
+    assert (always.low, always.high) == (wilson.low, pytest.approx(1))
 
 
 def test_auroc_counts_ties_half():

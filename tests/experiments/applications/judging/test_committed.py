@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.applications.judging.agreement import pearson, rate_interval, spearman
+from experiments.applications.judging.agreement import pearson, rate_interval, share, spearman
 from experiments.applications.judging.outcomes import read_outcomes, successes
 from experiments.applications.judging.summary import COLUMNS, COMPARED, shown
 
@@ -25,6 +25,12 @@ def test_the_summary_is_that_of_the_table_and_of_the_page(directory):
             assert summary["policies"][name][column]["mean"] == pytest.approx(rate_interval(found[i]).mean, abs=1e-4)
         cells = " | ".join(f"{summary['policies'][name][column]['mean']:.2f}" for column in COLUMNS)
         assert f"| {name} | {cells} |" in page, name
+    same = each["learned, by head"] == each["true, by state"]
+    for kind, among in (("all episodes", same | ~same), ("those that truly succeed", each["true, by state"])):
+        alike = share(same, among)
+        assert summary["episodes alike"][kind] == {
+            key: pytest.approx(getattr(alike, key), abs=1e-4) for key in ("mean", "low", "high")
+        }
     true = each["true, by state"].mean(1)
     for kind, column in COMPARED.items():
         agreed = summary["agreement"][kind]["policies and starts"]
