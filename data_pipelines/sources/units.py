@@ -84,13 +84,13 @@ class Source(Protocol):
         ...
 
 
-def require_module(name: str) -> ModuleType:
-    """An optional library of the extra `convert`; ConfigError that says how to get it."""
+def require_module(name: str, needed_by: str = "this format") -> ModuleType:
+    """An optional library of the extra `convert`; ConfigError that says what needs it and how to get it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         raise ConfigError(
-            f"this format needs the package {name.partition('.')[0]!r}, which cannot be imported "
+            f"{needed_by} needs the package {name.partition('.')[0]!r}, which cannot be imported "
             f"({error}); install the extra with: pip install 'hma-jax[convert]'"
         ) from error
 

@@ -48,13 +48,14 @@ def generate(
         given: Recorded frames that an episode begins with.
         seed: Another seed gives other draws of the same episodes.
         batch: Episodes at once. Part of what the frames depend on, by rounding.
-        clips: So many of the episodes also as MP4, the recording on the left.
+        clips: So many of the episodes also as MP4, the recording on the left; with 0, PyAV is not needed.
         unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says.
         temperature: Of drawing tokens, instead of what RUN/decode.json says.
         tokenizer: That the model was trained with, if it is not beside the run.
         registry: TOML file with entries of your own.
     """
     from data_pipelines.convert.write import convert
+    from data_pipelines.sources.units import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
     from experiments.applications.generating.trajectories import open_trajectories
@@ -67,6 +68,8 @@ def generate(
     require(batch >= 1, f"--batch must be at least 1, got {batch}")
     require(episodes is None or episodes >= 1, f"--episodes must be at least 1, got {episodes}")
     require(0 <= seed < 2**32, f"--seed must lie in [0, 2^32), got {seed}")
+    if clips:
+        require_module("av", f"--clips {clips}")
     use_entries(registry)
     asked = {"unmask_steps": unmask_steps, "temperature": temperature}
     decode = replace(find_decode(run), **{key: x for key, x in asked.items() if x is not None})

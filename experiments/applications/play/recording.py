@@ -106,7 +106,7 @@ class Recording:
 
 def encode_video(images: Sequence[np.ndarray], rate: float) -> bytes:
     """MP4 of frames uint8 [H, W, 3], enlarged, about `rate` of them per second. ConfigError where PyAV is missing."""
-    av = require_module("av")
+    av = require_module("av", "a video")
     file = io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=max(round(rate), 1))

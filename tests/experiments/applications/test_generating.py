@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -123,3 +124,11 @@ def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
         open_trajectories(str(recorded), "val", gripper, {}, tokenizer, tmp_path)
     with pytest.raises(ConfigError, match="name one with --robot"):
         open_trajectories(str(recorded), "val", None, {gripper.name: gripper}, tokenizer, tmp_path)
+
+
+def test_clips_that_cannot_be_written_are_refused_at_once(run, recorded, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "av", None)
+    assert generate(run, recorded, tmp_path / "out", "--clips", "1") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--clips 1 needs the package 'av'" in said and "hma-jax[convert]" in said
+    assert not (tmp_path / "out").exists()
