@@ -50,15 +50,15 @@ def sweep(
     _run(("sweep", Path(axis).absolute() if is_file(axis) else axis), asked, running, remake, (axis,))
 
 
-def report(out: Path) -> None:
+def report(study: Annotated[Positional[Path], arg(metavar="STUDY")]) -> None:
     """Draw CSV, figures and page again from the trials that are finished.
 
     Args:
-        out: Directory of a study that has run.
+        study: Directory of a study that has run.
     """
     from experiments.report.draw import draw_again
 
-    draw_again(out)
+    draw_again(study)
 
 
 def _run(

@@ -155,7 +155,7 @@ class Workspace:
 
 @dataclass(frozen=True)
 class Record:
-    """What study.json remembers, so that `hma report` and `hma sweep` need only --out."""
+    """What study.json remembers, so that `hma report` and `hma sweep` need only its directory."""
 
     study: Study
     data: tuple[str, ...] = ()  # RLDS directories of the user; () for the suite

@@ -54,7 +54,7 @@ def test_help_needs_no_jax():
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "suite.fewest=0"], 2, "suite.fewest must be at least 1"),
-        (["report", "--out", "{empty}"], 2, "no study"),
+        (["report", "{empty}"], 2, "no study"),
         (["evaluate", "{empty}", "--preset", "smoke"], 2, "checkpoint"),
         (["tokenizer", "import", "{empty}", "--out", "{empty}/t"], 2, "{empty}/config.json"),
         (["tokenizer", "import", "{empty}/no.ckpt", "--out", "{empty}/t"], 2, "at {empty}/no.ckpt"),
@@ -87,7 +87,7 @@ def test_wrong_choice_exits_with_2(capsys):
 
 def test_debug_shows_the_traceback(tmp_path):
     with pytest.raises(Exception, match="no study"):
-        main(["report", "--out", str(tmp_path), "--debug"])
+        main(["report", str(tmp_path), "--debug"])
 
 
 def test_paper_plan_prints_the_papers_sizes(capsys):
@@ -123,7 +123,7 @@ def test_a_study_is_the_scaling_axes_only(capsys):
 def test_report_is_drawn_again_from_disk(tmp_path, capsys):
     workspace = finished_study(tmp_path)
     save_record(workspace, record_of())
-    assert main(["report", "--out", str(tmp_path)]) == 0
+    assert main(["report", str(tmp_path)]) == 0
     assert "report.html" in capsys.readouterr().out and workspace.report.exists()
 
 

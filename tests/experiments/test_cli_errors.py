@@ -316,7 +316,7 @@ def test_evaluation_without_what_was_prepared(name, study, tmp_path, refused):
 
 
 def test_report_of_an_empty_directory(tmp_path, refused):
-    message = refused(2, "report", "--out", tmp_path)
+    message = refused(2, "report", tmp_path)
     assert f"no study in {tmp_path}" in message and "hma study" in message
 
 
