@@ -133,19 +133,22 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0, level: 
 
     The interval joins those of the two levels resampled alone, each with its own Student's t: half its width squared
     is (t sem)^2 of the seeds plus (t sem)^2 of the episodes (the method of variance estimates recovery; Zou and Donner
-    2008, Statistics in Medicine 27). Three seeds that happen to agree then make no interval narrow, as one from the
+    2008, Statistics in Medicine 27). Degrees of freedom are the seeds less one, and for episodes Satterthwaite's, as of
+    one seed (`intervals.overall`). Three seeds that happen to agree then make no interval narrow, as one from the
     quantiles of the draws would be.
     """
     both, by_seed, by_episode = (
         resample(panel, draws, seed, over_seeds=s, over_episodes=e).drawn.std(0, ddof=1)
         for s, e in ((True, True), (True, False), (False, True))
     )
-    sums, _, ends = measured = _by_episode(panel)
-    episodes, value, found, at = sums.shape[1], _mean_of_robots(*measured), [], 0
-    t_episode = critical(episodes - len(ends), level)  # nan, as the interval, if no robot has two episodes
+    sums, counts, ends = _by_episode(panel)
+    episodes, value, found, at = sums.shape[1], _mean_of_robots(sums, counts, ends), [], 0
     for i, seeds in enumerate(panel.seeds):
-        mean = float(value[at : at + len(seeds)].mean())
+        own = slice(at, at + len(seeds))
         at += len(seeds)
+        mean = float(value[own].mean())
+        # nan, as the interval, if no robot has two episodes
+        t_episode = critical(_freedom(sums[own].mean(0), counts, ends), level)
         t_seed = critical(len(seeds) - 1, level) if len(seeds) > 1 else 0.0
         half = math.hypot(t_seed * by_seed[i], t_episode * by_episode[i])
         sem = float(both[i]) if episodes > len(ends) else math.nan
@@ -167,6 +170,24 @@ def _by_episode(panel: Panel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _mean_of_robots(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> np.ndarray:
     starts = np.r_[0, ends[:-1]]
     return (np.add.reduceat(sums, starts, axis=1) / np.add.reduceat(counts, starts)).mean(1)
+
+
+def _freedom(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> float:
+    """Degrees of freedom of the variance that episodes give to the mean over robots, from `sums` [episodes].
+
+    0 if no robot has two episodes, infinite if no two of a robot's differ.
+    """
+    variances, freedoms = [], []
+    for start, end in zip(np.r_[0, ends[:-1]], ends, strict=True):
+        if (freedom := end - start - 1) > 0:
+            own_sums, own_counts = sums[start:end], counts[start:end]
+            apart = own_sums - own_counts * own_sums.sum() / own_counts.sum()
+            variances.append((freedom + 1) / freedom * (apart**2).sum() / own_counts.sum() ** 2)
+            freedoms.append(freedom)
+    if not freedoms:
+        return 0.0
+    v = np.asarray(variances)
+    return float(v.sum() ** 2 / (v**2 / freedoms).sum()) if v.any() else math.inf
 
 
 def _resample_episodes(

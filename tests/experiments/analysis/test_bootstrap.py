@@ -44,6 +44,15 @@ def test_without_a_scatter_of_seeds_it_is_the_clustered_error():
     assert (interval.n, interval.episodes) == (want.n, want.episodes) == (120, 40)
 
 
+def test_a_robot_that_scatters_most_leaves_few_degrees_of_freedom():
+    table = judged(np.random.default_rng(2), robots=4, episodes=6, each=2)
+    wild = np.where(table.dataset == "r0", 30.0, 1.0) * table.metrics[LOSS]
+    (interval,) = bootstrap_intervals(make_panel([{0: with_loss(table, wild)}], LOSS), draws=20_000)
+    want = intervals(summarise(with_loss(table, wild), 1))[OVERALL][LOSS]
+    t, expected = ((i.high - i.mean) / i.sem for i in (interval, want))
+    assert t == pytest.approx(expected, rel=0.02) and t > 2.5  # five episodes' worth; twenty would be 2.09
+
+
 def test_three_seeds_have_the_variance_of_their_mean_not_two_thirds_of_it():
     table = judged(np.random.default_rng(0), episodes=5)
     loss = table.metrics[LOSS]
