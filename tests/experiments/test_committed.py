@@ -23,7 +23,7 @@ from experiments.running.ledger import FINISHED
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import POINT
+from experiments.sweeps.sweep import CONTROL, POINT
 from hma_jax.evaluation.windows import FILE, WindowTable
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
@@ -132,6 +132,86 @@ def test_the_axis_lr_is_as_the_page_on_designs_says():
         cells = line.strip("| ").split(" | ")
         moved[cells[0]].append(int(cells[4]))
     assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}  # as README says
+
+
+def axis_rows(sweep: str) -> list[str]:
+    """The lines of docs/designs.md on one of the axes of cpu-full over a number: means over seeds and judged robots."""
+    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.sweep, r.scope) == (sweep, OVERALL)]
+    lines = []
+    for role in (POINT, CONTROL):
+        for x in sorted({r.x for r in rows if r.role == role}):
+            mine = [r for r in rows if (r.role, r.x) == (role, x)]
+            cells = [f"{x:,.0f}" + ", control" * (role == CONTROL), str(len({r.seed for r in mine}))]
+            for metric, digits in (("cross_entropy", 3), ("psnr", 2), ("action_nats", 2), ("delta_psnr", 2)):
+                mean = float(np.mean([r.mean for r in mine if r.metric == metric]))
+                cells.append(f"{round(mean, digits) + 0.0:.{digits}f}")  # no minus before zero
+            lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def gains() -> dict[str, dict[int, str]]:
+    """{sweep: {robots: nats beside those of forty, mean and standard error over seeds}} of the designs over robots."""
+    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.scope, r.metric) == (OVERALL, "cross_entropy")]
+    found: dict[str, dict[int, str]] = {}
+    for sweep in ("dilution", "transfer"):
+        nats = {(r.x, r.seed): r.mean for r in rows if (r.sweep, r.role) == (sweep, POINT)}
+        for count in (5, 10, 20):
+            apart = [mean - nats[40, seed] for (x, seed), mean in nats.items() if x == count]
+            said = f"{np.mean(apart):+.2f} ± {np.std(apart, ddof=1) / np.sqrt(len(apart)):.2f}"
+            found.setdefault(sweep, {})[count] = said
+    return found
+
+
+def exponents() -> dict[str, list[float]]:
+    """{sweep: a of every trial} such that N robots after S steps have the loss of forty after S (40 / N)^a."""
+    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.metric, r.role) == ("cross_entropy", POINT)]
+    robots = [r for r in rows if r.scope != OVERALL]
+    steps = {"dilution": lambda x: 4000.0, "transfer": lambda x: 100 * x}
+    found: dict[str, list[float]] = {name: [] for name in steps}
+    for seed in (0, 1, 2):
+        five = {r.scope for r in robots if (r.sweep, r.x, r.seed) == ("dilution", 5, seed)}
+        nats = {}
+        for r in robots:
+            if r.sweep == "horizon" and r.scope in five:
+                nats.setdefault(r.x, []).append(r.mean)
+        along = sorted(nats)
+        means = [-np.mean(nats[x]) for x in along]  # of all seeds of the forty
+        for r in rows:
+            if r.sweep in steps and (r.scope, r.seed) == (OVERALL, seed) and r.x < 40:
+                as_far = np.exp(np.interp(-r.mean, means, np.log(along)))
+                found[r.sweep].append(float(np.log(as_far / steps[r.sweep](r.x)) / np.log(40 / r.x)))
+    return found
+
+
+def test_what_sharing_and_company_cost_is_as_the_page_on_designs_says():
+    found, page = gains(), (RESULTS.parents[1] / "docs/designs.md").read_text().splitlines()
+    for count in (5, 10, 20):
+        came = [f"**{found[sweep][count]}**" for sweep in ("dilution", "transfer")]
+        assert any(line.startswith(f"| {count} |") and all(x in line for x in came) for line in page), (count, came)
+    a = sum(exponents().values(), [])
+    said = f"a = {min(a):.1f} to {max(a):.1f}, {np.mean(a):.1f} on average"
+    assert said in " ".join(" ".join(page).split()), said
+
+
+def test_what_was_found_is_as_readme_says():
+    root = RESULTS / "cpu-full"
+    text = " ".join((RESULTS.parents[1] / "README.md").read_text().split())
+    with open(root / "fits.csv", newline="") as file:
+        law = {r["coefficient"]: float(r["value"]) for r in csv.DictReader(file) if r["curve"] == "width"}
+    assert f"{law['E']:.2f} + {law['A']:.0f} N^-{law['alpha']:.2f} in trunk parameters" in text
+    predicted = json.loads((root / "predictions" / "width-64.json").read_text())["mean"]
+    came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
+    assert f"predicted at {predicted:.3f} nats before it ran, came to {came}" in text
+    alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
+    assert f"lose {alone} nats by sharing" in text and f"gain {company} by" in text
+
+
+@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer"])
+def test_an_axis_over_a_number_is_as_the_page_on_designs_says(sweep):
+    page, lines = (RESULTS.parents[1] / "docs/designs.md").read_text(), axis_rows(sweep)
+    assert len(lines) >= 4
+    for line in lines:
+        assert line in page, line
 
 
 @pytest.mark.parametrize("name", STUDIES)
