@@ -203,7 +203,7 @@ def test_what_was_found_is_as_readme_says():
     came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
     assert f"predicted at {predicted:.3f} nats before it ran, came to {came}" in text
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
-    assert f"lose {alone} nats by sharing" in text and f"gain {company} by" in text
+    assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
 
 
 @pytest.mark.parametrize("sweep", ["width", "dilution", "transfer"])
