@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.analysis.intervals import LEVEL, Interval, critical
+from experiments.analysis.intervals import LEVEL, Interval, critical, satterthwaite
 from experiments.analysis.paired import NotComparable, require_same_windows
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
@@ -177,17 +177,14 @@ def _freedom(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> float:
 
     0 if no robot has two episodes, infinite if no two of a robot's differ.
     """
-    variances, freedoms = [], []
+    estimates = []
     for start, end in zip(np.r_[0, ends[:-1]], ends, strict=True):
         if (freedom := end - start - 1) > 0:
             own_sums, own_counts = sums[start:end], counts[start:end]
             apart = own_sums - own_counts * own_sums.sum() / own_counts.sum()
-            variances.append((freedom + 1) / freedom * (apart**2).sum() / own_counts.sum() ** 2)
-            freedoms.append(freedom)
-    if not freedoms:
-        return 0.0
-    v = np.asarray(variances)
-    return float(v.sum() ** 2 / (v**2 / freedoms).sum()) if v.any() else math.inf
+            variance = (freedom + 1) / freedom * (apart**2).sum() / own_counts.sum() ** 2
+            estimates.append((float(variance), int(freedom)))
+    return satterthwaite(estimates) if estimates else 0.0
 
 
 def _resample_episodes(

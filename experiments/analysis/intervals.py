@@ -63,12 +63,18 @@ def overall(stats: Iterable[Stat], level: float = LEVEL) -> Interval:
     """Of the mean over robots, each counting equally (`stratified`).
 
     The robots are fixed: the interval is about other episodes of these robots, not about other robots. Degrees of
-    freedom: (sum v)^2 / sum(v^2 / (G - 1)) for the robots' variances v, over those with an error of their own.
+    freedom: `satterthwaite`'s, G - 1 for each robot's variance, over those with an error of their own.
     """
     stats = list(stats)
-    known = [(s.sem**2, s.clusters - 1) for s in stats if s.sem > 0]
+    freedom = satterthwaite((s.sem**2, s.clusters - 1) for s in stats if s.sem > 0)
+    return _around(stratified(stats), freedom, level)
+
+
+def satterthwaite(estimates: Iterable[tuple[float, float]]) -> float:
+    """Degrees of freedom of a sum of (variance, its own degrees of freedom); infinite where nothing varies."""
+    known = list(estimates)
     total, squares = sum(v for v, _ in known), sum(v**2 / df for v, df in known)
-    return _around(stratified(stats), total**2 / squares if squares else math.inf, level)
+    return total**2 / squares if squares else math.inf
 
 
 def intervals(summary: Summary, level: float = LEVEL) -> dict[str, dict[str, Interval]]:

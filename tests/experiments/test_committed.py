@@ -18,7 +18,7 @@ import pytest
 from data_pipelines.suite.embodiments import TRAINED
 from experiments.report.draw import draw_again
 from experiments.report.robots import robots_of
-from experiments.rows import OVERALL, read_rows
+from experiments.rows import OVERALL, curve, difference, read_rows
 from experiments.running.ledger import FINISHED
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
@@ -136,38 +136,35 @@ def test_the_axis_lr_is_as_the_page_on_designs_says():
 
 def axis_rows(sweep: str) -> list[str]:
     """The lines of docs/designs.md on one of the axes of cpu-full over a number: means over seeds and judged robots."""
-    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.sweep, r.scope) == (sweep, OVERALL)]
+    rows, digits = read_rows(Workspace(RESULTS / "cpu-full")), (3, 2, 2, 2)
     lines = []
     for role in (POINT, CONTROL):
-        for x in sorted({r.x for r in rows if r.role == role}):
-            mine = [r for r in rows if (r.role, r.x) == (role, x)]
-            cells = [f"{x:,.0f}" + ", control" * (role == CONTROL), str(len({r.seed for r in mine}))]
-            for metric, digits in (("cross_entropy", 3), ("psnr", 2), ("action_nats", 2), ("delta_psnr", 2)):
-                mean = float(np.mean([r.mean for r in mine if r.metric == metric]))
-                cells.append(f"{round(mean, digits) + 0.0:.{digits}f}")  # no minus before zero
+        curves = [curve(rows, sweep, m, role) for m in ("cross_entropy", "psnr", "action_nats", "delta_psnr")]
+        for points in zip(*curves, strict=True):
+            cells = [f"{points[0].x:,.0f}" + ", control" * (role == CONTROL), str(len(points[0].seeds))]
+            # no minus before zero
+            cells += [f"{round(p.mean, n) + 0.0:.{n}f}" for p, n in zip(points, digits, strict=True)]
             lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
 def gains() -> dict[str, dict[int, str]]:
     """{sweep: {robots: nats beside those of forty, mean and standard error over seeds}} of the designs over robots."""
-    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.scope, r.metric) == (OVERALL, "cross_entropy")]
+    rows = read_rows(Workspace(RESULTS / "cpu-full"))
     found: dict[str, dict[int, str]] = {}
     for sweep in ("dilution", "transfer"):
-        nats = {(r.x, r.seed): r.mean for r in rows if (r.sweep, r.role) == (sweep, POINT)}
-        for count in (5, 10, 20):
-            apart = [mean - nats[40, seed] for (x, seed), mean in nats.items() if x == count]
-            said = f"{np.mean(apart):+.2f} ± {np.std(apart, ddof=1) / np.sqrt(len(apart)):.2f}"
-            found.setdefault(sweep, {})[count] = said
+        *fewer, forty = curve(rows, sweep, "cross_entropy")
+        apart = {round(point.x): difference(point, forty) for point in fewer}
+        found[sweep] = {count: f"{mean:+.2f} ± {error:.2f}" for count, (mean, error) in apart.items()}
     return found
 
 
-def exponents() -> dict[str, list[float]]:
-    """{sweep: a of every trial} such that N robots after S steps have the loss of forty after S (40 / N)^a."""
+def exponents() -> list[float]:
+    """a of every trial of N robots: after S steps it has the loss of forty after S (40 / N)^a."""
     rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.metric, r.role) == ("cross_entropy", POINT)]
     robots = [r for r in rows if r.scope != OVERALL]
     steps = {"dilution": lambda x: 4000.0, "transfer": lambda x: 100 * x}
-    found: dict[str, list[float]] = {name: [] for name in steps}
+    found = []
     for seed in (0, 1, 2):
         five = {r.scope for r in robots if (r.sweep, r.x, r.seed) == ("dilution", 5, seed)}
         nats = {}
@@ -179,7 +176,7 @@ def exponents() -> dict[str, list[float]]:
         for r in rows:
             if r.sweep in steps and (r.scope, r.seed) == (OVERALL, seed) and r.x < 40:
                 as_far = np.exp(np.interp(-r.mean, means, np.log(along)))
-                found[r.sweep].append(float(np.log(as_far / steps[r.sweep](r.x)) / np.log(40 / r.x)))
+                found.append(np.log(as_far / steps[r.sweep](r.x)) / np.log(40 / r.x))
     return found
 
 
@@ -188,7 +185,7 @@ def test_what_sharing_and_company_cost_is_as_the_page_on_designs_says():
     for count in (5, 10, 20):
         came = [f"**{found[sweep][count]}**" for sweep in ("dilution", "transfer")]
         assert any(line.startswith(f"| {count} |") and all(x in line for x in came) for line in page), (count, came)
-    a = sum(exponents().values(), [])
+    a = exponents()
     said = f"a = {min(a):.1f} to {max(a):.1f}, {np.mean(a):.1f} on average"
     assert said in " ".join(" ".join(page).split()), said
 

@@ -90,13 +90,9 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS, seed: i
     """
     alike = same_PM & among_PM
     wilson = rate_interval(same_PM[among_PM])
-    drawn = np.array(
-        [
-            alike[rows][:, columns].sum() / max(int(among_PM[rows][:, columns].sum()), 1)
-            for rows, columns in _resamples(*same_PM.shape, draws, seed)
-            if among_PM[rows][:, columns].any()
-        ]
-    )
+    grids = (np.ix_(rows, columns) for rows, columns in _resamples(*same_PM.shape, draws, seed))
+    counts = [(alike[grid].sum(), among_PM[grid].sum()) for grid in grids]
+    drawn = np.array([found / n for found, n in counts if n])
     clustered = _interval(wilson.mean, drawn, {"n": wilson.n, "episodes": wilson.episodes})
     if not math.isfinite(clustered.low):
         return wilson
