@@ -4,27 +4,17 @@ A study that is kept with its trials (per-window numbers and all) is drawn again
 table alone cannot be: its files are held by their hashes.
 """
 
-import csv
 import hashlib
-import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from data_pipelines.suite.embodiments import TRAINED
 from experiments.report.draw import draw_again
-from experiments.report.robots import robots_of
-from experiments.rows import OVERALL, curve, difference, read_rows
+from experiments.rows import read_rows
 from experiments.running.ledger import FINISHED
-from experiments.running.trial import trial_id
-from experiments.running.workspace import Workspace, load_record
-from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import CONTROL, POINT
-from hma_jax.evaluation.windows import FILE, WindowTable
+from experiments.running.workspace import Workspace
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
 STUDIES = sorted(path.parent.name for path in RESULTS.glob("*/study.json"))
@@ -50,165 +40,6 @@ def test_every_trial_of_a_table_is_finished_and_judged(name):
     assert {r.status for r in rows} == {FINISHED}
     assert all(r.metric for r in rows)
     assert len({r.manifest for r in rows}) == 1, "judged on different windows"
-
-
-def test_the_first_axis_by_how_much_data_a_robot_has_is_as_the_page_on_designs_says():
-    folder = RESULTS / "cpu-full-horizon"
-    windows = {name: d["windows"] for name, d in json.loads((folder / "data.json").read_text()).items()}
-    rows = [r for r in read_rows(Workspace(folder)) if r.metric == "cross_entropy" and r.role == "point"]
-    page = (RESULTS.parents[1] / "docs/designs.md").read_text()
-    for least, most in ((0, 400), (400, 2000), (2000, 10**9)):
-        mine = [r for r in rows if least <= windows.get(r.scope, -1) < most]
-        means = [np.mean([r.mean for r in mine if r.x == n]) for n in (500, 1000, 2000, 4000, 8000, 16_000)]
-        line = " | ".join([str(len({r.scope for r in mine})), *(f"{mean:.2f}" for mean in means)])
-        assert f"| {line} |" in page, line
-
-
-def horizon_rows() -> list[str]:
-    """The lines of docs/designs.md on the axis `horizon` of cpu-full, from every window's numbers."""
-    workspace = Workspace(RESULTS / "cpu-full")
-    record = load_record(workspace)
-    (sweep,) = plan_sweeps(record.study, ("horizon",))
-    acting = {e.name for e in TRAINED if not e.video_only}
-    ids = {trial_id(p.trial, record.provenance): p for p in sweep.points if p.role == POINT}
-    windows = {id: WindowTable.load(workspace.trials / id / FILE) for id in ids}
-    lines = []
-    for x in sorted({p.x for p in ids.values()}):
-        tables = [windows[id] for id, p in ids.items() if p.x == x]
-        robots = robots_of([], replace(sweep, reference_x=x), record.provenance, windows)
-        follow = [r.follows for r in robots if r.name in acting]
-
-        def mean(metric: str, tables=tables) -> float:
-            return float(np.mean([t.of(name).metrics[metric].mean() for t in tables for name in t.datasets]))
-
-        cells = [
-            f"{x:,}", len(tables), f"{mean('cross_entropy'):.2f}", f"{mean('psnr'):.2f}",
-            sum(r.ahead > 0 for r in robots),
-            sum(f["action_nats"].errors > 3 for f in follow), sum(f["delta_psnr"].errors > 2 for f in follow),
-            *(f"{np.mean([f[metric].mean for f in follow]):.2f}" for metric in ("action_nats", "retrieval")),
-        ]  # fmt: skip
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return lines
-
-
-def test_the_axis_horizon_is_as_the_page_on_designs_says():
-    root = RESULTS.parents[1]
-    page, lines = (root / "docs/designs.md").read_text(), horizon_rows()
-    for line in lines:
-        assert line in page, line
-    of_steps = next(line for line in lines if "| 8,000 |" in line).strip("| ").split(" | ")
-    steps, seeds, _, psnr, ahead, follow, changed, *_ = of_steps
-    table = read_rows(Workspace(RESULTS / "cpu-full"))
-    (copying,) = {f"{r.mean:.2f}" for r in table if (r.sweep, r.scope, r.metric) == ("horizon", OVERALL, "psnr_copy")}
-    said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; other"
-    said = f"{said} actions cost nats on {follow} of the 36 with any, dB on {changed}."
-    assert seeds == "3" and said in " ".join((root / "README.md").read_text().split())
-    assert f"PSNR, copying {copying} dB" in page
-
-
-def rates_rows() -> list[str]:
-    """The lines of docs/designs.md on the axis `lr` of cpu-full, of held-out nats."""
-    with open(RESULTS / "cpu-full" / "optima.csv", newline="") as file:
-        found = [r for r in csv.DictReader(file) if (r["sweep"], r["metric"]) == ("lr", "cross_entropy")]
-    lines = []
-    for r in found:
-        best, low, high, nats, moved, penalty, error = (
-            float(r[name]) for name in ("x", "near_low", "near_high", "loss", "moved", "penalty", "penalty_seed_sem")
-        )
-        near = "" if low == high else f"{low:.3g} to {high:.3g}"
-        words = {"point": "muP", "standard": "standard"}[r["role"]]
-        cells = [words, r["series"].removeprefix("width "), f"{best:.3g}", near, f"{moved:+.0f}" if moved else "0"]
-        lines.append(f"| {' | '.join([*cells, f'{nats:.3f}', f'{penalty:.3f} ± {error:.3f}'])} |")
-    return lines
-
-
-def test_the_axis_lr_is_as_the_page_on_designs_says():
-    page, lines = (RESULTS.parents[1] / "docs/designs.md").read_text(), rates_rows()
-    assert len(lines) == 6
-    for line in lines:
-        assert line in page, line
-    moved = {"muP": [], "standard": []}
-    for line in lines:
-        cells = line.strip("| ").split(" | ")
-        moved[cells[0]].append(int(cells[4]))
-    assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}  # as README says
-
-
-def axis_rows(sweep: str) -> list[str]:
-    """The lines of docs/designs.md on one of the axes of cpu-full over a number: means over seeds and judged robots."""
-    rows, digits = read_rows(Workspace(RESULTS / "cpu-full")), (3, 2, 2, 2)
-    lines = []
-    for role in (POINT, CONTROL):
-        curves = [curve(rows, sweep, m, role) for m in ("cross_entropy", "psnr", "action_nats", "delta_psnr")]
-        for points in zip(*curves, strict=True):
-            cells = [f"{points[0].x:,.0f}" + ", control" * (role == CONTROL), str(len(points[0].seeds))]
-            # no minus before zero
-            cells += [f"{round(p.mean, n) + 0.0:.{n}f}" for p, n in zip(points, digits, strict=True)]
-            lines.append(f"| {' | '.join(cells)} |")
-    return lines
-
-
-def gains() -> dict[str, dict[int, str]]:
-    """{sweep: {robots: nats beside those of forty, mean and standard error over seeds}} of the designs over robots."""
-    rows = read_rows(Workspace(RESULTS / "cpu-full"))
-    found: dict[str, dict[int, str]] = {}
-    for sweep in ("dilution", "transfer"):
-        *fewer, forty = curve(rows, sweep, "cross_entropy")
-        apart = {round(point.x): difference(point, forty) for point in fewer}
-        found[sweep] = {count: f"{mean:+.2f} ± {error:.2f}" for count, (mean, error) in apart.items()}
-    return found
-
-
-def exponents() -> list[float]:
-    """a of every trial of N robots: after S steps it has the loss of forty after S (40 / N)^a."""
-    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.metric, r.role) == ("cross_entropy", POINT)]
-    robots = [r for r in rows if r.scope != OVERALL]
-    steps = {"dilution": lambda x: 4000.0, "transfer": lambda x: 100 * x}
-    found = []
-    for seed in (0, 1, 2):
-        five = {r.scope for r in robots if (r.sweep, r.x, r.seed) == ("dilution", 5, seed)}
-        nats = {}
-        for r in robots:
-            if r.sweep == "horizon" and r.scope in five:
-                nats.setdefault(r.x, []).append(r.mean)
-        along = sorted(nats)
-        means = [-np.mean(nats[x]) for x in along]  # of all seeds of the forty
-        for r in rows:
-            if r.sweep in steps and (r.scope, r.seed) == (OVERALL, seed) and r.x < 40:
-                as_far = np.exp(np.interp(-r.mean, means, np.log(along)))
-                found.append(np.log(as_far / steps[r.sweep](r.x)) / np.log(40 / r.x))
-    return found
-
-
-def test_what_sharing_and_company_cost_is_as_the_page_on_designs_says():
-    found, page = gains(), (RESULTS.parents[1] / "docs/designs.md").read_text().splitlines()
-    for count in (5, 10, 20):
-        came = [f"**{found[sweep][count]}**" for sweep in ("dilution", "transfer")]
-        assert any(line.startswith(f"| {count} |") and all(x in line for x in came) for line in page), (count, came)
-    a = exponents()
-    said = f"a = {min(a):.1f} to {max(a):.1f}, {np.mean(a):.1f} on average"
-    assert said in " ".join(" ".join(page).split()), said
-
-
-def test_what_was_found_is_as_readme_says():
-    root = RESULTS / "cpu-full"
-    text = " ".join((RESULTS.parents[1] / "README.md").read_text().split())
-    with open(root / "fits.csv", newline="") as file:
-        law = {r["coefficient"]: float(r["value"]) for r in csv.DictReader(file) if r["curve"] == "width"}
-    assert f"{law['E']:.2f} + {law['A']:.0f} N^-{law['alpha']:.2f} in trunk parameters" in text
-    predicted = json.loads((root / "predictions" / "width-64.json").read_text())["mean"]
-    came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
-    assert f"predicted at {predicted:.3f} nats before it ran, came to {came}" in text
-    alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
-    assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
-
-
-@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer"])
-def test_an_axis_over_a_number_is_as_the_page_on_designs_says(sweep):
-    page, lines = (RESULTS.parents[1] / "docs/designs.md").read_text(), axis_rows(sweep)
-    assert len(lines) >= 4
-    for line in lines:
-        assert line in page, line
 
 
 @pytest.mark.parametrize("name", STUDIES)
