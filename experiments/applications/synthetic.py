@@ -12,10 +12,12 @@ are trained on what it shows, not on that frame. Control: the same simulator und
 pictures and actions do not belong together. All policies are trained alike (behaviour cloning, as many steps), and
 judged from the same starts in the true simulator.
 
-The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations.
+The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations. With --actions
+DATASET the trajectories are recordings of a robot that no simulator judges (the paper's Language Table): policies are
+judged by that error alone.
 
-Writes to OUT: trials.csv, a row per policy and start; errors.csv, one per policy and held-out trajectory; summary.csv
-and table.md; synthetic.png; frames.png.
+Writes to OUT: trials.csv, a row per policy and start (not of recordings); errors.csv, one per policy and held-out
+trajectory; summary.csv and table.md; synthetic.png; frames.png.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +37,9 @@ from experiments.applications.generating.conditions import (
     ALL,
     CONDITIONS,
     CONTROL,
-    ERRORS,
     FEW,
     KINDS,
     MOST,
-    TRIALS,
     Condition,
     Trials,
     markdown,
@@ -47,101 +47,73 @@ from experiments.applications.generating.conditions import (
     write_tables,
 )
 from experiments.applications.generating.figures import draw_conditions, draw_strips
+from experiments.applications.generating.lessons import (
+    Lessons,
+    RecordedLessons,
+    ScriptedLessons,
+    Settings,
+    Training,
+    as_trajectories,
+    others_actions,
+)
 from experiments.applications.generating.source import replay
-from experiments.applications.generating.trajectories import Trajectory
+from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.made_with import claim, write_settings
 from experiments.applications.policies.acting import Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
-from experiments.applications.policies.closed_loop import MOST_TRIED, away_at_start, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import (
     Demonstrations,
     join,
     load_demonstrations,
-    record,
     save_demonstrations,
 )
 from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.policy import Policy
-from experiments.applications.policies.tasks import Task, find_task
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.progress import Pace, step
+from experiments.running.workspace import Workspace
+from experiments.setting import use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.evaluation.metrics import psnr
+from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
 OUT = Path("runs/synthetic")
 
+JUDGED_ON = "held_out"
+"""The name of the recordings that nobody is trained on, beside those of `KINDS`."""
+
 BATCH = 8
 
 
-@dataclass(frozen=True)
-class Settings:
-    """All that the results depend on besides the world model."""
-
-    robot: str = "gripper_wood"
-    task: str = "hover"
-    frames: int = 14
-    hold: int = 6  # frames in a row at the goal, for success
-    least: float = 0.5  # from the goal, that an episode begins, in halves of the floor's side
-    noise: float = 0.05  # of the expert
-    trajectories: int = 100
-    starts: int = 200
-    seeds: tuple[int, ...] = (0, 1, 2)
-    steps: int = 2000  # of training, of every policy
-    batch: int = 32
-    learning_rate: float = 2e-3
-    given: int = 1  # recorded frames that a generated trajectory begins with
-    with_given: bool = False  # policies are trained on these, too
-
-    def make_task(self) -> Task:
-        return find_task(self.robot, self.task, self.frames, self.hold)
-
-
-def make_data(settings: Settings, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
-    """The 100 trajectories as recorded, generated, and generated under shuffled actions; made once, kept in `out`."""
-    sets, size = {kind: out / f"{kind}.npz" for kind in KINDS}, simulator.tokenizer.image_size
-    stride = simulator.robot(settings.robot).stride
+def make_data(lessons: Lessons, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
+    """The trajectories as recorded, generated, and generated under shuffled actions; made once, kept in `out`."""
+    sets, given = {kind: out / f"{kind}.npz" for kind in (*KINDS, JUDGED_ON)}, lessons.settings.given
     if not sets["recorded"].exists():
-        with step(f"record {settings.trajectories} trajectories"):
-            save_demonstrations(record_far(settings, stride, size), sets["recorded"])
+        with step(f"record {lessons.settings.trajectories} trajectories"):
+            save_demonstrations(lessons.record(), sets["recorded"])
     recorded = load_demonstrations(sets["recorded"])
-    for kind, shift in (("generated", 0), ("shuffled", 1)):
+    for kind, actions in (("generated", recorded.actions), ("shuffled", others_actions(recorded))):
         if not sets[kind].exists():
             with step(f"replay actions: {kind}") as update:
-                actions = np.roll(recorded.actions, shift, 0)
-                images = imagine(simulator, settings.robot, recorded, actions, settings.given, update)
+                images = imagine(simulator, lessons.robot, replace(recorded, actions=actions), given, update)
             save_demonstrations(replace(recorded, images=images), sets[kind])
-    held_out = out / "held_out.npz"
-    if not held_out.exists():
-        save_demonstrations(record_far(settings, stride, size, seed=1), held_out)
-    return {kind: load_demonstrations(path) for kind, path in {**sets, "held_out": held_out}.items()}
+    if not sets[JUDGED_ON].exists():
+        save_demonstrations(lessons.record_held_out(), sets[JUDGED_ON])
+    return {kind: load_demonstrations(path) for kind, path in sets.items()}
 
 
-def record_far(settings: Settings, stride: int, image_size: int, seed: int = 0) -> Demonstrations:
-    """Successes of the expert that begin far enough from the goal."""
-    task = settings.make_task()
-    count = MOST_TRIED * settings.trajectories
-    how = {"noise": settings.noise, "only_successes": True, "stride": stride, "image_size": image_size}
-    made = record(task, count, seed=seed, **how)
-    far = np.flatnonzero(away_at_start(task, made.seeds) >= settings.least)[: settings.trajectories]
-    enough = len(far) == settings.trajectories
-    require(enough, f"{task.robot}: hardly an episode begins {settings.least:g} from its goal")
-    return made.take(far)
-
-
-def imagine(
-    simulator: Simulator, robot: str, demos: Demonstrations, actions: np.ndarray, given: int, update
-) -> np.ndarray:
-    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under `actions` [N, L, A]."""
-    driven, made = simulator.robot(robot), []
+def imagine(simulator: Simulator, robot: Robot, demos: Demonstrations, given: int, update) -> np.ndarray:
+    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under its actions."""
+    trajectories, images = as_trajectories(demos, robot), np.zeros_like(demos.images)
     for first in range(0, len(demos), len(simulator)):
         rows = range(first, min(first + len(simulator), len(demos)))
-        batch = [Trajectory(str(i), demos.images[i], np.repeat(actions[i][:, None], driven.stride, 1)) for i in rows]
-        made += replay(simulator, driven, batch, list(rows), given)
-        update(len(made), len(demos), "trajectories")
-    return np.stack(made)
+        for i, made in zip(rows, replay(simulator, robot, [trajectories[i] for i in rows], rows, given), strict=True):
+            images[i, : len(made)] = made
+        update(rows.stop, len(demos), "trajectories")
+    return images
 
 
 def choose(condition: Condition, data: Mapping[str, Demonstrations], seed: int, dropped: int) -> Demonstrations:
@@ -164,77 +136,96 @@ def without_first(demos: Demonstrations, frames: int) -> Demonstrations:
 
 
 def run_trial(
-    settings: Settings, condition: Condition, data: Mapping[str, Demonstrations], stride: int, seed: int, update
-) -> dict:
-    """Trains one policy and judges it: {success, distance} by start, {error} by held-out trajectory."""
-    dropped, task = 0 if settings.with_given else settings.given, settings.make_task()
-    demos = choose(condition, data, seed, dropped)
+    lessons: Lessons, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update
+) -> dict[str, list[float]]:
+    """Trains one policy and judges it: what the lessons' judge says by start, {error} by held-out trajectory."""
+    settings = lessons.settings
+    demos = choose(condition, data, seed, 0 if settings.with_given else settings.given)
     fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
     policy = clone(demos, BcConfig(frames=1, fit=fit), seed, update)
-    starts = start_seeds(task, settings.starts, least=settings.least)
-    found = run_policy(task, policy, starts, demos.images.shape[2], stride)
-    errors = action_errors(policy, data["held_out"], scale_of(data["recorded"]))
-    return {
-        "success": found.success.astype(int).tolist(),
-        "distance": np.round(found.distance, 4).tolist(),
-        "error": np.round(errors, 5).tolist(),
-    }
+    judged = lessons.judge(policy)
+    errors = action_errors(policy, data[JUDGED_ON], scale_of(data["recorded"]))
+    return {**judged, "error": np.round(errors, 5).tolist()}
 
 
 def action_errors(policy: Policy, demos: Demonstrations, scale: Scale) -> np.ndarray:
     """float [N]: mean squared difference from the recorded actions of each trajectory, in standard deviations."""
     policy.reset()
     acted = np.stack([policy.act(demos.images[:, t]) for t in range(demos.images.shape[1])], 1)
-    return ((scale.normalise(acted) - scale.normalise(demos.actions)) ** 2).mean((1, 2), dtype=np.float64)
+    squares = ((scale.normalise(acted) - scale.normalise(demos.actions)) ** 2).mean(2, dtype=np.float64)
+    return np.array([row[:length].mean() for row, length in zip(squares, demos.lengths, strict=True)])
 
 
-def write_results(settings: Settings, trials: Trials, quality: dict, out: Path) -> None:
-    write_tables(trials, settings.seeds, out)
-    found = summarise(trials, settings.seeds)
-    measured = [(f"{what}: {one.name}", getattr(one, what)) for what in ("success", "error") for one in found]
+def write_results(seeds: tuple[int, ...], trials: Trials, quality: dict, out: Path) -> list[Path]:
+    """Returns what it wrote."""
+    tables, found = write_tables(trials, seeds, out), summarise(trials, seeds)
+    shown = "success" if "success" in found[0].measured else "error"
+    measured = [(f"{what}: {one.name}", one.measured[what]) for what in found[0].measured for one in found]
     lines = [[name, *(f"{x:.4f}" for x in (r.mean, r.low, r.high))] for name, r in measured]
     lines += [[f"PSNR of {kind}, dB", *(f"{x:.4f}" for x in three)] for kind, three in quality.items()]
-    write_table(out / "summary.csv", ["what", "mean", "low", "high"], lines)
-    write_file(out / "table.md", markdown(found))
+    summary, table, figure = out / "summary.csv", out / "table.md", out / "synthetic.png"
+    write_table(summary, ["what", "mean", "low", "high"], lines)
+    write_file(table, markdown(found))
     places = range(len(CONDITIONS))
-    seeds = [[float(np.mean(trials[i, s]["success"])) for s in settings.seeds if (i, s) in trials] for i in places]
-    named = {one.name: one.success for one in found[: len(CONDITIONS)]}
-    draw_conditions(named, seeds, {CONTROL}, {FEW, ALL}, out / "synthetic.png")
+    each = [[float(np.mean(trials[i, s][shown])) for s in seeds if (i, s) in trials] for i in places]
+    named = {one.name: one.measured[shown] for one in found[: len(CONDITIONS)]}
+    draw_conditions(named, each, {CONTROL}, {FEW, ALL}, figure, shown)
+    return [*tables, summary, table, figure]
 
 
 def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tuple[float, float, float]]:
     """PSNR in dB against the recording, of the frames after the given ones: mean, low and high over trajectories."""
-    found = {}
+    found, recorded = {}, data["recorded"]
     for kind in ("generated", "shuffled"):
-        means = psnr(data[kind].images[:, given:], data["recorded"].images[:, given:]).mean(1)
-        names, each = np.full(len(means), kind), np.arange(len(means))
-        (interval,) = bootstrap_intervals(Panel(names, each, (means[None],), ((0,),)))
+        each = psnr(data[kind].images, recorded.images)
+        means = np.array([row[given:length].mean() for row, length in zip(each, recorded.lengths, strict=True)])
+        names, numbers = np.full(len(means), kind), np.arange(len(means))
+        (interval,) = bootstrap_intervals(Panel(names, numbers, (means[None],), ((0,),)))
         found[kind] = interval.mean, interval.low, interval.high
     return found
+
+
+def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
+    """Raises ConfigError for options that belong to the other kind of lessons."""
+    seeds = tuple(range(asked.seeds))
+    training = Training(seeds=seeds, steps=asked.steps, given=asked.given, with_given=asked.with_given)
+    scripted = {name: value for name in ("task", "frames", "starts") if (value := getattr(asked, name)) is not None}
+    if asked.actions is None:
+        settings = Settings(**vars(training), robot=asked.robot or Settings.robot, **scripted)
+        return ScriptedLessons(settings, simulator.robot(settings.robot), simulator.tokenizer.image_size)
+    require(not scripted, f"--{', --'.join(scripted)}: of the suite's tasks, not of recordings (--actions)")
+    use_entries(asked.registry)
+    robot = simulator.robot(asked.robot) if asked.robot else None
+    place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(asked.run).store
+    recorded, driven = open_trajectories(asked.actions, asked.split, *place)
+    return RecordedLessons(training, driven, recorded, open_trajectories(asked.actions, asked.held_out, *place)[0])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--robot", default=Settings.robot)
-    parser.add_argument("--task", default=Settings.task, help="hover, reach, or own: what its recordings do")
-    parser.add_argument("--frames", type=int, default=Settings.frames, help="of an episode")
-    parser.add_argument("--starts", type=int, default=Settings.starts)
-    parser.add_argument("--seeds", type=int, default=len(Settings.seeds), help="how many")
-    parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
-    parser.add_argument("--given", type=int, default=Settings.given, help="recorded frames that others begin with")
+    parser.add_argument("--actions", metavar="DATASET", help="recordings, as `hma generate` takes them")
+    parser.add_argument("--split", default="train", help="of DATASET, that policies are trained on")
+    parser.add_argument("--held-out", default="val", metavar="SPLIT", help="of DATASET, that they are judged on")
+    parser.add_argument("--registry", type=Path, metavar="FILE", help="TOML file with entries of your own")
+    parser.add_argument("--robot", help=f"of the model; DATASET's, or {Settings.robot}")
+    parser.add_argument("--task", help=f"hover, reach, or own: what its recordings do ({Settings.task})")
+    parser.add_argument("--frames", type=int, help=f"of an episode ({Settings.frames})")
+    parser.add_argument("--starts", type=int, help=f"in the true simulator ({Settings.starts})")
+    parser.add_argument("--seeds", type=int, default=len(Training.seeds), help="how many")
+    parser.add_argument("--steps", type=int, default=Training.steps, help="of training, of every policy")
+    parser.add_argument("--given", type=int, default=Training.given, help="recorded frames that others begin with")
     parser.add_argument("--with-given", action="store_true", help="train on these, too")
-    asked = vars(parser.parse_args())
-    run, out, seeds = asked.pop("run"), asked.pop("out"), tuple(range(asked.pop("seeds")))
-    settings = Settings(seeds=seeds, **asked)
+    asked = parser.parse_args()
+    run, out = asked.run, asked.out
     simulator = load_simulator(run, episodes=BATCH, history=1)
-    stride = simulator.robot(settings.robot).stride  # a mistyped name claims nothing
-    settings.make_task()
+    lessons = find_lessons(asked, simulator)  # a mistyped name claims nothing
+    settings = lessons.settings
     claim(out, run, simulator.model.params, asdict(settings), grows=("seeds",))
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
-    data = make_data(settings, simulator, out)
+    data = make_data(lessons, simulator, out)
     trials: Trials = {}
     first = sorted(range(len(CONDITIONS)), key=lambda i: i not in (FEW, ALL, MOST, CONTROL))  # what counts most
     jobs, pace = [(i, s) for i in first for s in settings.seeds], Pace()
@@ -244,12 +235,13 @@ def main() -> None:
             if not path.exists():
                 note = f"{CONDITIONS[i].name}, seed {seed}{pace(n, len(jobs))}"
                 report = lambda done, total, said, note=note, n=n: update(n, len(jobs), f"{note}: step {done}, {said}")
-                write_file(path, json.dumps(run_trial(settings, CONDITIONS[i], data, stride, seed, report)))
+                write_file(path, json.dumps(run_trial(lessons, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
-    write_results(settings, trials, quality_of(data, settings.given), out)
+    written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
     write_settings(out, run, simulator.model.params, asdict(settings))
-    draw_strips([data[kind].images[:2] for kind in KINDS], KINDS, out / "frames.png")
-    wrote(out / TRIALS, out / ERRORS, out / "summary.csv", out / "table.md", out / "synthetic.png", out / "frames.png")
+    shortest = data["recorded"].lengths[:2].min()
+    draw_strips([data[kind].images[:2, :shortest] for kind in KINDS], KINDS, out / "frames.png")
+    wrote(*written, out / "frames.png")
 
 
 if __name__ == "__main__":

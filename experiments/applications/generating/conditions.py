@@ -14,7 +14,8 @@ from experiments.analysis.intervals import Interval
 from experiments.applications.tables import write_table
 
 Trials = dict[tuple[int, int], dict[str, list[float]]]
-"""{(place of the condition, seed): {success and distance by start, error by held-out trajectory}}."""
+"""{(place of the condition, seed): {success and distance by start, where a simulator judged; error by held-out
+trajectory}}."""
 
 
 class Condition(NamedTuple):
@@ -70,22 +71,25 @@ class Summary(NamedTuple):
     """One condition, or how much of the gap from few to all recorded trajectories it closes."""
 
     name: str
-    success: Interval
-    error: Interval
+    measured: dict[str, Interval]  # success, where a simulator judged, and error
 
 
 def summarise(trials: Trials, seeds: tuple[int, ...]) -> list[Summary]:
     """Every condition; then which share of the gap 90 generated trajectories close, and 90 of the control."""
-    panels = [make_panel(trials, seeds, what) for what in ("success", "error")]
-    found = [Summary(c.name, *both) for c, *both in zip(CONDITIONS, *map(bootstrap_intervals, panels), strict=True)]
+    panels = {what: make_panel(trials, seeds, what) for what in ("success", "error") if what in trials[FEW, seeds[0]]}
+    found = {what: bootstrap_intervals(panel) for what, panel in panels.items()}
+    summaries = [Summary(c.name, {what: each[i] for what, each in found.items()}) for i, c in enumerate(CONDITIONS)]
     for name, at in (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL)):
-        found.append(Summary(name, *(share_closed(panel, at) for panel in panels)))
-    return found
+        summaries.append(Summary(name, {what: share_closed(panel, at) for what, panel in panels.items()}))
+    return summaries
 
 
-def write_tables(trials: Trials, seeds: tuple[int, ...], out: Path) -> None:
-    """All outcomes, as `read_trials` reads them."""
+def write_tables(trials: Trials, seeds: tuple[int, ...], out: Path) -> list[Path]:
+    """All outcomes, as `read_trials` reads them. Returns what it wrote."""
+    written = []
     for path, names, what in ((TRIALS, STARTS, ("success", "distance")), (ERRORS, HELD_OUT, ("error",))):
+        if what[0] not in trials[FEW, seeds[0]]:
+            continue
         rows = [
             [c.name, s, k, *(round(value, 5) for value in values)]
             for i, c in enumerate(CONDITIONS)
@@ -94,24 +98,35 @@ def write_tables(trials: Trials, seeds: tuple[int, ...], out: Path) -> None:
             for k, values in enumerate(zip(*(trials[i, s][name] for name in what), strict=True))
         ]
         write_table(out / path, names, rows)
+        written.append(out / path)
+    return written
 
 
 def markdown(found: Sequence[Summary]) -> str:
     """The table that docs/generating.md shows; an interval of a rate ends at 0 and 1."""
-    lines = ["| trained on | success | 95 % interval | action error | 95 % interval |", "|---|---|---|---|---|"]
+    titles, digits = {"success": "success", "error": "action error"}, {"success": 2, "error": 3}
+    measured = found[0].measured
+    lines = [f"| trained on | {' | '.join(f'{titles[what]} | 95 % interval' for what in measured)} |"]
+    lines.append(f"|{'---|' * (1 + 2 * len(measured))}")
     for one in found:
-        low, high = one.success.low, one.success.high
-        if not one.name.startswith("share"):
-            low, high = max(low, 0.0), min(high, 1.0)
-        error = f"{one.error.mean:.3f} | {one.error.low:.3f} to {one.error.high:.3f}"
-        lines.append(f"| {one.name} | {one.success.mean:.2f} | {low:.2f} to {high:.2f} | {error} |")
+        cells = [one.name]
+        for what, r in one.measured.items():
+            low, high = r.low, r.high
+            if what == "success" and not one.name.startswith("share"):
+                low, high = max(low, 0.0), min(high, 1.0)
+            n = digits[what]
+            cells += [f"{r.mean:.{n}f}", f"{low:.{n}f} to {high:.{n}f}"]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def read_trials(directory: Path) -> Trials:
-    """What the tables say: {(place of the condition, seed): {success, distance, error}}."""
+    """What the tables say: {(place of the condition, seed): {success, distance, error}}; without the first two where
+    no simulator judged."""
     places, trials = {c.name: i for i, c in enumerate(CONDITIONS)}, {}
     for path, what in ((TRIALS, ("success", "distance")), (ERRORS, ("error",))):
+        if not (directory / path).exists():
+            continue
         with open(directory / path, newline="") as file:
             for row in csv.DictReader(file):
                 one = trials.setdefault((places[row["condition"]], int(row["seed"])), {})

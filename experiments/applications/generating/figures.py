@@ -20,13 +20,15 @@ def draw_conditions(
     control: Collection[int],
     ends: Collection[int],
     path: Path,
+    what: str,
 ) -> None:
-    """Success by condition: a bar with its interval, a dot for every seed. `control` and `ends`: places of those that
+    """Success or action error by condition: a bar with its interval, a dot for every seed. `control` and `ends`: places of those that
     are not trained on generated trajectories."""
+    most, label = {"success": (1, "success in the true simulator"), "error": (None, "action error, held out")}[what]
     with plt.rc_context(STYLE):
         figure, panel = plt.subplots(figsize=(7.2, 3.4), layout="constrained")
         places, mean = np.arange(len(found)), np.array([r.mean for r in found.values()])
-        low, high = (np.clip([getattr(r, end) for r in found.values()], 0, 1) for end in ("low", "high"))
+        low, high = (np.clip([getattr(r, end) for r in found.values()], 0, most) for end in ("low", "high"))
         colours = [
             COLOURS["delta_psnr"] if i in control else MUTED if i in ends else COLOURS["perplexity"] for i in places
         ]
@@ -35,7 +37,7 @@ def draw_conditions(
         for i, means in zip(places, seeds, strict=True):
             panel.plot(np.full(len(means), i + 0.2), means, "o", color=INK, markersize=3)
         panel.set_xticks(places, [name.replace(" generated", "\ngenerated").replace(", ", ",\n") for name in found])
-        panel.set(ylim=(0, 1), ylabel="success in the true simulator")
+        panel.set(ylim=(0, most), ylabel=label)
         panel.grid(False, axis="x")
         save(figure, path)
 

@@ -3,22 +3,41 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.applications import SHIPPED, plan_actions
+from data_pipelines.suite.generate import generate_suite
+from experiments.applications import SHIPPED, plan_actions, synthetic
 from experiments.applications.generating import conditions
-from experiments.applications.generating.conditions import ALL, CONDITIONS, CONTROL, FEW, MOST, share_closed
+from experiments.applications.generating.conditions import (
+    ALL,
+    CONDITIONS,
+    CONTROL,
+    FEW,
+    MOST,
+    Condition,
+    share_closed,
+)
+from experiments.applications.generating.lessons import RecordedLessons, Settings, Training, others_actions
+from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.made_with import hash_of
 from experiments.applications.plan_actions import decided
+from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.tasks import find_task
-from experiments.applications.synthetic import Settings, choose
+from experiments.applications.simulators import load_simulator
+from experiments.applications.synthetic import choose, make_data, run_trial
+from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict
+from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_model
+from tests.experiments.applications.runs import TABLE, make_run
 
 ROOT = Path(__file__).parents[3]
 RESULTS = ROOT / "experiments" / "results"
@@ -62,6 +81,68 @@ def test_the_share_of_the_gap_is_that_of_the_means():
     share, control = share_closed(panel, MOST), share_closed(panel, CONTROL)
     assert share.mean == pytest.approx(0.83, abs=0.08) and share.low < 0.83 < share.high < share.low + 0.4
     assert control.high < share.low
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    """Some recorded episodes of pusher_sand, four of them held out."""
+    (directory,) = generate_suite(tmp_path_factory.mktemp("suite"), scale=0.01, validation=4, names=["pusher_sand"])
+    return str(directory)
+
+
+def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordings, tmp_path, monkeypatch):
+    encoder = EncoderConfig(size=8, channels=(4, 4, 4), hidden=8)
+    monkeypatch.setattr(synthetic, "BcConfig", partial(BcConfig, encoder=encoder))
+    run = make_run(tmp_path / "study")
+    simulator, robot = load_simulator(run, episodes=2, history=1), Robot.of(TABLE.entries[0])
+    train, val = (
+        open_trajectories(recordings, split, robot, {}, simulator.tokenizer, tmp_path)[0] for split in ("train", "val")
+    )
+    lessons = RecordedLessons(Training(trajectories=5, seeds=(0,), steps=2, given=2), robot, train, val)
+    data = make_data(lessons, simulator, tmp_path)
+    recorded, generated = data["recorded"], data["generated"]
+    for i in range(5):
+        length = len(train[i])
+        assert recorded.lengths[i] == length
+        np.testing.assert_array_equal(recorded.images[i, :length], train[i].images)
+        low, high = np.array(robot.low * robot.stride), np.array(robot.high * robot.stride)
+        whole = train[i].chunks.reshape(length, -1)  # an action is the whole chunk, as it was executed
+        np.testing.assert_allclose(recorded.actions[i, :length], np.clip(whole, low, high), rtol=1e-6)
+        np.testing.assert_array_equal(generated.images[i, :2], train[i].images[:2])
+        assert (generated.images[i, 2:length] != train[i].images[2:]).any((1, 2, 3)).all()
+        assert not generated.images[i, length:].any()
+    assert (data["shuffled"].images != generated.images).any()
+    np.testing.assert_array_equal(data["shuffled"].actions, recorded.actions)
+    assert len(data["held_out"]) == 4
+
+    found = run_trial(lessons, Condition("", 2, 3), data, 0, lambda *_: None)
+    assert set(found) == {"error"} and len(found["error"]) == 4
+    trials = {(i, 0): {"error": [round((6 - i) * e, 5) for e in found["error"]]} for i in range(len(CONDITIONS))}
+    synthetic.write_results((0,), trials, synthetic.quality_of(data, 2), tmp_path)
+    assert conditions.read_trials(tmp_path) == trials and not (tmp_path / conditions.TRIALS).exists()
+    assert "success" not in (tmp_path / "table.md").read_text()
+
+
+def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(recordings, tmp_path, monkeypatch):
+    run, out = make_run(tmp_path / "study"), tmp_path / "out"
+    asked = ["synthetic", str(run), "--actions", recordings, "--out", str(out)]
+    for more, said in (
+        ([], "split train, has [0-9]+ trajectories longer than 1 frame.*, 100 are needed"),
+        (["--held-out", "train"], "judged on what they were trained on, split train"),
+        (["--starts", "3"], "--starts: of the suite's tasks, not of recordings"),
+        (["--robot", "gripper_wood"], "2 action values, gripper_wood takes 4"),
+    ):
+        monkeypatch.setattr(sys, "argv", [*asked, *more])
+        with pytest.raises(ConfigError, match=said):
+            synthetic.main()
+        assert not out.exists()
+
+
+def test_other_actions_are_another_trajectorys_and_a_shorter_ones_last_is_held():
+    demos = demonstrations(0, 3)
+    demos = Demonstrations(**{**vars(demos), "actions": demos.actions + np.arange(3)[:, None] / 10})
+    demos.lengths[2] = 2
+    np.testing.assert_allclose(others_actions(demos)[..., 0], [[2, 2.1, 2.1], [0, 0.1, 0.2], [1, 1.1, 1.2]], rtol=1e-6)
 
 
 def test_an_episode_ends_when_nothing_can_change_its_outcome():

@@ -1,0 +1,175 @@
+"""Whose trajectories policies learn from, and what judges the policies: a scripted expert and the true simulator, or
+recordings and nothing but held-out recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from experiments.applications.generating.source import confined
+from experiments.applications.generating.trajectories import Trajectories, Trajectory, describe
+from experiments.applications.policies.closed_loop import MOST_TRIED, away_at_start, run_policy, start_seeds
+from experiments.applications.policies.demonstrations import Demonstrations, record
+from experiments.applications.policies.policy import Policy
+from experiments.applications.policies.tasks import Task, find_task
+from hma_jax.config import require
+from hma_jax.simulator.robots import Robot
+
+
+@dataclass(frozen=True)
+class Training:
+    """How policies are trained, on how much; besides the world model and the lessons all that results depend on."""
+
+    trajectories: int = 100
+    seeds: tuple[int, ...] = (0, 1, 2)
+    steps: int = 2000  # of training, of every policy
+    batch: int = 32
+    learning_rate: float = 2e-3
+    given: int = 1  # recorded frames that a generated trajectory begins with
+    with_given: bool = False  # policies are trained on these, too
+
+
+@dataclass(frozen=True)
+class Settings(Training):
+    """A scripted expert's task."""
+
+    robot: str = "gripper_wood"
+    task: str = "hover"
+    frames: int = 14
+    hold: int = 6  # frames in a row at the goal, for success
+    least: float = 0.5  # from the goal, that an episode begins, in halves of the floor's side
+    noise: float = 0.05  # of the expert
+    starts: int = 200
+
+    def make_task(self) -> Task:
+        return find_task(self.robot, self.task, self.frames, self.hold)
+
+
+@dataclass(frozen=True)
+class RecordedSettings(Training):
+    """Recordings, told from others by `describe`."""
+
+    robot: str = ""
+    recordings: dict[str, Any] | None = None
+    held_out: dict[str, Any] | None = None
+
+
+class Lessons(Protocol):
+    """`record` gives as many trajectories as policies are trained on, `record_held_out` others to judge their actions
+    on; `judge` gives {what: a number for every start} of a policy in closed loop, nothing where no simulator can."""
+
+    settings: Training
+    robot: Robot
+
+    def record(self) -> Demonstrations: ...
+
+    def record_held_out(self) -> Demonstrations: ...
+
+    def judge(self, policy: Policy) -> dict[str, list[float]]: ...
+
+
+class ScriptedLessons:
+    """Successes of the expert that begin far enough from the goal; the true simulator judges."""
+
+    def __init__(self, settings: Settings, robot: Robot, image_size: int):
+        self.settings, self.robot, self._size, self._task = settings, robot, image_size, settings.make_task()
+
+    def record(self) -> Demonstrations:
+        return self._record(seed=0)
+
+    def record_held_out(self) -> Demonstrations:
+        return self._record(seed=1)
+
+    def _record(self, seed: int) -> Demonstrations:
+        settings, task = self.settings, self._task
+        count = MOST_TRIED * settings.trajectories
+        how = {"noise": settings.noise, "only_successes": True, "stride": self.robot.stride, "image_size": self._size}
+        made = record(task, count, seed=seed, **how)
+        far = np.flatnonzero(away_at_start(task, made.seeds) >= settings.least)[: settings.trajectories]
+        enough = len(far) == settings.trajectories
+        require(enough, f"{task.robot}: hardly an episode begins {settings.least:g} from its goal")
+        return made.take(far)
+
+    def judge(self, policy: Policy) -> dict[str, list[float]]:
+        starts = start_seeds(self._task, self.settings.starts, least=self.settings.least)
+        found = run_policy(self._task, policy, starts, self._size, self.robot.stride)
+        return {"success": found.success.astype(int).tolist(), "distance": np.round(found.distance, 4).tolist()}
+
+
+class RecordedLessons:
+    """The first recordings that are longer than the given frames, with actions as the simulator executes them, and at
+    most as many held-out ones."""
+
+    def __init__(self, training: Training, robot: Robot, recorded: Trajectories, held_out: Trajectories):
+        """Raises ConfigError for too few recordings, and for a split that would be judged on itself."""
+        require(
+            (recorded.fingerprint, recorded.split) != (held_out.fingerprint, held_out.split),
+            f"{recorded.name}: policies would be judged on what they were trained on, split {recorded.split}; name "
+            "another one with --held-out",
+        )
+        _require_enough(recorded, len(recorded), training)
+        self.robot, self._recorded, self._held_out = robot, recorded, held_out
+        about = {"recordings": describe(recorded), "held_out": describe(held_out)}
+        self.settings = RecordedSettings(**vars(training), robot=robot.name, **about)
+
+    def record(self) -> Demonstrations:
+        found = self._first(self._recorded, self.settings.trajectories)
+        _require_enough(self._recorded, len(found), self.settings)
+        return as_demonstrations([confined(t, self.robot) for t in found])
+
+    def record_held_out(self) -> Demonstrations:
+        found = self._first(self._held_out, self.settings.trajectories)
+        require(bool(found), f"{self._held_out.name}, split {self._held_out.split}, has no trajectory to judge on")
+        return as_demonstrations(found)
+
+    def _first(self, trajectories: Trajectories, count: int) -> list[Trajectory]:
+        found = []
+        for i in range(len(trajectories)):
+            if len(found) == count:
+                break
+            one = trajectories[i]
+            if len(one) > self.settings.given:
+                found.append(one)
+        return found
+
+    def judge(self, policy: Policy) -> dict[str, list[float]]:
+        return {}
+
+
+def _require_enough(recorded: Trajectories, count: int, training: Training) -> None:
+    wanted = training.trajectories
+    require(
+        count >= wanted,
+        f"{recorded.name}, split {recorded.split}, has {count} trajectories longer than {training.given} frame(s), "
+        f"{wanted} are needed",
+    )
+
+
+def as_demonstrations(trajectories: list[Trajectory]) -> Demonstrations:
+    """An action is the whole chunk of its frame, [stride * A]. Nobody knows whether they succeeded."""
+    count, longest = len(trajectories), max(map(len, trajectories))
+    images = np.zeros((count, longest, *trajectories[0].images.shape[1:]), np.uint8)
+    actions = np.zeros((count, longest, trajectories[0].chunks[0].size), np.float32)
+    for i, one in enumerate(trajectories):
+        images[i, : len(one)], actions[i, : len(one)] = one.images, one.chunks.reshape(len(one), -1)
+    lengths, unknown = np.array([len(t) for t in trajectories]), np.zeros((count, longest), bool)
+    return Demonstrations(images, actions, lengths, unknown, unknown[:, 0], np.full(count, -1))
+
+
+def as_trajectories(demos: Demonstrations, robot: Robot) -> list[Trajectory]:
+    """With the chunks that a demonstration's actions stand for: whole ones, or an action that is held."""
+    found = []
+    for i, length in enumerate(demos.lengths):
+        acted = demos.actions[i, :length]
+        whole = acted.shape[1] == robot.stride * robot.action_dim
+        chunks = acted.reshape(length, robot.stride, -1) if whole else np.repeat(acted[:, None], robot.stride, 1)
+        found.append(Trajectory(str(i), demos.images[i, :length], chunks))
+    return found
+
+
+def others_actions(demos: Demonstrations) -> np.ndarray:
+    """float32 [N, L, A]: of every trajectory the one's before it; of a shorter one the last action is held."""
+    at = np.minimum(np.arange(demos.actions.shape[1]), np.roll(demos.lengths, 1)[:, None] - 1)
+    return np.take_along_axis(np.roll(demos.actions, 1, 0), at[..., None], 1)
