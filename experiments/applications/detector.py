@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import sys
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -31,6 +32,7 @@ from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.tables import write_rows
+from experiments.boundary import guarded
 from experiments.progress import step
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
@@ -238,4 +240,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

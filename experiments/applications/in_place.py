@@ -12,6 +12,7 @@ this much. Writes DIR/in_place.csv, a row for each thing that is seen at the end
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from experiments.applications.made_with import claim
 from experiments.applications.scenes import Points, point_names, points_of
 from experiments.applications.simulators import START_FRAMES, held_out, load_simulator, true_simulator
 from experiments.applications.tables import write_rows
+from experiments.boundary import guarded
 from experiments.progress import console, step
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig
@@ -118,4 +120,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

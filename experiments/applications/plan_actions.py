@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -53,6 +54,7 @@ from experiments.applications.policies.scripted import make_expert, noisy
 from experiments.applications.policies.tasks import Task, find_task, held, world_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
+from experiments.boundary import guarded
 from experiments.progress import Pace, step
 from experiments.wrote import wrote
 from hma_jax.config import require
@@ -258,4 +260,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

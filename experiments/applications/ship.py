@@ -18,6 +18,7 @@ import argparse
 import io
 import json
 import shutil
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -32,6 +33,7 @@ from data_pipelines.publishing.files import publish, write_file
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.applications import SHIPPED
 from experiments.applications.simulators import held_out, load_simulator, true_simulator
+from experiments.boundary import guarded
 from experiments.running.machine import describe_machine
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
@@ -193,4 +195,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -71,6 +72,7 @@ from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
+from experiments.boundary import guarded
 from experiments.progress import Pace, step
 from experiments.running.workspace import Workspace
 from experiments.setting import use_entries
@@ -245,4 +247,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

@@ -42,12 +42,3 @@ class Hosts:
         from hma_jax.runtime.processes import is_writer
 
         console.quiet = not is_writer()
-
-
-def end_together(error: BaseException | None = None, code: int = 0, show: bool = False) -> None:
-    """At the end of the program; a process by itself just ends."""
-    from hma_jax.runtime.processes import end
-    from hma_jax.training.loop import Interrupted
-
-    # A stop that was asked for is one of all processes, after the same step.
-    end(None if isinstance(error, Interrupted) else error, code, show)

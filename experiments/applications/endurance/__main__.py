@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.made_with import claim
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
+from experiments.boundary import guarded
 from experiments.progress import console, step
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require
@@ -122,4 +124,4 @@ def show(rows: list[Row]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

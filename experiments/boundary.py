@@ -1,0 +1,97 @@
+"""The boundary of a program: what an error becomes. Exit codes are those of `hma_jax.runtime.exits`."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable
+
+from experiments.progress import errors
+from experiments.run_study import TrialsFailed
+from hma_jax.config import ConfigError
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
+
+
+def guarded(work: Callable[[], None], debug: bool = False, own_process: bool = True) -> int:
+    """Does `work` and returns the exit code; what a user can mend is one message on stderr, with `debug` or HMA_DEBUG=1
+    a traceback, as of a bug. `own_process`: the process has nothing else to do."""
+    debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
+    if own_process and not debug:
+        _silence_background()
+    try:
+        with terminated_like_interrupted():
+            work()
+            _end_together()
+        return Exit.DONE
+    except KeyboardInterrupt as request:
+        code = exit_of_interrupt(request)
+        _say(f"{'stopped by SIGTERM' if code == Exit.STOPPED else 'interrupted'}; the same command goes on from here")
+        _end_together(request, code)
+        return code
+    except Exception as error:  # the boundary of the program
+        code = _exit_code(error)
+        if debug or code is None:
+            _end_together(error, code or Exit.FAILED, show=True)
+            raise
+        _say(f"error: {_words(error)}")
+        _end_together(error, code)
+        return code
+
+
+def _end_together(error: BaseException | None = None, code: int = Exit.DONE, show: bool = False) -> None:
+    """With other processes, where there are any: none is left waiting for one that ends."""
+    if "hma_jax.runtime.processes" not in sys.modules:  # none was started
+        return
+    from hma_jax.runtime.processes import end
+    from hma_jax.training.loop import Interrupted
+
+    # A stop that was asked for is one of all processes, after the same step.
+    end(None if isinstance(error, Interrupted) else error, code, show)
+
+
+def _silence_background() -> None:
+    """For the rest of this process: reader tasks of a checkpoint that turns out damaged report it in
+    pages of their own, from threads and destructors where nothing can catch it, until the very
+    end. The error message says it once.
+    """
+    sys.unraisablehook = lambda _: None
+    warnings.filterwarnings("ignore", "coroutine .* was never awaited", RuntimeWarning)
+    logging.getLogger("asyncio").setLevel(logging.CRITICAL)
+
+
+def _exit_code(error: Exception) -> Exit | None:
+    """None for what is not the user's business: a bug, shown with its traceback."""
+    from data_pipelines.errors import DataError
+
+    if isinstance(error, ConfigError):
+        return Exit.REFUSED
+    if isinstance(error, (DataError, TrialsFailed, OSError)):
+        return Exit.FAILED
+    if "jax" in sys.modules:  # otherwise none of these can have been raised
+        from hma_jax.training.divergence import DivergedError
+        from hma_jax.training.loop import Interrupted
+
+        if isinstance(error, DivergedError):
+            return Exit.DIVERGED
+        if isinstance(error, Interrupted):
+            return error.exit
+    return None
+
+
+def _words(error: Exception) -> str:
+    """The message of an error, and what it cannot know: how its advice is followed from here."""
+    from data_pipelines.errors import EpisodeError
+
+    if isinstance(error, EpisodeError):
+        return f"{error} (Here: --set store.corrupt=skip.)"
+    if isinstance(error, OSError) and error.strerror:
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
+    return str(error)
+
+
+def _say(message: str) -> None:
+    errors.print(message, markup=False, soft_wrap=True)
+
