@@ -22,7 +22,11 @@ from experiments.presets import get_preset
 from experiments.study import override
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "experiments" / "results").glob("*/findings.md")),
+]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"(?<!`)`((?:hma|make|python -m)\b[^`]*)`(?!`)")
 STARTS = ("hma", "make", "pip", "python")

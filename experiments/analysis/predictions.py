@@ -25,9 +25,6 @@ from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.evaluation.windows import WindowTable
 
-FOLDER = "predictions"
-"""Where a study keeps them."""
-
 
 @dataclass(frozen=True)
 class Prediction:

@@ -71,7 +71,7 @@ def _words(fitted: Fitted) -> tuple[str, str, str]:
 
 
 def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]) -> None:
-    from experiments.analysis.predictions import FOLDER, predict, save_prediction
+    from experiments.analysis.predictions import predict, save_prediction
     from experiments.analysis.scaling import curves_of
     from experiments.report.numbers import read_results, result_hashes
     from experiments.running.attempts import read_states
@@ -114,7 +114,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     curve = next(c for c in curves if c.name.split("-")[0] == name)
     places = [p for p in curve.places if p.trial in ids]
     prediction = predict(curve, places, windows, result_hashes(results))
-    path = out or workspace.root / FOLDER / f"{curve.name}-{text}.json"
+    path = out or workspace.predictions / f"{curve.name}-{text}.json"
     save_prediction(path, prediction)
     console.print(
         f"{curve.name} at {prediction.x[0]:,.0f} {curve.axes[0]}: {prediction.mean:.4f} nats per token, "

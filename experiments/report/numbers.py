@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments.analysis.fits import DRAWS
 from experiments.analysis.isoflop import IsoFlop
-from experiments.analysis.predictions import FOLDER, Outcome, compare, load_predictions
+from experiments.analysis.predictions import Outcome, compare, load_predictions
 from experiments.analysis.scaling import Fitted, curves_of, fit_budgets, fit_study
 from experiments.running.provenance import Provenance
 from experiments.running.sealed import RESULT, read_result
@@ -52,7 +52,7 @@ def compute_numbers(
     flops = {id: float(result["train_flops"]) for id, result in results.items()}
     _, isoflop = fit_budgets(sweeps, provenance, windows, flops, draws)
     hashes, curves = result_hashes(results), curves_of(sweeps, provenance)
-    predictions = load_predictions(workspace.root / FOLDER).values()
+    predictions = load_predictions(workspace.predictions).values()
     outcomes = [compare(p, curves, windows, hashes) for p in predictions]
     return Numbers(results, windows, fit_study(sweeps, provenance, windows, draws), isoflop, outcomes)
 

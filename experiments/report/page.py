@@ -14,8 +14,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from experiments.analysis.preregistered import FILE as PREREGISTERED
+from experiments.analysis.preregistered import Came, read_expected, what_came
 from experiments.optima import Optimum
 from experiments.report.clips import describe_clips
+from experiments.report.findings import Findings, describe_expected, read_findings
 from experiments.report.fits import describe_fits
 from experiments.report.numbers import Numbers
 from experiments.report.pieces import card, picture, section, table
@@ -60,11 +63,14 @@ def write_report(
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
     checks = check_study(sweeps, rows, optima, states, robots if shown else [], numbers.outcomes, checked, vocabulary)
+    findings = read_findings(workspace.findings, [s.name for s in sweeps])
+    came = what_came(read_expected(workspace.predictions / PREREGISTERED), rows)
     body = [
         _headline(workspace, record, sweeps, rows, states, shown_by, result),
         draw_box(checks),
-        *_curves(workspace, sweeps, rows, optima, along),
+        *_curves(workspace, sweeps, rows, optima, along, came, findings),
         _fits(workspace, numbers),
+        findings.rest,
         _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
         section("Robots, the most controllable first", describe_robots(
             rows, shown_by, robots, workspace.data_summary
@@ -151,18 +157,28 @@ def _curves(
     rows: Sequence[Row],
     optima: Sequence[Optimum],
     along: Along,
+    came: Sequence[Came],
+    findings: Findings,
 ) -> list[str]:
-    """A section for the scaling curves, which share a figure, and one for each other sweep."""
+    """A section for the scaling curves, which share a figure, and one for each other sweep.
+
+    Of each its numbers, what was expected of it and what its author makes of it.
+    """
+
+    def say(sweep: Sweep) -> str:
+        said = findings.of_axes.get(sweep.name, "")
+        return describe(sweep, rows, optima, along) + describe_expected(sweep, came) + said
+
     sections = []
     scaling = [s for s in sweeps if s.scaling]
     if scaling:
         overview = picture(workspace.figures / "scaling.png", "Scaling curves")
-        sections.append(section("Scaling curves", overview, *(describe(s, rows, optima, along) for s in scaling)))
+        sections.append(section("Scaling curves", overview, *(say(s) for s in scaling)))
     for sweep in sweeps:
         if not sweep.scaling:
             title = sweep.title or sweep.axis.capitalize()
             figure = picture(workspace.figures / f"{sweep.name}.png", title)
-            sections.append(section(title, figure, describe(sweep, rows, optima, along)))
+            sections.append(section(title, figure, say(sweep)))
     return sections
 
 

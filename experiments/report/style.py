@@ -26,7 +26,9 @@ p { margin: .4rem 0 .8rem; max-width: 46rem; }
 table { border-collapse: collapse; font-size: .88rem; font-variant-numeric: tabular-nums; margin: .5rem 0 .8rem; }
 th, td { text-align: right; padding: .28rem .8rem; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { color: var(--muted); font-weight: 500; }
-th.text, td.text { text-align: left; } th:first-child, td:first-child { padding-left: 0; }
+th.text, td.text { text-align: left; }
+.findings th:first-child, .findings td:first-child { text-align: left; }
+.findings ul { max-width: 46rem; padding-left: 1.2rem; } .findings li { margin: .35rem 0; } th:first-child, td:first-child { padding-left: 0; }
 td:nth-child(3).text { white-space: normal; min-width: 8rem; }
 .finished { color: var(--good); } .failed, .diverged { color: var(--bad); font-weight: 600; }
 .missing, .interrupted { color: var(--muted); }

@@ -26,7 +26,7 @@ class Busy(Held):
 
 @dataclass(frozen=True)
 class Workspace:
-    """Paths under `root`. Deleting any of them is safe: the next run makes it again."""
+    """Paths under `root`. Deleting any of them is safe, the next run makes it again, but for predictions and findings."""
 
     root: Path
 
@@ -118,6 +118,16 @@ class Workspace:
     def fits(self) -> Path:
         """Coefficients of scaling fits."""
         return self.root / "fits.csv"
+
+    @property
+    def predictions(self) -> Path:
+        """What was said of trials before they ran."""
+        return self.root / "predictions"
+
+    @property
+    def findings(self) -> Path:
+        """What the study's author makes of its axes, for the page."""
+        return self.root / "findings.md"
 
     @property
     def figures(self) -> Path:

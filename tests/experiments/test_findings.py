@@ -1,4 +1,4 @@
-"""What docs/designs.md and README say of cpu-full's axes follows from what is kept of its trials."""
+"""What findings.md and README say of cpu-full's axes follows from what is kept of its trials."""
 
 import csv
 import json
@@ -9,20 +9,22 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.embodiments import TRAINED
+from experiments.analysis.preregistered import FILE, read_expected
 from experiments.report.robots import robots_of
 from experiments.rows import OVERALL, curve, difference, read_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT
-from hma_jax.evaluation.windows import FILE, WindowTable
+from hma_jax.evaluation.windows import FILE as WINDOWS
+from hma_jax.evaluation.windows import WindowTable
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "experiments" / "results"
 
 
-def designs_page() -> str:
-    return (ROOT / "docs/designs.md").read_text()
+def findings(study: str = "cpu-full") -> str:
+    return (RESULTS / study / "findings.md").read_text()
 
 
 def readme() -> str:
@@ -30,11 +32,11 @@ def readme() -> str:
     return " ".join((ROOT / "README.md").read_text().split())
 
 
-def test_the_first_axis_by_how_much_data_a_robot_has_is_as_the_page_on_designs_says():
+def test_the_first_axis_by_how_much_data_a_robot_has_is_as_its_findings_say():
     folder = RESULTS / "cpu-full-horizon"
     windows = {name: d["windows"] for name, d in json.loads((folder / "data.json").read_text()).items()}
     rows = [r for r in read_rows(Workspace(folder)) if r.metric == "cross_entropy" and r.role == "point"]
-    page = designs_page()
+    page = findings("cpu-full-horizon")
     for least, most in ((0, 400), (400, 2000), (2000, 10**9)):
         mine = [r for r in rows if least <= windows.get(r.scope, -1) < most]
         means = [np.mean([r.mean for r in mine if r.x == n]) for n in (500, 1000, 2000, 4000, 8000, 16_000)]
@@ -43,13 +45,13 @@ def test_the_first_axis_by_how_much_data_a_robot_has_is_as_the_page_on_designs_s
 
 
 def horizon_rows() -> list[str]:
-    """The lines of docs/designs.md on the axis `horizon` of cpu-full, from every window's numbers."""
+    """The lines of findings.md on the axis `horizon` of cpu-full, from every window's numbers."""
     workspace = Workspace(RESULTS / "cpu-full")
     record = load_record(workspace)
     (sweep,) = plan_sweeps(record.study, ("horizon",))
     acting = {e.name for e in TRAINED if not e.video_only}
     ids = {trial_id(p.trial, record.provenance): p for p in sweep.points if p.role == POINT}
-    windows = {id: WindowTable.load(workspace.trials / id / FILE) for id in ids}
+    windows = {id: WindowTable.load(workspace.trials / id / WINDOWS) for id in ids}
     lines = []
     for x in sorted({p.x for p in ids.values()}):
         tables = [windows[id] for id, p in ids.items() if p.x == x]
@@ -69,8 +71,8 @@ def horizon_rows() -> list[str]:
     return lines
 
 
-def test_the_axis_horizon_is_as_the_page_on_designs_says():
-    page, lines = designs_page(), horizon_rows()
+def test_the_axis_horizon_is_as_findings_say():
+    page, lines = findings(), horizon_rows()
     for line in lines:
         assert line in page, line
     of_steps = next(line for line in lines if "| 16,000 |" in line).strip("| ").split(" | ")
@@ -84,7 +86,7 @@ def test_the_axis_horizon_is_as_the_page_on_designs_says():
 
 
 def rates_rows() -> list[str]:
-    """The lines of docs/designs.md on the axis `lr` of cpu-full, of held-out nats."""
+    """The lines of findings.md on the axis `lr` of cpu-full, of held-out nats."""
     with open(RESULTS / "cpu-full" / "optima.csv", newline="") as file:
         found = [r for r in csv.DictReader(file) if (r["sweep"], r["metric"]) == ("lr", "cross_entropy")]
     lines = []
@@ -99,8 +101,8 @@ def rates_rows() -> list[str]:
     return lines
 
 
-def test_the_axis_lr_is_as_the_page_on_designs_says():
-    page, lines = designs_page(), rates_rows()
+def test_the_axis_lr_is_as_findings_say():
+    page, lines = findings(), rates_rows()
     assert len(lines) == 6
     for line in lines:
         assert line in page, line
@@ -112,7 +114,7 @@ def test_the_axis_lr_is_as_the_page_on_designs_says():
 
 
 def axis_rows(sweep: str) -> list[str]:
-    """The lines of docs/designs.md on one of the axes of cpu-full over a number: means over seeds and judged robots."""
+    """The lines of findings.md on one of the axes of cpu-full over a number: means over seeds and judged robots."""
     rows, digits = read_rows(Workspace(RESULTS / "cpu-full")), (3, 2, 2, 2)
     lines = []
     for role in (POINT, CONTROL):
@@ -157,11 +159,15 @@ def exponents() -> list[float]:
     return found
 
 
-def test_what_sharing_and_company_cost_is_as_the_page_on_designs_says():
-    found, page = gains(), designs_page().splitlines()
+def test_what_sharing_and_company_cost_is_as_findings_say():
+    found, page = gains(), findings().splitlines()
+    expected = {(e.sweep, e.x): e for e in read_expected(RESULTS / "cpu-full" / "predictions" / FILE)}
     for count in (5, 10, 20):
-        came = [f"**{found[sweep][count]}**" for sweep in ("dilution", "transfer")]
-        assert any(line.startswith(f"| {count} |") and all(x in line for x in came) for line in page), (count, came)
+        cells = [str(count)]
+        for sweep in ("dilution", "transfer"):
+            e = expected[sweep, str(count)]
+            cells += [f"{e.mean:+.2f} ({e.low:+.2f} to {e.high:+.2f})", f"**{found[sweep][count]}**"]
+        assert f"| {' | '.join(cells)} |" in page, cells
     a = exponents()
     said = f"a = {min(a):.1f} to {max(a):.1f}, {np.mean(a):.1f} on average"
     assert said in " ".join(" ".join(page).split()), said
@@ -181,15 +187,15 @@ def test_what_was_found_is_as_readme_says():
 
 
 @pytest.mark.parametrize("sweep", ["width", "dilution", "transfer"])
-def test_an_axis_over_a_number_is_as_the_page_on_designs_says(sweep):
-    page, lines = designs_page(), axis_rows(sweep)
+def test_an_axis_over_a_number_is_as_findings_say(sweep):
+    page, lines = findings(), axis_rows(sweep)
     assert len(lines) >= 4
     for line in lines:
         assert line in page, line
 
 
 def grid_rows(sweep: str, digits: int) -> list[str]:
-    """The lines of docs/designs.md on an axis of several curves: of each, held-out nats along the axis."""
+    """The lines of findings.md on an axis of several curves: of each, held-out nats along the axis."""
     rows = read_rows(Workspace(RESULTS / "cpu-full"))
     lines = []
     for series in dict.fromkeys(r.series for r in rows if r.sweep == sweep):
@@ -199,8 +205,8 @@ def grid_rows(sweep: str, digits: int) -> list[str]:
 
 
 @pytest.mark.parametrize(("sweep", "digits", "curves"), [("lr_horizon", 3, 2)])
-def test_an_axis_of_several_curves_is_as_the_page_on_designs_says(sweep, digits, curves):
-    page, lines = designs_page(), grid_rows(sweep, digits)
+def test_an_axis_of_several_curves_is_as_findings_say(sweep, digits, curves):
+    page, lines = findings(), grid_rows(sweep, digits)
     assert len(lines) == curves
     for line in lines:
         assert line in page, line

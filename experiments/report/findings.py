@@ -1,0 +1,83 @@
+"""What the author of a study expected of its axes, and makes of them.
+
+The first is predictions/preregistered.csv (`experiments.analysis.preregistered`). The second is findings.md beside the
+page, a section per axis, shown with its curves:
+
+    ## `width`
+
+    Everything improves with width ...
+
+A heading that names several axes in backticks stands with the last of them; what names none comes at the end.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.analysis.preregistered import Came
+from experiments.report.fits import VERDICTS
+from experiments.report.pieces import pm, section, table
+from experiments.report.sweeps import CHANGED
+from experiments.sweeps.sweep import Sweep
+
+
+@dataclass(frozen=True)
+class Findings:
+    of_axes: dict[str, str]  # HTML, by the axis with which it is shown
+    rest: str = ""
+
+
+def read_findings(path: Path, axes: Sequence[str]) -> Findings:
+    """Of a study with these axes, in their order on the page; empty without a file."""
+    if not path.exists():
+        return Findings({})
+    of_axes: dict[str, str] = {}
+    rest = []
+    for part in re.split(r"^## ", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
+        title, text = part.split("\n", 1)
+        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")  # as where Markdown is read as a page
+        said = f'<div class=findings id="{anchor}">{_as_html(text)}</div>'
+        named = [axis for axis in axes if f"`{axis}`" in title]
+        if named:
+            of_axes[named[-1]] = of_axes.get(named[-1], "") + said
+        else:
+            rest.append(section(title.replace("`", ""), said))
+    return Findings(of_axes, "".join(rest))
+
+
+def describe_expected(sweep: Sweep, came: Sequence[Came]) -> str:
+    """Numbers of an axis that were written down before its trials ran, beside what came."""
+    own = [c for c in came if c.expected.sweep == sweep.name]
+    if not own:
+        return ""
+    lines = []
+    for c in own:
+        e = c.expected
+        where = f"{e.x} beside {e.against}" if e.against else e.x
+        said = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
+        there = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
+        curve = [html.escape(e.series)] if sweep.several else []
+        lines.append([*curve, html.escape(where), CHANGED.get(e.metric, e.metric), said, there, VERDICTS[c.inside]])
+    ran = [c for c in own if c.observed is not None]
+    commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
+    head = ["curve"] * sweep.several + [sweep.axis, "", "predicted", "came", ""]
+    return (
+        f"<h4>Written down before</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals hold what came. "
+        f"They were written by hand before the trials ran, in {commits}. Errors are over seeds.</p>"
+        f"<details><summary>Predicted and came</summary>{table(head, lines, text=2 + sweep.several)}</details>"
+    )
+
+
+def _as_html(text: str) -> str:
+    """Markdown with tables. Pictures are left out: they are the study's figures, which the page shows itself."""
+    from markdown_it import MarkdownIt
+
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+    rules = {"image": "", "table_open": "<div class=scroll><table>", "table_close": "</table></div>"}
+    for rule, written in rules.items():
+        reader.add_render_rule(rule, lambda *_, written=written: written)
+    return reader.render(text)

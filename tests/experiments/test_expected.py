@@ -1,0 +1,99 @@
+"""What a study's author wrote down before, and makes of it, stands with its axis on the page."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from experiments.analysis.preregistered import FILE, Expected, read_expected, what_came
+from experiments.report.draw import draw
+from experiments.rows import curve, difference, read_rows
+from hma_jax.config import ConfigError
+from tests.experiments.judged import WIDE, judged_study
+
+COLUMNS = "sweep,series,x,against,metric,mean,low,high,commit"
+WIDTH = Expected("width", "", "8", "", "cross_entropy", 5.0, 4.0, 6.0, "abc1234")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    workspace, record = judged_study(tmp_path_factory.mktemp("expected") / "study", replace(WIDE, widths=(8, 16)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("experiments.report.draw.draw_figures", lambda *_: None)
+        draw(workspace, record)
+        yield workspace, record
+
+
+@pytest.fixture
+def rows(study):
+    return read_rows(study[0])
+
+
+def test_an_expectation_meets_the_mean_over_seeds(rows):
+    [came] = what_came([WIDTH], rows)
+    first = curve(rows, "width", "cross_entropy")[0]
+    assert (came.observed, came.seed_sem) == (first.mean, first.seed_sem)
+    assert came.inside is (4.0 <= first.mean <= 6.0)
+    [other] = what_came([replace(WIDTH, low=first.mean + 0.1, mean=first.mean + 0.2, high=first.mean + 1)], rows)
+    assert other.inside is False
+
+
+def test_or_the_difference_of_two_points_seed_by_seed(rows):
+    [came] = what_came([replace(WIDTH, against="16")], rows)
+    first, last = curve(rows, "width", "cross_entropy")
+    assert (came.observed, came.seed_sem) == difference(first, last)
+
+
+def test_what_has_not_run_is_open(rows):
+    unfinished = [replace(r, metric="", status="missing") for r in rows if r.x == 8]
+    [came] = what_came([WIDTH], [*(r for r in rows if r.x != 8), *unfinished])
+    assert came.observed is None and came.inside is None
+    assert what_came([replace(WIDTH, sweep="compute")], rows) == []  # an axis that this study does not have
+
+
+def test_a_point_that_is_not_there_is_refused(rows):
+    for wrong in (replace(WIDTH, x="12"), replace(WIDTH, against="wide"), replace(WIDTH, series="8,000 steps")):
+        with pytest.raises(ConfigError, match="width.*has no point"):
+            what_came([wrong], rows)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("width,,8,,cross_entropy,five,4,6,abc", "line 2: no prediction"),
+        ("width,,8,,cross_entropy,5,4,6", "line 2: no prediction .it has too few columns"),
+        ("width,,8,,cross_entropy,5,4,6,abc,more", "line 2: no prediction"),
+        ("width,,8,,cross_entropy,7,4,6,abc", "line 2: low, mean and high do not ascend"),
+    ],
+)
+def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
+    path = tmp_path / FILE
+    path.write_text(f"{COLUMNS}\n{line}\n")
+    with pytest.raises(ConfigError, match=message):
+        read_expected(path)
+
+
+def test_columns_are_checked(tmp_path):
+    (tmp_path / FILE).write_text("sweep,x,mean\nwidth,8,5\n")
+    with pytest.raises(ConfigError, match="columns have to be"):
+        read_expected(tmp_path / FILE)
+
+
+def test_the_page_shows_both_at_the_axis(study):
+    workspace, record = study
+    workspace.predictions.mkdir()
+    (workspace.predictions / FILE).write_text(
+        f"{COLUMNS}\nwidth,,8,,cross_entropy,50,40,60,abc1234\nwidth,,8,16,cross_entropy,0,-9,9,abc1234\n"
+    )
+    workspace.findings.write_text(
+        "# What it says\n\n## `width`\n\n* **Wide** pays <script>.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n"
+        "![its figure](figures/width.png)\n\n## Elsewhere\n\nNothing of `width`.\n"
+    )
+    draw(workspace, record)
+    page = workspace.report.read_text()
+    axis, elsewhere = page.index("<h3>Width</h3>"), page.index("<h2>Elsewhere</h2>")
+    of_axis = page[axis : page.index("</section>", axis)]
+    assert "1 of 2 intervals hold what came" in of_axis and "<code>abc1234</code>" in of_axis
+    assert "8 beside 16" in of_axis and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
+    assert "<strong>Wide</strong> pays &lt;script&gt;." in of_axis and "<td>1</td>" in of_axis
+    assert "its figure" not in page and axis < elsewhere
