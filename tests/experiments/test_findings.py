@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.embodiments import TRAINED
-from experiments.analysis.preregistered import FILE, read_expected
+from experiments.analysis.preregistered import FILE, Expected, read_expected
 from experiments.report.robots import robots_of
 from experiments.rows import OVERALL, curve, difference, read_rows
 from experiments.running.trial import trial_id
@@ -114,13 +114,14 @@ def test_the_axis_lr_is_as_findings_say():
 
 
 def axis_rows(sweep: str) -> list[str]:
-    """The lines of findings.md on one of the axes of cpu-full over a number: means over seeds and judged robots."""
+    """The lines of findings.md on an axis of cpu-full with one curve: means over seeds and judged robots."""
     rows, digits = read_rows(Workspace(RESULTS / "cpu-full")), (3, 2, 2, 2)
     lines = []
     for role in (POINT, CONTROL):
         curves = [curve(rows, sweep, m, role) for m in ("cross_entropy", "psnr", "action_nats", "delta_psnr")]
         for points in zip(*curves, strict=True):
-            cells = [f"{points[0].x:,.0f}" + ", control" * (role == CONTROL), str(len(points[0].seeds))]
+            x = points[0].label or f"{points[0].x:,.0f}"
+            cells = [x + ", control" * (role == CONTROL), str(len(points[0].seeds))]
             # no minus before zero
             cells += [f"{round(p.mean, n) + 0.0:.{n}f}" for p, n in zip(points, digits, strict=True)]
             lines.append(f"| {' | '.join(cells)} |")
@@ -161,11 +162,11 @@ def exponents() -> list[float]:
 
 def test_what_sharing_and_company_cost_is_as_findings_say():
     found, page = gains(), findings().splitlines()
-    expected = {(e.sweep, e.x): e for e in read_expected(RESULTS / "cpu-full" / "predictions" / FILE)}
+    expected = expectations()
     for count in (5, 10, 20):
         cells = [str(count)]
         for sweep in ("dilution", "transfer"):
-            e = expected[sweep, str(count)]
+            e = expected[sweep, "", str(count)]
             cells += [f"{e.mean:+.2f} ({e.low:+.2f} to {e.high:+.2f})", f"**{found[sweep][count]}**"]
         assert f"| {' | '.join(cells)} |" in page, cells
     a = exponents()
@@ -186,25 +187,47 @@ def test_what_was_found_is_as_readme_says():
     assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
 
 
-@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer"])
-def test_an_axis_over_a_number_is_as_findings_say(sweep):
+@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer", "newcomers", "settings"])
+def test_an_axis_of_one_curve_is_as_findings_say(sweep):
     page, lines = findings(), axis_rows(sweep)
     assert len(lines) >= 4
     for line in lines:
         assert line in page, line
 
 
+def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
+    page = findings()
+    for (sweep, _, x), e in expectations().items():
+        interval = f"({e.low:g} to {e.high:g})" if not e.against else f"({e.low:.2f} to {e.high:.2f})"
+        if sweep == "newcomers":
+            [line] = [line for line in page.splitlines() if line.startswith(f"| {x} |")]
+            assert line.endswith(f"| {e.mean:g} {interval} |"), line
+        if sweep == "settings":
+            assert f"{e.mean:.2f}" in page and interval in " ".join(page.split()), (x, interval)
+
+
+def expectations() -> dict[tuple[str, str, str], Expected]:
+    """{(axis, curve, x): what was written down before}."""
+    return {(e.sweep, e.series, e.x): e for e in read_expected(RESULTS / "cpu-full" / "predictions" / FILE)}
+
+
 def grid_rows(sweep: str, digits: int) -> list[str]:
-    """The lines of findings.md on an axis of several curves: of each, held-out nats along the axis."""
-    rows = read_rows(Workspace(RESULTS / "cpu-full"))
+    """The lines of findings.md on an axis of several curves: held-out nats along each, in brackets what was predicted,
+    bold where that did not hold."""
+    rows, expected = read_rows(Workspace(RESULTS / "cpu-full")), expectations()
     lines = []
     for series in dict.fromkeys(r.series for r in rows if r.sweep == sweep):
-        points = curve(rows, sweep, "cross_entropy", series=series)
-        lines.append(f"| {series} | {' | '.join(f'{p.mean:.{digits}f}' for p in points)} |")
+        cells = [series]
+        for point in curve(rows, sweep, "cross_entropy", series=series):
+            e, came = expected.get((sweep, series, f"{point.x:g}")), f"{point.mean:.{digits}f}"
+            if e is not None:
+                came += f" ({e.mean:.{digits}f})" if e.low <= point.mean <= e.high else f" (**{e.mean:.{digits}f}**)"
+            cells.append(came)
+        lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
-@pytest.mark.parametrize(("sweep", "digits", "curves"), [("lr_horizon", 3, 2)])
+@pytest.mark.parametrize(("sweep", "digits", "curves"), [("lr_horizon", 3, 2), ("compute", 2, 4)])
 def test_an_axis_of_several_curves_is_as_findings_say(sweep, digits, curves):
     page, lines = findings(), grid_rows(sweep, digits)
     assert len(lines) == curves
