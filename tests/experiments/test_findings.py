@@ -178,13 +178,18 @@ def test_what_was_found_is_as_readme_says():
     root = RESULTS / "cpu-full"
     text = readme()
     with open(root / "fits.csv", newline="") as file:
-        law = {r["coefficient"]: float(r["value"]) for r in csv.DictReader(file) if r["curve"] == "width"}
+        fits = [(r["curve"], r["coefficient"], float(r["value"])) for r in csv.DictReader(file) if r["value"]]
+    law, best = ({name: value for of, name, value in fits if of == which} for which in ("width", "isoflop"))
     assert f"{law['E']:.2f} + {law['A']:.0f} N^-{law['alpha']:.2f} in trunk parameters" in text
     predicted = json.loads((root / "predictions" / "width-64.json").read_text())["mean"]
     came = next(line for line in axis_rows("width") if line.startswith("| 64 |")).split(" | ")[2]
     assert f"predicted at {predicted:.3f} nats before it ran, came to {came}" in text
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
     assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
+    poor = {p.label: p for p in curve(read_rows(Workspace(root)), "newcomers", "cross_entropy")}
+    gained, _ = difference(poor["alone"], poor["all robots"])
+    assert f"{gained:.2f} if the five have 8 trajectories each" in text
+    assert f"best trunk grows as C^{best['a']:.2f}" in text
 
 
 @pytest.mark.parametrize("sweep", ["width", "dilution", "transfer", "newcomers", "settings"])
