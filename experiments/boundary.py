@@ -14,9 +14,17 @@ from hma_jax.config import ConfigError
 from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
 
-def guarded(work: Callable[[], None], debug: bool = False, own_process: bool = True) -> int:
+def guarded(
+    work: Callable[[], None],
+    debug: bool = False,
+    own_process: bool = True,
+    *,
+    resumes: bool = True,
+    skipping: str = "",
+) -> int:
     """Does `work` and returns the exit code; what a user can mend is one message on stderr, with `debug` or HMA_DEBUG=1
-    a traceback, as of a bug. `own_process`: the process has nothing else to do."""
+    a traceback, as of a bug. `own_process`: the process has nothing else to do; `resumes`: after a stop the same command
+    goes on where it was; `skipping`: the option that leaves out records that cannot be read."""
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
         _silence_background()
@@ -27,7 +35,8 @@ def guarded(work: Callable[[], None], debug: bool = False, own_process: bool = T
         return Exit.DONE
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
-        _say(f"{'stopped by SIGTERM' if code == Exit.STOPPED else 'interrupted'}; the same command goes on from here")
+        what = "stopped by SIGTERM" if code == Exit.STOPPED else "interrupted"
+        _say(f"{what}; the same command {'goes on from here' if resumes else 'begins anew'}")
         _end_together(request, code)
         return code
     except Exception as error:  # the boundary of the program
@@ -35,7 +44,7 @@ def guarded(work: Callable[[], None], debug: bool = False, own_process: bool = T
         if debug or code is None:
             _end_together(error, code or Exit.FAILED, show=True)
             raise
-        _say(f"error: {_words(error)}")
+        _say(f"error: {_words(error, skipping)}")
         _end_together(error, code)
         return code
 
@@ -80,12 +89,12 @@ def _exit_code(error: Exception) -> Exit | None:
     return None
 
 
-def _words(error: Exception) -> str:
+def _words(error: Exception, skipping: str) -> str:
     """The message of an error, and what it cannot know: how its advice is followed from here."""
     from data_pipelines.errors import EpisodeError
 
-    if isinstance(error, EpisodeError):
-        return f"{error} (Here: --set store.corrupt=skip.)"
+    if isinstance(error, EpisodeError) and skipping:
+        return f"{error} (Here: {skipping}.)"
     if isinstance(error, OSError) and error.strerror:
         place = f"{error.filename}: " if error.filename else ""
         return f"{place}{error.strerror}; check the path, its permissions and the space on its disk"
@@ -94,4 +103,3 @@ def _words(error: Exception) -> str:
 
 def _say(message: str) -> None:
     errors.print(message, markup=False, soft_wrap=True)
-

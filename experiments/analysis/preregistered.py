@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from experiments.rows import Row, curve, difference
+from experiments.sweeps.registry import AXES
+from experiments.sweeps.sweep import POINT
 from hma_jax.config import ConfigError, require
 
 FILE = "preregistered.csv"
@@ -37,11 +39,15 @@ class Expected:
 
 @dataclass(frozen=True)
 class Came:
-    """One expectation beside what came: `observed` with its standard error over seeds, None before any trial ran."""
+    """One expectation beside what came: `observed`, the mean over `seeds` of the `planned` ones; None before any ran.
+
+    `seed_sem` is its standard error over seeds."""
 
     expected: Expected
     observed: float | None
     seed_sem: float
+    seeds: int
+    planned: int
 
     @property
     def inside(self) -> bool | None:
@@ -59,7 +65,8 @@ def read_expected(path: Path) -> list[Expected]:
         reader = csv.DictReader(file)
         require(reader.fieldnames == columns, f"{path}: its columns have to be {','.join(columns)}")
         found = []
-        for number, record in enumerate(reader, start=2):
+        for record in reader:
+            number = reader.line_num
             try:
                 if None in record.values():
                     raise ValueError("it has too few columns")
@@ -71,26 +78,35 @@ def read_expected(path: Path) -> list[Expected]:
     return found
 
 
-def what_came(expected: Iterable[Expected], rows: Sequence[Row]) -> list[Came]:
-    """Of every expectation of an axis that `rows` have. Raises ConfigError for a curve or a point that is not there."""
-    axes = {r.sweep for r in rows}
-    found = []
+def what_came(expected: Sequence[Expected], rows: Sequence[Row]) -> list[Came]:
+    """Of every expectation of an axis that `rows` have; other axes may come. Raises ConfigError for an axis, a curve, a
+    point or a metric that is not there."""
+    known = {*AXES, *(r.sweep for r in rows)}
     for e in expected:
-        if e.sweep not in axes:
-            continue
-        places = {(r.x, r.label) for r in rows if (r.sweep, r.series) == (e.sweep, e.series)}
-        for x in filter(None, (e.x, e.against)):
-            where = f"{e.sweep}, {e.series}" if e.series else e.sweep
-            require(any(_names(x, *place) for place in places), f"{FILE}: {where} has no point {x!r}")
-        points = curve(rows, e.sweep, e.metric, series=e.series)
-        point, base = (next((p for p in points if _names(x, p.x, p.label)), None) for x in (e.x, e.against))
-        if point is None or (e.against and base is None):
-            found.append(Came(e, None, math.nan))
-        elif base is None:
-            found.append(Came(e, point.mean, point.seed_sem))
-        else:
-            found.append(Came(e, *difference(point, base)))
-    return found
+        require(e.sweep in known, f"{FILE}: no axis {e.sweep!r}; known: {', '.join(sorted(known))}")
+    return [_came(e, own) for e in expected if (own := [r for r in rows if (r.sweep, r.role) == (e.sweep, POINT)])]
+
+
+def _came(e: Expected, rows: Sequence[Row]) -> Came:
+    """`rows`: of the axis, without its controls."""
+    places = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
+    where = f"{FILE}: {e.sweep}, {e.series}" if e.series else f"{FILE}: {e.sweep}"
+    for x in filter(None, (e.x, e.against)):
+        there = sorted({label or f"{place:g}" for place, label, _ in places})
+        known = any(_names(x, place, label) for place, label, _ in places)
+        require(known, f"{where} has no point {x!r}, but {', '.join(there) or 'none, nor such a curve'}")
+    metrics = {r.metric for r in rows} - {""}
+    require(not metrics or e.metric in metrics, f"{where} has no metric {e.metric!r}, but {', '.join(sorted(metrics))}")
+    planned = {seed for place, label, seed in places if _names(e.x, place, label)}
+    points = curve(rows, e.sweep, e.metric, series=e.series)
+    point, base = (next((p for p in points if _names(x, p.x, p.label)), None) for x in (e.x, e.against))
+    seeds = set(point.seeds) if point else set()
+    if e.against:
+        seeds &= set(base.seeds) if base else set()
+    if point is None or not seeds:
+        return Came(e, None, math.nan, 0, len(planned))
+    mean, error = difference(point, base) if base and e.against else (point.mean, point.seed_sem)
+    return Came(e, mean, error, len(seeds), len(planned))
 
 
 def _names(text: str, x: float, label: str) -> bool:

@@ -60,7 +60,7 @@ from experiments.applications.generating.lessons import (
 from experiments.applications.generating.source import replay
 from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.made_with import claim, write_settings
-from experiments.applications.policies.acting import Scale, scale_of
+from experiments.applications.policies.acting import STILL, Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.demonstrations import (
     Demonstrations,
@@ -151,10 +151,13 @@ def run_trial(
 
 
 def action_errors(policy: Policy, demos: Demonstrations, scale: Scale) -> np.ndarray:
-    """float [N]: mean squared difference from the recorded actions of each trajectory, in standard deviations."""
+    """float [N]: mean squared difference from the recorded actions of each trajectory, in standard deviations, over the
+    dimensions that vary in what policies are trained on: in others the smallest difference would be a large one."""
+    moving = np.array(scale.std) > STILL
     policy.reset()
     acted = np.stack([policy.act(demos.images[:, t]) for t in range(demos.images.shape[1])], 1)
-    squares = ((scale.normalise(acted) - scale.normalise(demos.actions)) ** 2).mean(2, dtype=np.float64)
+    apart = (scale.normalise(acted) - scale.normalise(demos.actions))[..., moving]
+    squares = (apart**2).mean(2, dtype=np.float64)
     return np.array([row[:length].mean() for row, length in zip(squares, demos.lengths, strict=True)])
 
 
@@ -191,16 +194,22 @@ def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
     """Raises ConfigError for options that belong to the other kind of lessons."""
     seeds = tuple(range(asked.seeds))
     training = Training(seeds=seeds, steps=asked.steps, given=asked.given, with_given=asked.with_given)
-    scripted = {name: value for name in ("task", "frames", "starts") if (value := getattr(asked, name)) is not None}
+    scripted, recorded = (
+        {name: value for name in names if (value := getattr(asked, name)) is not None}
+        for names in (("task", "frames", "starts"), ("split", "held_out", "registry"))
+    )
     if asked.actions is None:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in recorded)
+        require(not recorded, f"{options}: of recordings, which --actions DATASET names")
         settings = Settings(**vars(training), robot=asked.robot or Settings.robot, **scripted)
         return ScriptedLessons(settings, simulator.robot(settings.robot), simulator.tokenizer.image_size)
     require(not scripted, f"--{', --'.join(scripted)}: of the suite's tasks, not of recordings (--actions)")
     use_entries(asked.registry)
     robot = simulator.robot(asked.robot) if asked.robot else None
     place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(asked.run).store
-    recorded, driven = open_trajectories(asked.actions, asked.split, *place)
-    return RecordedLessons(training, driven, recorded, open_trajectories(asked.actions, asked.held_out, *place)[0])
+    trained_on, driven = open_trajectories(asked.actions, asked.split or "train", *place)
+    held_out, _ = open_trajectories(asked.actions, asked.held_out or "val", *place)
+    return RecordedLessons(training, driven, trained_on, held_out)
 
 
 def main() -> None:
@@ -208,8 +217,8 @@ def main() -> None:
     parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--actions", metavar="DATASET", help="recordings, as `hma generate` takes them")
-    parser.add_argument("--split", default="train", help="of DATASET, that policies are trained on")
-    parser.add_argument("--held-out", default="val", metavar="SPLIT", help="of DATASET, that they are judged on")
+    parser.add_argument("--split", help="of DATASET, that policies are trained on (train)")
+    parser.add_argument("--held-out", metavar="SPLIT", help="of DATASET, that they are judged on (val)")
     parser.add_argument("--registry", type=Path, metavar="FILE", help="TOML file with entries of your own")
     parser.add_argument("--robot", help=f"of the model; DATASET's, or {Settings.robot}")
     parser.add_argument("--task", help=f"hover, reach, or own: what its recordings do ({Settings.task})")

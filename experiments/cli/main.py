@@ -62,4 +62,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
             args=arguments or ["--help"],
         )
 
-    return guarded(work, debug, own_process)
+    return guarded(work, debug, own_process, skipping="--set store.corrupt=skip")

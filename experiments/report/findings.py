@@ -7,7 +7,8 @@ page, a section per axis, shown with its curves:
 
     Everything improves with width ...
 
-A heading that names several axes in backticks stands with the last of them; what names none comes at the end.
+What stands under a heading that names several axes in backticks is shown with the last of them; what names none, or
+stands before them all, comes at the end. No other line may begin with `## `.
 """
 
 from __future__ import annotations
@@ -37,8 +38,11 @@ def read_findings(path: Path, axes: Sequence[str]) -> Findings:
         return Findings({})
     of_axes: dict[str, str] = {}
     rest = []
-    for part in re.split(r"^## ", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
-        title, text = part.split("\n", 1)
+    before, *parts = re.split(r"^## ", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    if before := re.sub(r"\A\s*# .*", "", before).strip():
+        rest.append(section("Findings", f"<div class=findings>{_as_html(before)}</div>"))
+    for part in parts:
+        title, _, text = part.partition("\n")
         anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")  # as where Markdown is read as a page
         said = f'<div class=findings id="{anchor}">{_as_html(text)}</div>'
         named = [axis for axis in axes if f"`{axis}`" in title]
@@ -61,13 +65,14 @@ def describe_expected(sweep: Sweep, came: Sequence[Came]) -> str:
         said = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
         there = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
         curve = [html.escape(e.series)] if sweep.several else []
-        lines.append([*curve, html.escape(where), CHANGED.get(e.metric, e.metric), said, there, VERDICTS[c.inside]])
+        metric, seeds = CHANGED.get(e.metric, html.escape(e.metric)), f"{c.seeds} of {c.planned}"
+        lines.append([*curve, html.escape(where), metric, said, there, VERDICTS[c.inside], seeds])
     ran = [c for c in own if c.observed is not None]
     commits = ", ".join(dict.fromkeys(f"<code>{html.escape(c.expected.commit)}</code>" for c in own))
-    head = ["curve"] * sweep.several + [sweep.axis, "", "predicted", "came", ""]
+    head = ["curve"] * sweep.several + [sweep.axis, "", "predicted", "came", "", "seeds"]
     return (
         f"<h4>Written down before</h4><p>{sum(bool(c.inside) for c in ran)} of {len(ran)} intervals hold what came. "
-        f"They were written by hand before the trials ran, in {commits}. Errors are over seeds.</p>"
+        f"By its author's word they were written before the trials ran, in {commits}. Errors are over seeds.</p>"
         f"<details><summary>Predicted and came</summary>{table(head, lines, text=2 + sweep.several)}</details>"
     )
 

@@ -49,11 +49,26 @@ def test_what_has_not_run_is_open(rows):
     [came] = what_came([WIDTH], [*(r for r in rows if r.x != 8), *unfinished])
     assert came.observed is None and came.inside is None
     assert what_came([replace(WIDTH, sweep="compute")], rows) == []  # an axis that this study does not have
+    one = [r for r in rows if r.x == 8 or r.seed == 1]
+    [came] = what_came([replace(WIDTH, against="16")], [r for r in one if r.x == 16 or r.seed != 1])
+    assert came.observed is None  # no seed has both
+
+
+def test_seeds_are_counted(rows):
+    unfinished = [replace(r, metric="", status="missing") if r.seed else r for r in rows]
+    [came] = what_came([WIDTH], unfinished)
+    assert (came.seeds, came.planned) == (1, 3)
 
 
 def test_a_point_that_is_not_there_is_refused(rows):
-    for wrong in (replace(WIDTH, x="12"), replace(WIDTH, against="wide"), replace(WIDTH, series="8,000 steps")):
-        with pytest.raises(ConfigError, match="width.*has no point"):
+    for wrong, message in (
+        (replace(WIDTH, x="12"), "width has no point '12', but 16, 8"),
+        (replace(WIDTH, against="wide"), "has no point 'wide'"),
+        (replace(WIDTH, series="8,000 steps"), "nor such a curve"),
+        (replace(WIDTH, metric="cross-entropy"), "has no metric 'cross-entropy', but .*cross_entropy"),
+        (replace(WIDTH, sweep="widht"), "no axis 'widht'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
             what_came([wrong], rows)
 
 
@@ -86,8 +101,9 @@ def test_the_page_shows_both_at_the_axis(study):
         f"{COLUMNS}\nwidth,,8,,cross_entropy,50,40,60,abc1234\nwidth,,8,16,cross_entropy,0,-9,9,abc1234\n"
     )
     workspace.findings.write_text(
-        "# What it says\n\n## `width`\n\n* **Wide** pays <script>.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n"
-        "![its figure](figures/width.png)\n\n## Elsewhere\n\nNothing of `width`.\n"
+        "# What it says\n\nIn short: little.\n\n"
+        "## `width`\n\n* **Wide** pays <script>.\n\n| a | b |\n|---|---|\n| 1 | 2 |\n\n"
+        "![its figure](figures/width.png)\n\n[a](javascript:alert(1))\n\n## Elsewhere\n\nNothing of `width`.\n\n## <b>"
     )
     draw(workspace, record)
     page = workspace.report.read_text()
@@ -97,3 +113,4 @@ def test_the_page_shows_both_at_the_axis(study):
     assert "8 beside 16" in of_axis and re.search(r"50 <span class=sem>\[40, 60\]", of_axis)
     assert "<strong>Wide</strong> pays &lt;script&gt;." in of_axis and "<td>1</td>" in of_axis
     assert "its figure" not in page and axis < elsewhere
+    assert "In short: little." in page and "<h2>&lt;b&gt;</h2>" in page and 'href="javascript' not in page

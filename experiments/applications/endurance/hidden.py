@@ -13,6 +13,7 @@ Writes DIR/hidden.csv, a row per event.
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -31,6 +32,7 @@ from experiments.applications.endurance.tables import Row
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows
+from experiments.boundary import guarded
 from experiments.progress import console, step
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig
@@ -165,4 +167,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(guarded(main))

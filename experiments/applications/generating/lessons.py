@@ -30,6 +30,11 @@ class Training:
     given: int = 1  # recorded frames that a generated trajectory begins with
     with_given: bool = False  # policies are trained on these, too
 
+    def __post_init__(self) -> None:
+        """Raises ConfigError."""
+        require(self.given >= 1, f"given = {self.given}: a generated trajectory begins with at least 1 recorded frame")
+        require(bool(self.seeds), "no seed: at least 1 is needed")
+
 
 @dataclass(frozen=True)
 class Settings(Training):
@@ -109,14 +114,22 @@ class RecordedLessons:
             f"{recorded.name}: policies would be judged on what they were trained on, split {recorded.split}; name "
             "another one with --held-out",
         )
-        _require_enough(recorded, len(recorded), training)
+        require(
+            len(recorded) >= training.trajectories,
+            f"{recorded.name}, split {recorded.split}, has {len(recorded)} trajectories, {training.trajectories} are "
+            "needed; name another --split or DATASET",
+        )
         self.robot, self._recorded, self._held_out = robot, recorded, held_out
         about = {"recordings": describe(recorded), "held_out": describe(held_out)}
         self.settings = RecordedSettings(**vars(training), robot=robot.name, **about)
 
     def record(self) -> Demonstrations:
         found = self._first(self._recorded, self.settings.trajectories)
-        _require_enough(self._recorded, len(found), self.settings)
+        require(
+            len(found) == self.settings.trajectories,
+            f"{self._recorded.name}, split {self._recorded.split}, has {len(found)} trajectories longer than "
+            f"{self.settings.given} frame(s), {self.settings.trajectories} are needed; name another --split or DATASET",
+        )
         return as_demonstrations([confined(t, self.robot) for t in found])
 
     def record_held_out(self) -> Demonstrations:
@@ -136,15 +149,6 @@ class RecordedLessons:
 
     def judge(self, policy: Policy) -> dict[str, list[float]]:
         return {}
-
-
-def _require_enough(recorded: Trajectories, count: int, training: Training) -> None:
-    wanted = training.trajectories
-    require(
-        count >= wanted,
-        f"{recorded.name}, split {recorded.split}, has {count} trajectories longer than {training.given} frame(s), "
-        f"{wanted} are needed",
-    )
 
 
 def as_demonstrations(trajectories: list[Trajectory]) -> Demonstrations:

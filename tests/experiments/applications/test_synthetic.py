@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +27,7 @@ from experiments.applications.generating.lessons import RecordedLessons, Setting
 from experiments.applications.generating.trajectories import open_trajectories
 from experiments.applications.made_with import hash_of
 from experiments.applications.plan_actions import decided
+from experiments.applications.policies.acting import scale_of
 from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.network import EncoderConfig
@@ -127,7 +128,9 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
     run, out = make_run(tmp_path / "study"), tmp_path / "out"
     asked = ["synthetic", str(run), "--actions", recordings, "--out", str(out)]
     for more, said in (
-        ([], "split train, has [0-9]+ trajectories longer than 1 frame.*, 100 are needed"),
+        ([], "split train, has [0-9]+ trajectories, 100 are needed; name another"),
+        (["--given", "0"], "given = 0: a generated trajectory begins with at least 1"),
+        (["--seeds", "0"], "no seed"),
         (["--held-out", "train"], "judged on what they were trained on, split train"),
         (["--starts", "3"], "--starts: of the suite's tasks, not of recordings"),
         (["--robot", "gripper_wood"], "2 action values, gripper_wood takes 4"),
@@ -136,6 +139,29 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
         with pytest.raises(ConfigError, match=said):
             synthetic.main()
         assert not out.exists()
+    monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(out), "--split", "train", "--held-out", "a"])
+    with pytest.raises(ConfigError, match="--split, --held-out: of recordings, which --actions"):
+        synthetic.main()
+
+
+def test_a_dimension_that_stood_still_in_training_is_not_judged():
+    actions = np.zeros((2, 3, 2), np.float32)
+    actions[..., 0] = [[0, 1, 2], [2, 1, 0]]
+    unknown = np.zeros((2, 3), bool)
+    demos = Demonstrations(
+        np.zeros((2, 3, 1, 1, 3), np.uint8), actions, np.array([3, 3]), unknown, unknown[:, 0], np.full(2, -1)
+    )
+    others = replace(demos, actions=actions + np.array([0.0, 0.5], np.float32))
+
+    class Exact:
+        def reset(self):
+            self.t = -1
+
+        def act(self, images):
+            self.t += 1
+            return actions[:, self.t]
+
+    np.testing.assert_array_equal(synthetic.action_errors(Exact(), others, scale_of(demos)), 0)
 
 
 def test_other_actions_are_another_trajectorys_and_a_shorter_ones_last_is_held():
