@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
 from experiments.optima import diverged, ends, lowest
-from experiments.report.plot_style import LABELS, MUTED, plain_log, show_nothing, show_tally
+from experiments.report.plot_style import LABELS, MUTED, count, plain_log, show_nothing, show_tally
 from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
 from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 
@@ -87,6 +87,6 @@ def _draw(
         show_nothing(panel)
     panel.set_xscale("log")
     panel.set_xlim(xs[0] / 1.25, xs[-1] * 1.25)
-    panel.set_xticks(xs, [f"{x:.2g}" for x in xs])
+    panel.set_xticks(xs, [count(x) if x >= 1 else f"{x:.2g}" for x in xs])
     panel.xaxis.set_minor_locator(NullLocator())
     panel.set_ylabel(label)

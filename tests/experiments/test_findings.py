@@ -223,7 +223,7 @@ def grid_rows(sweep: str, digits: int) -> list[str]:
     bold where that did not hold."""
     rows, expected = read_rows(Workspace(RESULTS / "cpu-full")), expectations()
     lines = []
-    for series in dict.fromkeys(r.series for r in rows if r.sweep == sweep):
+    for series in dict.fromkeys(r.series for r in rows if (r.sweep, r.role) == (sweep, POINT)):
         cells = [series]
         for point in curve(rows, sweep, "cross_entropy", series=series):
             e, came = expected.get((sweep, series, f"{point.x:g}")), f"{point.mean:.{digits}f}"
@@ -234,7 +234,7 @@ def grid_rows(sweep: str, digits: int) -> list[str]:
     return lines
 
 
-@pytest.mark.parametrize(("sweep", "digits", "curves"), [("lr_horizon", 3, 2), ("compute", 2, 4)])
+@pytest.mark.parametrize(("sweep", "digits", "curves"), [("lr_horizon", 3, 2), ("compute", 2, 4), ("episodes", 2, 3)])
 def test_an_axis_of_several_curves_is_as_findings_say(sweep, digits, curves):
     page, lines = findings(), grid_rows(sweep, digits)
     assert len(lines) == curves
