@@ -193,12 +193,23 @@ def test_what_was_found_is_as_readme_says():
     assert f"best trunk grows as C^{best['a']:.2f}" in text
 
 
-@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer", "newcomers", "settings"])
+@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer", "newcomers", "settings", "conditioning"])
 def test_an_axis_of_one_curve_is_as_findings_say(sweep):
     page, lines = findings(), axis_rows(sweep)
     assert len(lines) >= 4
-    for line in lines:
-        assert line in page, line
+    for line in lines:  # further columns may follow
+        assert line.removesuffix("|") in page, line
+
+
+def test_what_was_predicted_of_conditioning_is_as_findings_say():
+    points = {p.label: p for p in curve(read_rows(Workspace(RESULTS / "cpu-full")), "conditioning", "cross_entropy")}
+    lines = findings().splitlines()
+    for (sweep, _, x), e in expectations().items():
+        if sweep == "conditioning":
+            mean, error = difference(points[x], points[e.against])
+            said = f"{e.mean:.2f}" if e.low <= mean <= e.high else f"**{e.mean:.2f}**"
+            line = f" | {mean:+.3f} ± {error:.3f} | {said} ({e.low:.2f} to {e.high:.2f}) |"
+            assert any(row.startswith(f"| {x} |") and row.endswith(line) for row in lines), line
 
 
 def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
