@@ -76,6 +76,9 @@ class CrossAttention(nnx.Module):
     DIFFERS: the release's heads attend to each other at one position and its results are
     scrambled over time (reference section 9.1), so a checkpoint of it converts but does not
     compute what it was trained to. A frame to which no action is shown gets nothing.
+
+    Keys carry no time: a token tells its own frame's action from earlier ones by what they are alone. Models so
+    conditioned hardly follow actions (cpu-full's findings, docs/models.md).
     """
 
     def __init__(self, config: ModelConfig, embodiments: int):
