@@ -10,3 +10,9 @@ Not for what changes tokenizers, tokens or windows: these are named by their con
 beyond rounding leaves the number; the sources that each trial ran are recorded beside it (`provenance`)."""
 
 RESULTS_VERSION = max(CHANGES)
+
+OF_SOME = {
+    "a frame's own action is told from earlier ones by its weight": {"model.conditioning": "cross_attention"},
+}
+"""Changes that alter the numbers of a few trials only: those whose fields have such values. They are part of the names
+of these trials, and all others stay finished."""

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from experiments.running.machine import describe_machine
 from experiments.running.provenance import Provenance, record_end
+from experiments.running.results_version import OF_SOME
 from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, TrainConfig
@@ -114,18 +115,30 @@ def _identity(trial: Trial) -> dict[str, Any]:
     fields = to_dict(trial)
     if trial.source:
         fields["source"] = _identity(trial.source)
+    altered = [
+        what
+        for what, where in OF_SOME.items()
+        if all(_at(fields, path.split(".")) == value for path, value in where.items())
+    ]
     for path, before in LATER.items():
         _drop(fields, path.split("."), before)
-    return fields
+    return fields | {"altered": altered} if altered else fields
 
 
-def _drop(fields: dict[str, Any] | None, path: list[str], value: Any) -> None:
-    """Deletes the entry at `path` where it is `value`; a part of the path may be a configuration that is absent."""
+def _drop(fields: dict[str, Any], path: list[str], value: Any) -> None:
+    """Deletes the entry at `path` where it is `value`."""
     *parents, name = path
-    for parent in parents:
-        fields = fields.get(parent) if fields else None
-    if fields and name in fields and fields[name] == value:
-        del fields[name]
+    within = _at(fields, parents)
+    if within and name in within and within[name] == value:
+        del within[name]
+
+
+def _at(fields: dict[str, Any], path: list[str]) -> Any:
+    """None where a configuration on the way is absent."""
+    found: Any = fields
+    for name in path:
+        found = found[name] if found else None
+    return found
 
 
 @dataclass(frozen=True)

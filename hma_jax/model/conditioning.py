@@ -77,8 +77,8 @@ class CrossAttention(nnx.Module):
     scrambled over time (reference section 9.1), so a checkpoint of it converts but does not
     compute what it was trained to. A frame to which no action is shown gets nothing.
 
-    Keys carry no time: a token tells its own frame's action from earlier ones by what they are alone. Models so
-    conditioned hardly follow actions (cpu-full's findings, docs/models.md).
+    Keys carry no time, so the frame's own action is told from earlier ones by its weight: before anything is learned
+    it has as much as all of those together. Without this, models hardly follow actions (cpu-full's findings).
     """
 
     def __init__(self, config: ModelConfig, embodiments: int):
@@ -113,6 +113,7 @@ class CrossAttention(nnx.Module):
             k, v, shown = (jnp.concatenate([old, own], axis=1) for old, own in zip(past, new, strict=True))
         allowed_BTs = visible & shown[:, None]
         logits = self.scale * jnp.einsum("btphi,bshi->bphts", q, k, preferred_element_type=jnp.float32)
+        logits = logits + _own_bonus(allowed_BTs)[:, None, None]
         weights = plain.softmax(logits, allowed_BTs[:, None, None]).astype(v.dtype)
         y = jnp.einsum("bphts,bshi->btphi", weights, v).reshape(x_BTPD.shape)
         some = jnp.any(allowed_BTs, axis=-1)
@@ -125,6 +126,15 @@ class CrossAttention(nnx.Module):
         """[B, ..., D] -> [B, ..., H, I], a layer norm over each head."""
         x = layer_norm(x.reshape(*x.shape[:-1], self.heads, -1), FINE_EPS)
         return shifted(scaled(x, own(self.gain, slice_B, x)), own(self.bias, slice_B, x))
+
+
+def _own_bonus(allowed_BTs: jax.Array) -> jax.Array:
+    """[B, T, T_past + T] of which actions a frame may see -> what is added to logits: of its own the logarithm of how
+    many others there are, of others 0."""
+    count, keys = allowed_BTs.shape[1:]
+    itself = jnp.eye(count, keys, k=keys - count, dtype=bool)
+    others = jnp.sum(allowed_BTs & ~itself, axis=-1, keepdims=True)
+    return jnp.where(itself, jnp.log(jnp.maximum(others, 1).astype(jnp.float32)), 0)
 
 
 def _where_shown(action: ActionFeature, y: jax.Array) -> jax.Array:

@@ -10,6 +10,7 @@ import pytest
 
 from experiments.presets import CPU_FULL, SMOKE
 from experiments.run_study import make_jobs
+from experiments.running import trial as trial_module
 from experiments.running.attempts import RUN
 from experiments.running.runner import Job
 from experiments.running.shared_runs import begin_shared, share_runs
@@ -116,6 +117,16 @@ def test_a_field_within_a_configuration_may_come_later(monkeypatch):
     monkeypatch.setitem(LATER, "model.diffusion.depth", DiffusionConfig().depth)
     assert trial_id(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
     assert len({trial_id(one, PROVENANCE) for one in (plain, latents, drawn)} | named) == 5
+
+
+def test_a_change_that_alters_some_trials_renames_these_alone(monkeypatch):
+    one = reference_trial(CPU_FULL, 0)
+    attends = replace(one, model=replace(one.model, conditioning="cross_attention"))
+    after = replace(one, source=attends)
+    before = [trial_id(trial, PROVENANCE) for trial in (one, attends, after)]
+    monkeypatch.setattr(trial_module, "OF_SOME", {})
+    changed = [trial_id(trial, PROVENANCE) != id for trial, id in zip((one, attends, after), before, strict=True)]
+    assert changed == [False, True, True]
 
 
 def test_names_of_trials_stay():

@@ -6,11 +6,12 @@ import pytest
 
 from hma_jax.config import ConfigError, ExecutionConfig, ModelConfig, MupConfig
 from hma_jax.evaluation.metrics import factored_cross_entropy
+from hma_jax.model.conditioning import ActionFeature, CrossAttention
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.flops import forward_flops_per_window
 from hma_jax.model.frames import compose, factorise
-from hma_jax.model.hma import declare_model
-from tests.tiny import TABLE, lively_params, model_config, random_batch
+from hma_jax.model.hma import causal, declare_model
+from tests.tiny import TABLE, lively_params, model_config, random_batch, shallow_config
 
 
 def logits_of(config, declared, params, batch, actions=True):
@@ -58,6 +59,33 @@ def test_the_chunk_before_a_frame_changes_its_logits():
     a = logits_of(config, declared, params, batch)
     b = logits_of(config, declared, params, changed)
     assert np.abs(a[:, 3] - b[:, 3]).max() > 1e-3
+
+
+def test_of_actions_attended_to_a_frame_s_own_weighs_as_much_as_all_earlier_ones_until_something_is_learned():
+    config = shallow_config(conditioning="cross_attention")
+    attend = CrossAttention(config, 1)  # every parameter 0: all logits are equal
+    attend.v.set_value(jnp.eye(config.width)[None])
+    attend.out.kernel.set_value(jnp.eye(config.width)[None])
+    feature = np.random.default_rng(0).normal(size=(2, 6, config.width)).astype(np.float32)
+    shown = np.array([[True] * 6, [False, True, False, True, True, False]])
+    x, slices = jnp.zeros((2, 6, 3, config.width)), jnp.zeros(2, int)
+    got, cache = attend(x, ActionFeature(feature, shown), slices, causal(6), None)
+
+    def mixed(example, t):
+        earlier = [feature[example, s] for s in range(t) if shown[example, s]]
+        own = [feature[example, t]] if shown[example, t] else []
+        parts = [np.mean(part, axis=0) for part in (earlier, own) if part]
+        return np.mean(parts, axis=0) if parts else np.zeros(config.width)
+
+    for example in range(2):
+        for t in range(6):
+            np.testing.assert_allclose(got[example, t, 1], mixed(example, t), atol=1e-5, err_msg=f"{example}, {t}")
+    # with the others in a cache, in any order
+    order = np.array([3, 0, 4, 1, 2])
+    past = jax.tree.map(lambda a: a[:, order], cache)
+    last = ActionFeature(feature[:, 5:], shown[:, 5:])
+    again, _ = attend(x[:, 5:], last, slices, jnp.ones((1, 6), bool), past)
+    np.testing.assert_allclose(again[:, 0], got[:, 5], atol=1e-5)
 
 
 def test_padding_and_dead_dimensions_of_actions_are_ignored():
