@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import scipy.stats
 
-from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference
+from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference, of_sweep
 from experiments.running.ledger import DIVERGED, FINISHED
 from experiments.sweeps.sweep import Sweep
 
@@ -50,16 +50,17 @@ def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
     for sweep in sweeps:
         if not sweep.base:
             continue
+        own = of_sweep(rows, sweep.name)
         for metric, scope in LOSSES.items():
-            for role, series in all_series(rows, sweep.name).items():
-                curves = {s: curve(rows, sweep.name, metric, role, scope, s) for s in series}
+            for role, series in all_series(own, sweep.name).items():
+                curves = {s: curve(own, sweep.name, metric, role, scope, s) for s in series}
                 best = {
-                    s: lowest(points, diverged(rows, sweep.name, role, s)) for s, points in curves.items()
+                    s: lowest(points, diverged(own, sweep.name, role, s)) for s, points in curves.items()
                 }
                 base = best.get(sweep.base)
                 of_base = curves.get(sweep.base, [])
                 found += [
-                    _optimum(rows, sweep.name, metric, role, s, curves[s], point, base, of_base)
+                    _optimum(own, sweep.name, metric, role, s, curves[s], point, base, of_base)
                     for s, point in best.items()
                     if point
                 ]

@@ -13,7 +13,7 @@ import io
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +22,6 @@ from data_pipelines.publishing.files import write_file
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
-from experiments.running.sealed import read_result
 from experiments.running.trial import last_loss, trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.sweep import POINT, Point, Sweep
@@ -79,15 +78,19 @@ class Row:
 
 
 def collect(
-    sweeps: Sequence[Sweep], provenance: Provenance, trials: Path, states: dict[str, State]
+    sweeps: Sequence[Sweep],
+    provenance: Provenance,
+    trials: Path,
+    states: Mapping[str, State],
+    results: Mapping[str, dict[str, Any]],
 ) -> list[Row]:
-    """Rows of every point of every sweep, in a fixed order."""
+    """Rows of every point of every sweep, in a fixed order; `results` are those of finished trials in `trials`."""
     rows = []
     for sweep in sweeps:
         for point in sweep.points:
             id = trial_id(point.trial, provenance)
             state = states[id].event
-            result = read_result(trials / id) if state == FINISHED else None
+            result = results[id] if state == FINISHED else None
             record = read_record(trials / id) if result else None
             origin = {**dataclasses.asdict(provenance), "code": record.code if record else ""}
             rows += _rows(sweep, point, id, state, result, origin)
@@ -194,6 +197,11 @@ def read_csv(path: Path) -> list[Row]:
 def _number(text: str) -> float:
     """An int where it was one."""
     return int(text) if text.isdigit() else float(text)
+
+
+def of_sweep(rows: Iterable[Row], sweep: str) -> list[Row]:
+    """Those of one axis; a study has many more."""
+    return [r for r in rows if r.sweep == sweep]
 
 
 @dataclass(frozen=True)

@@ -54,15 +54,15 @@ def _draw(workspace: Workspace, record: Record) -> None:
     sweeps = plan_sweeps(record.study, record.axes, workspace.root)
     states = read_states(list(unique_trials(sweeps, provenance)), workspace.trials, Ledger(workspace.ledger))
     written = read_rows(workspace) if workspace.results.exists() else []
-    write_rows(workspace, collect(sweeps, provenance, workspace.trials, states))
-    rows = read_rows(workspace)  # figures show what the files say
     numbers = compute_numbers(workspace, sweeps, provenance)
+    write_rows(workspace, collect(sweeps, provenance, workspace.trials, states, numbers.results))
+    rows = read_rows(workspace)  # figures show what the files say
     checked = check_numbers(written, rows, numbers.results, numbers.windows, record.study.eval.perplexity_group)
     if checked.verdict == "bad":
         console.print(f"note: {checked.text}", markup=False, soft_wrap=True)
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
-    others = write_tables(workspace, record, sweeps, states, provenance)
+    others = write_tables(workspace, record, sweeps, states, provenance, numbers.results)
     tables = [workspace.results, workspace.robots, workspace.fits, *others]
     changes = find_changes(sweeps, provenance, numbers.windows)
     at_best = judge_at_best(sweeps, provenance, numbers.windows)

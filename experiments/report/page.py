@@ -33,7 +33,6 @@ from experiments.running.agreement import group_by_sources
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance
-from experiments.running.sealed import read_result
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, titles
@@ -58,7 +57,7 @@ def write_report(
     finished = [id for id, state in states.items() if state.event == FINISHED]
     shown = reference in finished
     dated = reference if shown else next(iter(finished), None)
-    result = read_result(workspace.trials / dated) if dated else None
+    result = numbers.results[dated] if dated else None
     robots = robots_of(rows, shown_by, provenance, numbers.windows) if shown_by else []
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
@@ -75,7 +74,7 @@ def write_report(
         section("Robots, the most controllable first", describe_robots(
             rows, shown_by, robots, workspace.data_summary
         )) if shown else "",
-        section("Trials", _trial_table(workspace, sweeps, states, provenance)),
+        section("Trials", _trial_table(sweeps, states, provenance, numbers.results)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
     ]  # fmt: skip
     page = (
@@ -207,14 +206,17 @@ def _clips(path: Path, record: Record, robots: Sequence[Robot]) -> str:
 
 
 def _trial_table(
-    workspace: Workspace, sweeps: Sequence[Sweep], states: dict[str, State], provenance: Provenance
+    sweeps: Sequence[Sweep],
+    states: dict[str, State],
+    provenance: Provenance,
+    results: Mapping[str, Mapping[str, Any]],
 ) -> str:
     lines, names = [], titles(sweeps, provenance)
     for id, name in names.items():
         state = states[id]
         cells = ["–", "–", "–", "–"]
         if state.event == FINISHED:
-            result = read_result(workspace.trials / id)
+            result = results[id]
             run, loss = result["run"], training_loss(result)
             cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
                      f"{loss.mean:.3f}"]  # fmt: skip

@@ -30,12 +30,13 @@ from experiments.report.plot_style import (
     show_nothing,
     show_tally,
 )
-from experiments.rows import UNTRAINED, CurvePoint, Row, curve
+from experiments.rows import UNTRAINED, CurvePoint, Row, curve, of_sweep
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 
 def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
     """One axis: a panel per metric."""
+    rows = of_sweep(rows, sweep.name)
     with plt.rc_context(STYLE):
         if sweep.labels:
             figure = plot_names(rows, sweep)
@@ -66,8 +67,9 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
             layout="constrained", squeeze=False,
         )  # fmt: skip
         for column, sweep in enumerate(sweeps):
+            own = of_sweep(rows, sweep.name)
             for panel, metric in zip(panels[:, column], metrics, strict=True):
-                _draw(panel, rows, sweep, metric, legend=not column)
+                _draw(panel, own, sweep, metric, legend=not column)
                 if column:
                     panel.set_ylabel("")
         save(figure, path)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from experiments.analysis.controllability import Controlled, beyond, controllability
 from experiments.report.pieces import pm, table
-from experiments.rows import OVERALL, CurvePoint, Row, curve
+from experiments.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Sweep
@@ -93,8 +93,8 @@ def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
 
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:
     """A line per robot, and the mean; data.json says how much there was of each."""
-    data = read_data(data_summary)
-    measured = {r.metric for r in rows if r.sweep == sweep.name}
+    data, rows = read_data(data_summary), of_sweep(rows, sweep.name)
+    measured = {r.metric for r in rows}
     metrics = [m for m in COLUMNS if m in measured]
     follows = [m for m in FOLLOWS if any(m in r.follows for r in robots)]
     shares = {r.name: line.explained for r in robots for line in r.follows.values() if not math.isnan(line.explained)}

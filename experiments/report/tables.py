@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from experiments.report.robots import read_data
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
-from experiments.running.sealed import read_result
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, control_of, reference_trial, titles, unique_trials
@@ -19,7 +18,12 @@ if TYPE_CHECKING:
 
 
 def write_tables(
-    workspace: Workspace, record: Record, sweeps: Sequence[Sweep], states: Mapping[str, State], provenance: Provenance
+    workspace: Workspace,
+    record: Record,
+    sweeps: Sequence[Sweep],
+    states: Mapping[str, State],
+    provenance: Provenance,
+    results: Mapping[str, dict[str, Any]],
 ) -> list[Path]:
     """Writes trials.parquet and, where reference trials kept the numbers of their windows, controllability.csv: of them
     and of their controls."""
@@ -33,7 +37,7 @@ def write_tables(
     there = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
     for id, trial in unique_trials(sweeps, provenance).items():
         state = states[id].event
-        result = read_result(workspace.trials / id) if state == FINISHED else None
+        result = results[id] if state == FINISHED else None
         loss = training_loss(result).mean if result else 0.0
         rows.append(trial_row(id, names[id], state, trial, provenance, result, loss, there))
     write_trials(workspace.trial_table, rows)

@@ -12,6 +12,7 @@ A trial's directory holds
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -100,6 +101,7 @@ def trajectories_of(trial: Trial, there: Mapping[str, int]) -> dict[str, int]:
     }
 
 
+@functools.cache
 def trial_id(trial: Trial, provenance: Provenance) -> str:
     """The name of a trial: equal exactly when everything that determines it is equal."""
     return stable_hash({"trial": _identity(trial), "provenance": to_dict(provenance)})

@@ -18,6 +18,8 @@ from hma_jax.config.base import require
 
 def to_dict(config: Any) -> Any:
     """Plain JSON types from a config (dataclasses, tuples and scalars, nested)."""
+    if config is None or isinstance(config, (str, int, float)):  # most of what there is
+        return config
     if dataclasses.is_dataclass(config):
         return {f.name: to_dict(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if isinstance(config, (tuple, list)):

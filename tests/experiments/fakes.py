@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.presets import SMOKE
+from experiments.report.numbers import read_results
 from experiments.rows import Row, collect
 from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
@@ -74,7 +75,8 @@ def rows_of(workspace: Workspace, sweeps: Sequence[Sweep]) -> list[Row]:
     """The rows that `draw` would draw, without drawing."""
     ids = list(unique_trials(sweeps, PROVENANCE))
     states = read_states(ids, workspace.trials, Ledger(workspace.ledger))
-    return collect(sweeps, PROVENANCE, workspace.trials, states)
+    results, _ = read_results(workspace, ids)
+    return collect(sweeps, PROVENANCE, workspace.trials, states, results)
 
 
 def best_rate(trial: Trial) -> float:
