@@ -107,7 +107,7 @@ def _rows(
         return Row(
             sweep=sweep.name, x=point.x, label=sweep.label(point.x), role=role, series=point.series,
             seed=point.trial.train.seed, trial=id, status=state,
-            scope=scope, metric=metric, **dataclasses.asdict(stat),
+            scope=scope, metric=metric, **vars(stat),
             parameters=result["parameters"] if result else 0,
             train_flops=result["train_flops"] if result else 0.0,
             **origin,
@@ -173,7 +173,7 @@ def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
     with open(aside, "w", newline="") as file:
         writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(kind)], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(dataclasses.asdict(row) for row in rows)
+        writer.writerows(vars(row) for row in rows)
     os.replace(aside, path)
 
 
