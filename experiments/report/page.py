@@ -74,7 +74,7 @@ def write_report(
         section("Robots, the most controllable first", describe_robots(
             rows, shown_by, robots, workspace.data_summary
         )) if shown else "",
-        section("Trials", _trial_table(sweeps, states, provenance, numbers.results)),
+        section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
     ]  # fmt: skip
     page = (
@@ -206,6 +206,7 @@ def _clips(path: Path, record: Record, robots: Sequence[Robot]) -> str:
 
 
 def _trial_table(
+    workspace: Workspace,
     sweeps: Sequence[Sweep],
     states: dict[str, State],
     provenance: Provenance,
@@ -220,7 +221,7 @@ def _trial_table(
             run, loss = result["run"], training_loss(result)
             cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
                      f"{loss.mean:.3f}"]  # fmt: skip
-        message = html.escape(state.message)
+        message = html.escape(state.message.replace(f"{workspace.root}/", ""))  # a page may be read elsewhere
         status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
         lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
     done = sum(states[id].event == FINISHED for id in names)

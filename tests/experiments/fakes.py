@@ -12,7 +12,7 @@ import numpy as np
 from experiments.presets import SMOKE
 from experiments.report.numbers import read_results
 from experiments.rows import Row, collect
-from experiments.running.attempts import read_states
+from experiments.running.attempts import OUTPUT, read_states
 from experiments.running.ledger import Ledger
 from experiments.running.provenance import Provenance, Start, TrialRecord
 from experiments.running.sealed import write_result
@@ -56,7 +56,7 @@ def finished_study(
         directory.mkdir(parents=True)
         state = next((s for words, s in (broken or {}).items() if words in names[id]), None)
         if state:
-            ledger.append(id, state, message="the loss is <nan> at step 2")
+            ledger.append(id, state, message=f"the loss is <nan> at step 2; output in {directory / OUTPUT}")
             continue
         ledger.append(id, "finished")
         (directory / "job.json").write_text(json.dumps({"trial": to_dict(trial), "provenance": to_dict(PROVENANCE),

@@ -230,22 +230,28 @@ def expectations() -> dict[tuple[str, str, str], Expected]:
 
 
 def grid_rows(sweep: str, digits: int) -> list[str]:
-    """The lines of findings.md on an axis of several curves: held-out nats along each, in brackets what was predicted,
-    bold where that did not hold."""
+    """The lines of findings.md on an axis of several curves: held-out nats along each, or how far behind another point
+    where that was predicted, in brackets what was predicted, bold where that did not hold."""
     rows, expected = read_rows(Workspace(RESULTS / "cpu-full")), expectations()
     lines = []
     for series in dict.fromkeys(r.series for r in rows if (r.sweep, r.role) == (sweep, POINT)):
         cells = [series]
-        for point in curve(rows, sweep, "cross_entropy", series=series):
-            e, came = expected.get((sweep, series, f"{point.x:g}")), f"{point.mean:.{digits}f}"
+        points = {f"{p.x:g}": p for p in curve(rows, sweep, "cross_entropy", series=series)}
+        for x, point in points.items():
+            e = expected.get((sweep, series, x))
+            mean = difference(point, points[e.against])[0] if e is not None and e.against else point.mean
+            came = f"{mean:.{digits}f}"
             if e is not None:
-                came += f" ({e.mean:.{digits}f})" if e.low <= point.mean <= e.high else f" (**{e.mean:.{digits}f}**)"
+                came += f" ({e.mean:.{digits}f})" if e.low <= mean <= e.high else f" (**{e.mean:.{digits}f}**)"
             cells.append(came)
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 
 
-@pytest.mark.parametrize(("sweep", "digits", "curves"), [("lr_horizon", 3, 2), ("compute", 2, 4), ("episodes", 2, 3)])
+FAMILIES = [("lr_horizon", 3, 2), ("compute", 2, 4), ("episodes", 2, 3), ("fewshot", 2, 5)]
+
+
+@pytest.mark.parametrize(("sweep", "digits", "curves"), FAMILIES)
 def test_an_axis_of_several_curves_is_as_findings_say(sweep, digits, curves):
     page, lines = findings(), grid_rows(sweep, digits)
     assert len(lines) == curves

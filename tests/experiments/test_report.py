@@ -80,7 +80,8 @@ def test_page_is_self_contained_and_names_what_failed(drawn):
     page = drawn.report.read_text()
     assert not re.findall(r'(?:src|href)="(?!data:)', page) and "http" not in page
     assert page.count("data:image/png;base64,") >= 1 + 3 * 3  # curves, and three strips of three datasets
-    assert 'class="diverged"' in page and "the loss is &lt;nan&gt; at step 2" in page
+    assert 'class="diverged"' in page and "the loss is &lt;nan&gt; at step 2; output in trials/" in page
+    assert str(drawn.root) not in page
     for fact in ("hma study", PROVENANCE.tokenizer, "abacus", "1 trial(s) have no result"):
         assert fact in page
 
