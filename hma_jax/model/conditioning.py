@@ -78,7 +78,8 @@ class CrossAttention(nnx.Module):
     compute what it was trained to. A frame to which no action is shown gets nothing.
 
     Keys carry no time, so the frame's own action is told from earlier ones by its weight: before anything is learned
-    it has as much as all of those together. Without this, models hardly follow actions (cpu-full's findings).
+    it has as much as all of those together. Even so, models follow actions less than in the other ways (cpu-full's
+    findings).
     """
 
     def __init__(self, config: ModelConfig, embodiments: int):
