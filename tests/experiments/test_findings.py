@@ -113,6 +113,8 @@ def test_robots_that_do_not_stay_robots_are_as_findings_say():
         tools=shares[32_000, "tool", "model"], objects=shares[32_000, "object", "model"],
     )  # fmt: skip
     assert said in page, said
+    late = float(shares[32_000, "all", "model"].split()[0])
+    assert f"of what moved, {late:.0f} % stands in place in the last frame" in readme()
     assert "half of it is more than {} pixels off, in a still picture {}".format(*medians[32_000]) in page
 
 
