@@ -114,8 +114,33 @@ def test_robots_that_do_not_stay_robots_are_as_findings_say():
     )  # fmt: skip
     assert said in page, said
     late = float(shares[32_000, "all", "model"].split()[0])
-    assert f"of what moved, {late:.0f} % stands in place in the last frame" in readme()
+    assert f"After 32,000, {late:.0f} % of what moved stands in place in the last frame" in readme()
     assert "half of it is more than {} pixels off, in a still picture {}".format(*medians[32_000]) in page
+
+
+def test_what_knowing_robots_is_worth_to_new_ones_is_as_findings_say():
+    rows, page = read_rows(Workspace(RESULTS / "cpu-full")), " ".join(findings().split())
+    found = {
+        name: curve(rows, "fewshot", "cross_entropy", series=series)
+        for name, series in {
+            "new": "from scratch", "5": "after 5 robots", "20": "after 20 robots", "40": "after 40 robots",
+            "whole": "after 40 robots, everything trained",
+        }.items()
+    }  # fmt: skip
+
+    def behind(a: str, b: str) -> list[tuple[float, float]]:
+        return [difference(p, q) for p, q in zip(found[a], found[b], strict=True)]
+
+    four, sixteen, all_of_them = (f"{mean:.2f} ± {error:.2f}" for mean, error in behind("new", "40"))
+    assert f"**Knowing 40 robots is worth {four}, {sixteen} and {all_of_them} nats**" in page
+    for a, b in (("20", "40"), ("5", "20")):
+        steps = [mean for mean, _ in behind(a, b)]
+        assert f"{min(steps):.2f} to {max(steps):.2f} ahead" in page, (a, b, steps)
+    _, (worse, error), (level, beside) = behind("5", "new")
+    assert f"({level:.2f} ± {beside:.2f} behind) and {worse:.2f} ± {error:.2f} behind it with 16" in page
+    first, second, third = (mean for mean, _ in behind("whole", "40"))
+    said = f"training all is {-third:.2f} ahead with 64 trajectories, {second:.2f} behind with 16, and {first:.2f} behind"
+    assert f"{said} with 4" in page, said
 
 
 def rates_rows() -> list[str]:
