@@ -31,7 +31,7 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"(?<!`)`((?:hma|make|python -m)\b[^`]*)`(?!`)")
 STARTS = ("hma", "make", "pip", "python")
 TOP = ("hma_jax/", "data_pipelines/", "experiments/", "tests/", "docs/", ".ci/")
-MENTIONED = re.compile(r"(?<!`)`([^`\s]+)`|\]\(([^)\s#]+)\)")
+MENTIONED = re.compile(r"(?<!`)`([^`\s]+)`|\]\(([^)\s]+)\)")
 
 QUICK = (
     "hma data list open-x",
@@ -224,9 +224,27 @@ def paths(page: Path) -> Iterator[tuple[str, Path]]:
     """(as it is written, what it must be) of every path of the project that a page mentions."""
     for quoted, link in MENTIONED.findall(BLOCK.sub("", page.read_text())):
         if link and "://" not in link:
-            yield link, page.parent / link
+            yield link, (page if link[0] == "#" else page.parent / link.split("#")[0])
         elif quoted.startswith(TOP):
             yield quoted, ROOT / quoted.removesuffix("/").split("::")[0]
+
+
+def anchors(page: Path) -> set[str]:
+    """What `#...` may name in a page of Markdown: its headings, in lower case, without signs, spaces as dashes."""
+    headings = re.findall(r"^#+ (.*)$", BLOCK.sub("", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_every_heading_that_is_linked_exists():
+    linked = [
+        (page.name, link, target, link.partition("#")[2])
+        for page in PAGES
+        for link, target in paths(page)
+        if "#" in link and target.suffix == ".md"
+    ]
+    wrong = [f"{page}: {link}" for page, link, target, anchor in linked if anchor not in anchors(target)]
+    assert not wrong, "\n".join(wrong)
+    assert len(linked) > 5
 
 
 def test_every_path_that_is_mentioned_exists():

@@ -31,7 +31,7 @@ from experiments.rows import UNTRAINED, CurvePoint, Row, curve, training_loss
 from experiments.running.agreement import describe as describe_sources
 from experiments.running.agreement import group_by_sources
 from experiments.running.attempts import State
-from experiments.running.ledger import FINISHED
+from experiments.running.ledger import FINISHED, name_within
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
@@ -221,7 +221,7 @@ def _trial_table(
             run, loss = result["run"], training_loss(result)
             cells = [f"{result['parameters']:,}", f"{result['train_flops']:.2e}", f"{run['seconds']:.0f} s",
                      f"{loss.mean:.3f}"]  # fmt: skip
-        message = html.escape(state.message.replace(f"{workspace.root}/", ""))  # a page may be read elsewhere
+        message = html.escape(name_within(workspace.root, state.message))
         status = f'<span class="{state.event}">{state.event}</span>' + (f" {message}" if message else "")
         lines.append([f"<code>{id}</code>", html.escape(name), status, *cells])
     done = sum(states[id].event == FINISHED for id in names)

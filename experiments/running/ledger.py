@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -65,13 +66,23 @@ class Ledger:
         return last
 
     def append(self, trial: str, event: str, **details: Any) -> None:
-        """Adds one line and waits until it is on disk."""
+        """Adds one line and waits until it is on disk. A `message` names files as seen from the study's directory."""
+        if "message" in details:
+            details["message"] = name_within(self.path.parent, details["message"])
         line = json.dumps({"time": round(self.clock(), 3), "trial": trial, "event": event, **details})
         with open(self.path, "ab+") as file:
             _cut_torn_line(file)
             file.write(line.encode() + b"\n")
             file.flush()
             os.fsync(file.fileno())
+
+
+def name_within(root: Path, message: str) -> str:
+    """`message` with the files under `root` named as seen from there: ledgers and pages are read on other machines."""
+    for place in (root.resolve(), root):
+        if place != Path("."):
+            message = re.sub(rf"(?<![\w./-]){re.escape(str(place))}/", "", message)
+    return message
 
 
 def _cut_torn_line(file: Any) -> None:

@@ -1,6 +1,7 @@
 """The ledger keeps every whole line through a torn write; a workspace has one writer at a time."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -21,6 +22,16 @@ def test_last_line_of_a_trial_is_its_state(ledger):
     states = ledger.states()
     assert states["a"] == {"time": 7.0, "trial": "a", "event": "failed", "message": "no luck"}
     assert states["b"]["event"] == "running"
+
+
+def test_messages_name_files_as_seen_from_the_study(ledger, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path.parent)
+    near = Path(tmp_path.name)  # as the user gave it
+    ledger.append("a", "failed", message=f"no checkpoint in {tmp_path}/trials/b/run; remove {tmp_path}/trials/b")
+    Ledger(near / "ledger.jsonl").append("b", "lost", message=f"output in {near}/trials/b, not in /else/{near}/c")
+    messages = [record["message"] for record in ledger.records()]
+    assert messages[0] == "no checkpoint in trials/b/run; remove trials/b"
+    assert messages[1] == f"output in trials/b, not in /else/{near}/c"
 
 
 def test_lines_of_earlier_versions_are_read_in_todays_words(ledger):
