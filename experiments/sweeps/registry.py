@@ -23,7 +23,7 @@ SCALING = ("datasets", "trajectories", "width")
 DESIGNS = ("dilution", "transfer", "newcomers", "fewshot", "episodes", "compute", "horizon", "lr_horizon")
 """Those of a study that is to be believed (`DesignConfig`)."""
 
-AXES = (*SCALING, "settings", "conditioning", "lr", *DESIGNS)
+AXES = (*SCALING, "settings", "conditioning", "ladder", "lr", *DESIGNS)
 """Each is `experiments.sweeps.<name>`."""
 
 Plan = Callable[[Study], Sweep]

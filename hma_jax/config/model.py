@@ -85,6 +85,9 @@ class ModelConfig:
     # to it then arrives through temporal attention) or the one that led to it (`causal`).
     action_alignment: Literal["released", "causal"] = "released"
     action_heads: bool = True  # what predicts actions; forward dynamics does without
+    # What stands at a masked token: one learned vector and, where `recall`, what was there in the frame before, so that
+    # the first block already sees what is to move. DIFFERS: the release has the vector alone.
+    recall: bool = False
     mlp_ratio: float = 4.0
     qkv_bias: bool = False
     proj_bias: bool = True

@@ -96,6 +96,9 @@ class OptimizerConfig:
     epsilon: float = 1e-8
     weight_decay: float = 0.05
     clip_norm: float = 1.0
+    # How matrices between two widths of the trunk are moved: as everything else is, or along their momentum made
+    # orthogonal (Muon; Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
+    matrices: Literal["adamw", "muon"] = "adamw"
 
     def __post_init__(self):
         require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")

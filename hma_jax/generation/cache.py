@@ -72,10 +72,11 @@ class Window(NamedTuple):
         cache = self.empty(batch, room)
         return cache.write(self._pass(frames, None, 0, remember=count, said_from=count).cache, 0) if count else cache
 
-    def query(self, cache: FrameCache, frame: Frame, at: int | jax.Array) -> jax.Array:
-        """What the model says [B, S, ...] of a partly masked frame at position `at`."""
+    def query(self, cache: FrameCache, last: jax.Array, frame: Frame, at: int | jax.Array) -> jax.Array:
+        """What the model says [B, S, ...] of a partly masked frame at position `at`, after frame `last` [B, S (, C)]."""
         visible = jnp.append(cache.valid, True)[None]
-        said = self._pass(frame.values[:, None], frame.masked[:, None], at, cache.layers, visible).said
+        options = {"before": last[:, None]}
+        said = self._pass(frame.values[:, None], frame.masked[:, None], at, cache.layers, visible, **options).said
         return said[:, 0]
 
     def extend_and_query(

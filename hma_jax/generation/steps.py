@@ -21,13 +21,13 @@ def fill(
 ) -> tuple[FrameCache, jax.Array]:
     """Frame t at position t; `last` [B, S (, C)] is frame t - 1, which enters the cache."""
     cache, said = window.extend_and_query(cache, last[:, None], t - 1, t - 1)
-    return cache, _decode(window, cache, said, t, key_B, decode)
+    return cache, _decode(window, cache, last, said, t, key_B, decode)
 
 
 def slide(window: Window, past: jax.Array, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     """The frame at the last position after `past` [B, T - 1, S (, C)]."""
     cache, said = window.extend_and_query(None, past, 0, 0)
-    return _decode(window, cache, said, past.shape[1], key_B, decode)
+    return _decode(window, cache, past[:, -1], said, past.shape[1], key_B, decode)
 
 
 def stream(
@@ -41,18 +41,19 @@ def stream(
     oldest = (t - 1) % end  # the slot of frame t - T, which leaves the window
     stood_at = jnp.array([end, end])  # frame t - 1 was at the last position when it was made
     cache, said = window.extend_and_query(cache, last[:, None], end - 1, oldest, stood_at)
-    return cache, _decode(window, cache, said, end, key_B, decode)
+    return cache, _decode(window, cache, last, said, end, key_B, decode)
 
 
 def _decode(
     window: Window,
     cache: FrameCache,
+    last: jax.Array,
     said: jax.Array,
     at: int | jax.Array,
     key_B: jax.Array,
     decode: DecodeConfig,
 ) -> jax.Array:
     def predict(frame: Frame) -> jax.Array:
-        return window.query(cache, frame, at)
+        return window.query(cache, last, frame, at)
 
     return decode_frame(window.model, said, predict, key_B, decode)

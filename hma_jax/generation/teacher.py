@@ -57,6 +57,7 @@ def next_frames(
             visible=jnp.concatenate([causal(count), jnp.eye(count, dtype=bool)], axis=1),
             first=1,
             past=out.cache,
+            before=frames[:, :-1],
         )
         return _by_frame(out_of_past.said)
 

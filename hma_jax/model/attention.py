@@ -43,11 +43,13 @@ class Attention(nnx.Module):
         width, heads, head = config.width, config.heads, config.head_width
         # The fans are those of the fused (3D, D) matrix of the release.
         init = trunk_init(config, width, 3 * width)
-        self.qkv = param((width, 3, heads, head), ("D", None, "H", None), init, role="hidden")
+        shape, axes = (width, 3, heads, head), ("D", None, "H", None)
+        self.qkv = param(shape, axes, init, role="hidden", matrix=((-4,), (-2, -1)))
         shape, axes = (3, heads, head), (None, "H", None)
         self.qkv_bias = bias(shape, axes) if config.qkv_bias else None
         init = trunk_init(config, width, width)
-        self.out = param((heads, head, width), ("H", None, "D"), init, role="hidden")
+        shape, axes = (heads, head, width), ("H", None, "D")
+        self.out = param(shape, axes, init, role="hidden", matrix=((-3, -2), (-1,)))
         self.out_bias = bias((width,), ("D",)) if config.proj_bias else None
         self.norm = LayerNorm(head, axis=None) if config.qk_norm else None
         self.scale, self.backend = attention_scale(config), execution.attention

@@ -44,6 +44,7 @@ def look_beside(
         visible=beside(causal(count)),
         positions=jnp.concatenate([jnp.arange(count), jnp.arange(1, count + 1)]),
         remember=remember,
+        before=jnp.concatenate([before, before], axis=1),
         said_from=count,
         slice_B=slice_B,
     )

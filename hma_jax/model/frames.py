@@ -13,10 +13,10 @@ from flax import nnx
 
 from hma_jax.config import DiffusionConfig, ModelConfig
 from hma_jax.kernels.dense import look_up
-from hma_jax.kernels.pointwise import replaced
+from hma_jax.kernels.pointwise import replaced, scaled
 from hma_jax.model.initial import input_fan_out, readout_init, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
-from hma_jax.model.params import normal, param, used, xavier_uniform, zeros
+from hma_jax.model.params import normal, ones, param, used, xavier_uniform, zeros
 
 
 def factorise(tokens: jax.Array, factors: int, vocab: int) -> jax.Array:
@@ -118,6 +118,19 @@ class Condition(nnx.Module):
         """[B, T, S, D] of frames at window positions `positions_T` -> float32 of that shape."""
         z = self.norm(self.linear(x_BTSD)).astype(jnp.float32)
         return z + jnp.take(self.positions.get_value(), positions_T, axis=0)
+
+
+class Recall(nnx.Module):
+    """At masked tokens also what stood there in the frame before (`ModelConfig.recall`)."""
+
+    def __init__(self, config: ModelConfig):
+        self.gain = param((config.width,), ("D",), ones, role="vector")
+
+    def __call__(self, x: jax.Array, masked: jax.Array, before: jax.Array) -> jax.Array:
+        """x [..., S, D] of tokens that are `masked`, bool [..., S] or [..., S, cells], and the same places a frame earlier."""
+        if masked.ndim == x.ndim:
+            masked = masked.any(axis=-1)
+        return x + jnp.where(masked[..., None], scaled(before, self.gain.get_value()), 0)
 
 
 def make_embed(config: ModelConfig) -> nnx.Module:

@@ -17,7 +17,7 @@ from hma_jax.config.training import ActionLeak
 from hma_jax.kernels.pointwise import over_tokens, replaced, shifted
 from hma_jax.model.conditioning import ActionFeature
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.frames import make_embed, make_frame_head
+from hma_jax.model.frames import Recall, make_embed, make_frame_head
 from hma_jax.model.heads import Denoiser, make_action_head
 from hma_jax.model.layers import FINE_EPS, LayerNorm
 from hma_jax.model.params import Declared, declare, param, used, zeros
@@ -45,6 +45,7 @@ class HMA(nnx.Module):
     def __init__(self, config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig):
         self.config, self.table, self.dtype = config, table, jnp.dtype(execution.dtype)
         self.embed = make_embed(config)
+        self.recall = Recall(config) if config.recall else None
         shape = (config.frames, config.position_slots, config.width)
         self.positions = param(shape, ("T", "P", "D"), zeros, role="vector")
         self.norm = LayerNorm(config.width, eps=FINE_EPS) if config.diffusion else None
@@ -74,6 +75,7 @@ class HMA(nnx.Module):
         first: int | jax.Array = 0,
         positions: jax.Array | None = None,
         past: TemporalCache | None = None,
+        before: jax.Array | None = None,
         remember: int = 0,
         said_from: int = 0,
         slice_B: jax.Array | None = None,
@@ -97,6 +99,8 @@ class HMA(nnx.Module):
             visible = causal(count)
         slice_B = embodiment_B if slice_B is None else slice_B
         x = self.embed(frames, masked, self.dtype)
+        if self.recall is not None and masked is not None:
+            x = self.recall(x, masked, self._seen_before(frames, masked, before))
         action = None
         if actions_BTU is not None:
             feature = self.stem(actions_BTU, embodiment_B, slice_B, self.dtype)
@@ -113,6 +117,16 @@ class HMA(nnx.Module):
         x = x[:, said_from:, : config.tokens]
         said = self.frame_head(x, positions[said_from:]) if config.diffusion else self.frame_head(x)
         return Outputs(said, pooled, cache)
+
+    def _seen_before(self, frames: jax.Array, masked: jax.Array, before: jax.Array | None) -> jax.Array:
+        """[B, T, S, D] of the frame before each: of `before`, or of the one that precedes it in `frames`, where that is
+        shown."""
+        if before is not None:
+            return self.embed(before, None, self.dtype)
+        x = self.embed(frames, None, self.dtype)
+        known = ~(masked.any(axis=-1) if masked.ndim > x.ndim - 1 else masked)
+        x = jnp.where(known[..., None], x, 0)
+        return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
     def _action_tokens(
         self, feature_BTD: jax.Array, hidden_BT: jax.Array | None, leak: ActionLeak, positions: jax.Array

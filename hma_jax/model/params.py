@@ -36,6 +36,9 @@ Use = Literal["always", "actions_shown", "actions_hidden", "actions_predicted", 
 """Which examples a parameter has to do with. In a step without one it stands still, as an absent
 robot's do: no update, no decay, no count."""
 
+MatrixAxes = tuple[tuple[int, ...], tuple[int, ...]]
+"""The axes, counted from the last, that a `hidden` parameter maps from and to. Along others there are more such matrices."""
+
 Initializer = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 """init(rng, shape) -> float32 array."""
 
@@ -54,6 +57,7 @@ class ParamSpec:
     init: Initializer
     use: Use = "always"
     precise: bool = False  # used in float32, whatever type the model computes in
+    matrix: MatrixAxes = ((-2,), (-1,))
 
     @property
     def embodiment_axis(self) -> int | None:
@@ -77,6 +81,7 @@ def param(
     role: Role,
     decay: bool = True,
     precise: bool = False,
+    matrix: MatrixAxes = ((-2,), (-1,)),
 ) -> nnx.Param:
     """Declares one float32 parameter. `axes` names each dimension of `shape` (None: unnamed).
 
@@ -84,7 +89,7 @@ def param(
     """
     require(len(shape) == len(axes), f"a parameter of shape {shape} needs {len(shape)} axes, got {axes}")
     about = {"axes": axes, "init": init, "role": role, "decay": decay, "use": "always", "precise": precise}
-    return nnx.Param(jnp.zeros(shape, jnp.float32), **about)
+    return nnx.Param(jnp.zeros(shape, jnp.float32), **about, matrix=matrix)
 
 
 def bias(shape: tuple[int, ...], axes: tuple[str | None, ...]) -> nnx.Param:
@@ -253,4 +258,4 @@ def path_name(path: tuple[Any, ...]) -> str:
 def _spec(variable: nnx.Param) -> ParamSpec:
     shape = tuple(variable.get_value().shape)
     v = variable
-    return ParamSpec(shape, tuple(v.axes), v.role, v.decay, v.init, v.use, v.precise)
+    return ParamSpec(shape, tuple(v.axes), v.role, v.decay, v.init, v.use, v.precise, v.matrix)

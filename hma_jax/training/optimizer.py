@@ -1,4 +1,4 @@
-"""AdamW with muP multipliers, in which what a step does not concern stands still.
+"""AdamW, and Muon for matrices, with muP multipliers; what a step does not concern stands still.
 
 Multipliers, decay mask, embodiment axes and uses are read off the parameter declarations. A
 robot without an example in the global batch keeps its slices, moments and bias-correction
@@ -14,6 +14,7 @@ from typing import NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import optax
+import optax.contrib
 
 from hma_jax.config import ModelConfig, OptimizerConfig
 from hma_jax.model.params import Params, ParamSpec, Use, is_spec
@@ -92,7 +93,28 @@ def init_adam(params: Params, embodiments: int) -> AdamState:
     )
 
 
-def apply_adamw(
+MUON_MOMENTUM = 0.95
+MUON_GAIN = 0.2
+"""Root mean square of a square matrix's update in units of the rate, about what Adam's is (Liu et al. 2025), so that both
+take the same rate."""
+
+
+def muon_direction(momentum: jax.Array, spec: ParamSpec, multiplier: float) -> jax.Array:
+    """What a `hidden` parameter is moved along, in units of the rate at the base width: each of its matrices made
+    orthogonal, so that all its singular values are about 1.
+
+    muP wants the spectral norm of an update to stay as it is at the base width (Yang et al. 2023): its root mean square
+    falls as 1 / sqrt(m) of itself, so of `multiplier`, 1 / m, only the root is left to apply to the size.
+    """
+    axes = [tuple(len(spec.shape) + axis for axis in side) for side in spec.matrix]
+    numbers = optax.contrib.MuonDimensionNumbers(*axes)
+    orthogonalise = optax.contrib.scale_by_muon(beta=0.0, nesterov=False, weight_dimension_numbers=numbers)
+    orthogonal, _ = orthogonalise.update(momentum, orthogonalise.init(momentum))
+    longest = max(math.prod(spec.shape[axis] for axis in side) for side in axes)
+    return MUON_GAIN * math.sqrt(longest * multiplier) * orthogonal
+
+
+def apply_update(
     grads: Params,
     state: AdamState,
     params: Params,
@@ -105,7 +127,8 @@ def apply_adamw(
     """New parameters and state after one step.
 
     p <- p - rate * (multiplier * adam + weight_decay * p), the second term only where the
-    declaration says so. Weight decay is not divided by m: muP scales a hidden matrix's decay
+    declaration says so; with `config.matrices` muon, matrices between two widths take `muon_direction` in place of the
+    first, of their momentum with one look ahead, and have no second moment. Weight decay is not divided by m: muP scales a hidden matrix's decay
     up as much as its rate down (reference section 4.4).
     """
     count = {use: n + presence.shared[use] for use, n in state.count.items()}
@@ -115,11 +138,17 @@ def apply_adamw(
     def update(p, g, m, v, spec: ParamSpec, multiplier: float):
         # The count may be 0 before a first example; its (unused) correction must stay finite.
         steps = jnp.maximum(_own(spec, count, count_E), 1).astype(jnp.float32)
-        new_m = b1 * m + (1 - b1) * g
-        new_v = b2 * v + (1 - b2) * jnp.square(g)
-        adam = new_m / (1 - b1**steps) / (jnp.sqrt(new_v / (1 - b2**steps)) + config.epsilon)
+        if config.matrices == "muon" and spec.role == "hidden":
+            mu = MUON_MOMENTUM
+            new_m, new_v = mu * m + (1 - mu) * g, v
+            move = muon_direction(mu * new_m + (1 - mu) * g, spec, multiplier)
+        else:
+            new_m = b1 * m + (1 - b1) * g
+            new_v = b2 * v + (1 - b2) * jnp.square(g)
+            adam = new_m / (1 - b1**steps) / (jnp.sqrt(new_v / (1 - b2**steps)) + config.epsilon)
+            move = multiplier * adam
         decay = config.weight_decay * p if spec.decay else 0.0
-        new_p = p - learning_rate * (multiplier * adam + decay)
+        new_p = p - learning_rate * (move + decay)
         return tuple(jnp.where(presence.of(spec), new, old) for new, old in ((new_p, p), (new_m, m), (new_v, v)))
 
     leaves, treedef = jax.tree.flatten(params)

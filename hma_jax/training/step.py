@@ -19,7 +19,7 @@ from hma_jax.training import robots
 from hma_jax.training.average import update_average
 from hma_jax.training.optimizer import (
     Presence,
-    apply_adamw,
+    apply_update,
     clip_by_global_norm,
     keep_own,
     learning_rate_multiplier,
@@ -119,7 +119,7 @@ def make_train_step(
         rate = schedule(state.step)
         presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT)
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
-        new, adam = apply_adamw(
+        new, adam = apply_update(
             grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer
         )
         params = robots.put(state.params, new, specs, active)

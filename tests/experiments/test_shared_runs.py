@@ -14,7 +14,7 @@ from experiments.running import trial as trial_module
 from experiments.running.attempts import RUN
 from experiments.running.runner import Job
 from experiments.running.shared_runs import begin_shared, share_runs
-from experiments.running.trial import LATER, Trial, trial_id
+from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
 from hma_jax.config import DiffusionConfig
@@ -92,14 +92,20 @@ def test_jobs_of_the_designs_wait_for_their_sources_and_siblings():
     assert len({j.title for j in jobs.values()}) == len(jobs)
 
 
-def test_fields_that_came_later_do_not_change_the_name_of_a_trial():
+FIRST = {"capped": [], "source": None}
+"""What came later before anything else did."""
+
+
+def test_fields_that_came_later_do_not_change_the_name_of_a_trial(monkeypatch):
     """Named as before there were `capped` and `source`, where a trial has neither."""
+    monkeypatch.setattr(trial_module, "LATER", FIRST)
+    name = trial_id.__wrapped__  # not what is remembered, nor to be remembered
     plain = reference_trial(SMOKE, 0)
-    fields = {name: value for name, value in to_dict(plain).items() if name not in ("capped", "source")}
-    assert trial_id(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
+    fields = {field: value for field, value in to_dict(plain).items() if field not in FIRST}
+    assert name(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
     others = [replace(plain, capped=("arm_night",)), replace(plain, source=plain)]
     others.append(replace(plain, source=replace(plain, tau=1.0)))
-    assert len({trial_id(one, PROVENANCE) for one in (plain, *others)}) == 4
+    assert len({name(one, PROVENANCE) for one in (plain, *others)}) == 4
 
 
 def test_a_field_within_a_configuration_may_come_later(monkeypatch):
@@ -113,8 +119,10 @@ def test_a_field_within_a_configuration_may_come_later(monkeypatch):
     for one in (fields, fields["source"]):
         del one["train"]["masking"]["own_past"], one["capped"]
     del fields["source"]["source"]
-    monkeypatch.setitem(LATER, "train.masking.own_past", plain.train.masking.own_past)
-    monkeypatch.setitem(LATER, "model.diffusion.depth", DiffusionConfig().depth)
+    within = {
+        "train.masking.own_past": plain.train.masking.own_past, "model.diffusion.depth": DiffusionConfig().depth,
+    }  # fmt: skip
+    monkeypatch.setattr(trial_module, "LATER", FIRST | within)
     name = trial_id.__wrapped__  # not what is remembered, nor to be remembered
     assert name(plain, PROVENANCE) == stable_hash({"trial": fields, "provenance": to_dict(PROVENANCE)})
     assert len({name(one, PROVENANCE) for one in (plain, latents, drawn)} | named) == 5

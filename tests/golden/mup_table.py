@@ -14,7 +14,7 @@ from tests.golden.case import Case, Finding
 def rules(spec: ParamSpec, model: ModelConfig) -> dict[str, float]:
     """Of one of our parameters: its learning rate, its decay and the axes that grow with width."""
     rate = learning_rate_multiplier(spec, model)
-    # The release's decay is multiplied by the learning rate; ours is not (`apply_adamw`).
+    # The release's decay is multiplied by the learning rate; ours is not (`apply_update`).
     return {"lr_multiplier": rate, "weight_decay_multiplier": (1 / rate) if spec.decay else 0.0}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hma_jax.config import OptimizerConfig
 from hma_jax.model.params import is_spec
-from hma_jax.training.optimizer import apply_adamw, clip_by_global_norm, init_adam, learning_rate_multiplier
+from hma_jax.training.optimizer import apply_update, clip_by_global_norm, init_adam, learning_rate_multiplier
 from hma_jax.training.step import find_presence
 from tests.golden.case import Case, norms
 from tests.golden.discrete import as_masked, loss_and_accuracy
@@ -38,7 +38,7 @@ def check_train_steps(case: Case) -> None:
         grads, norm = clip_by_global_norm(grads, optimizer.clip_norm)
         presence = find_presence(recorded, robots, trained, config)
         rate = jnp.float32(optimizer.learning_rate)
-        return *apply_adamw(grads, state, params, specs, multipliers, presence, rate, optimizer), loss, norm
+        return *apply_update(grads, state, params, specs, multipliers, presence, rate, optimizer), loss, norm
 
     params, state = case.params, init_adam(case.params, case.table.size)
     losses, gradient_norms = [], []

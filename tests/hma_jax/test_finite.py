@@ -55,7 +55,7 @@ def test_a_gradient_that_is_no_number_is_refused_though_the_loss_is_fine(tmp_pat
 
 
 def test_an_update_that_is_infinite_is_refused_though_the_gradient_is_fine(tmp_path: Path, monkeypatch):
-    usual = step_module.apply_adamw
+    usual = step_module.apply_update
 
     def poisoned(grads, state, params, *rest):
         moved, after = usual(grads, state, params, *rest)
@@ -64,7 +64,7 @@ def test_an_update_that_is_infinite_is_refused_though_the_gradient_is_fine(tmp_p
         moved["embed"]["tables"] = table.at[0].add(jnp.where(bad, math.inf, 0.0))
         return moved, after
 
-    monkeypatch.setattr(step_module, "apply_adamw", poisoned)
+    monkeypatch.setattr(step_module, "apply_update", poisoned)
     with pytest.raises(DivergedError, match=r"the update is not finite at step 6 \(its loss is 2"):
         train(tmp_path, at=0)  # the very last step
     assert load_run(tmp_path).step == 5

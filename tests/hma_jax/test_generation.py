@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,11 +55,12 @@ def jitted_rollout(declared, batch, actions, keys, decode, prompt, **options):
     )
 
 
-def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None):
+def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None, frames: int | None = None):
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
-    batch = random_batch(0, config, 4)
+    longer = replace(config, frames=frames or config.frames)
+    batch = random_batch(0, longer, 4)
     other = batch["actions"].copy()
-    other[:, prompt - 1 :] = random_batch(1, config, 4)["actions"][:, prompt - 1 :]
+    other[:, prompt - 1 :] = random_batch(1, longer, 4)["actions"][:, prompt - 1 :]
     keys = jax.random.split(jax.random.key(0), 4)
     start = batch["tokens"][:, :prompt]
 
@@ -99,6 +102,16 @@ def test_the_cached_rollout_equals_recomputing_the_window(
 def test_the_cached_rollout_is_exact_under_every_conditioning(conditioning: str):
     got = compare_with_naive(model_config(conditioning=conditioning), DecodeConfig(2), 2)
     assert (got[:, 0] != got[:, 1]).any()
+
+
+@pytest.mark.parametrize("diffusion", [None, *some([DIFFUSION])], ids=["ids", "latents"])
+def test_the_cached_rollout_is_exact_where_masked_tokens_recall_the_frame_before(diffusion):
+    """Past the window too; and what is recalled counts."""
+    config = shallow_config(recall=True, diffusion=diffusion, frames=4)
+    decode = DecodeConfig(2, sampler=SAMPLER)
+    got = compare_with_naive(config, decode, 2, frames=6)
+    forgetful = compare_with_naive(replace(config, recall=False), decode, 2, frames=6)
+    assert (got != forgetful).any()
 
 
 @pytest.mark.exact

@@ -8,19 +8,21 @@ import pytest
 
 from hma_jax.config import MupConfig, OptimizerConfig
 from hma_jax.model.hma import declare_model
-from hma_jax.model.params import Use, is_spec
+from hma_jax.model.params import ParamSpec, Use, is_spec
 from hma_jax.training.optimizer import (
     Presence,
-    apply_adamw,
+    apply_update,
     clip_by_global_norm,
     init_adam,
     learning_rate_multiplier,
     make_schedule,
+    muon_direction,
 )
 from tests.tiny import TABLE, lively_params, shallow_config
 
 USES = get_args(Use)
 CONFIG = OptimizerConfig(learning_rate=1e-2, weight_decay=0.1)
+MUON = OptimizerConfig(learning_rate=1e-2, weight_decay=0.1, matrices="muon")
 
 
 def gradients(params, seed=0):
@@ -32,7 +34,7 @@ def gradients(params, seed=0):
 def update(declared, params, state, present, seed=0, config=CONFIG):
     ones = jax.tree.map(lambda _: 1.0, declared.specs, is_leaf=is_spec)
     here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, jnp.array(present)))
-    return apply_adamw(gradients(params, seed), state, params, declared.specs, ones, here, 1e-2, config)
+    return apply_update(gradients(params, seed), state, params, declared.specs, ones, here, 1e-2, config)
 
 
 def slices(declared, tree, robot):
@@ -47,11 +49,12 @@ def slices(declared, tree, robot):
     return out
 
 
-def test_robots_absent_from_a_step_do_not_move():
+@pytest.mark.parametrize("config", [CONFIG, MUON], ids=["adamw", "muon"])
+def test_robots_absent_from_a_step_do_not_move(config):
     declared, params = lively_params(shallow_config())
     state = init_adam(params, TABLE.size)
-    params1, state1 = update(declared, params, state, [True, True, True])
-    params2, state2 = update(declared, params1, state1, [True, False, True], seed=1)
+    params1, state1 = update(declared, params, state, [True, True, True], config=config)
+    params2, state2 = update(declared, params1, state1, [True, False, True], seed=1, config=config)
     for name, before in slices(declared, params1, 1).items():
         np.testing.assert_array_equal(before, slices(declared, params2, 1)[name], err_msg=name)
     for old, new in ((state1.first, state2.first), (state1.second, state2.second)):
@@ -87,6 +90,52 @@ def test_with_everyone_present_it_is_adamw():
         updates, opt = reference.update(gradients(params, seed), opt, theirs)
         theirs = optax.apply_updates(theirs, updates)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), ours, theirs)
+
+
+def singular_values(x: jax.Array, spec: ParamSpec) -> np.ndarray:
+    """Of every matrix of a parameter: [matrices, least side]."""
+    axes = [axis for side in spec.matrix for axis in side]
+    rows = int(np.prod([spec.shape[axis] for axis in spec.matrix[0]]))
+    turned = np.moveaxis(np.asarray(x), axes, range(-len(axes), 0))
+    columns = int(np.prod([spec.shape[axis] for axis in spec.matrix[1]]))
+    return np.linalg.svd(turned.reshape(-1, rows, columns), compute_uv=False)
+
+
+def test_muon_moves_every_matrix_by_as_much_in_every_direction_and_all_else_as_adamw():
+    declared, params = lively_params(shallow_config())
+    state, here = init_adam(params, TABLE.size), [True, True, True]
+    (adamw, _), (muon, after) = (update(declared, params, state, here, config=c) for c in (CONFIG, MUON))
+    flat = [jax.tree.leaves(tree) for tree in (params, adamw, muon, after.second)]
+    matrices = 0
+    for (path, spec), was, usual, moved, second in zip(declared.leaves().items(), *flat, strict=True):
+        if spec.role != "hidden":
+            np.testing.assert_array_equal(moved, usual, err_msg=path)
+            continue
+        step = (was - moved) / 1e-2 - 0.1 * was
+        found = singular_values(step, spec)
+        low, high = np.quantile(found / np.median(found), (0.1, 1.0))  # the smallest of all are raised by less
+        assert 0.5 < low and high < 1.7, path
+        assert 0.1 < np.std(step) < 0.3, path
+        assert not second.any(), path
+        matrices += len(found)
+    assert matrices == 2 * (3 + 1) + 2 + 4 * TABLE.size  # q, k, v, out, twice; MLP; of each robot modulation and stem
+
+
+def test_under_mup_muon_s_updates_keep_their_spectral_norm_at_every_width():
+    def norms(width: int) -> dict[str, float]:
+        config = shallow_config(width=width, mup=MupConfig(base_width=32))
+        found = {}
+        for path, spec in declare_model(config, TABLE).leaves().items():
+            if spec.role == "hidden":
+                x = jnp.asarray(np.random.default_rng(0).normal(size=spec.shape), jnp.float32)
+                direction = muon_direction(x, spec, learning_rate_multiplier(spec, config))
+                found[path] = float(singular_values(direction, spec).max())
+        return found
+
+    narrow, wide = norms(32), norms(128)
+    assert narrow and narrow.keys() == wide.keys()
+    for path in narrow:
+        assert wide[path] == pytest.approx(narrow[path], rel=0.15), path
 
 
 def test_biases_are_never_decayed_and_matrices_are():

@@ -66,6 +66,36 @@ def test_a_frame_is_told_the_frames_before_it_and_not_their_masks():
     assert (other_past[:, 1:] != shown[:, 1:]).any(axis=(0, 2, 3, 4)).all()
 
 
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["ids", "latents"])
+def test_what_a_masked_token_recalls_is_the_frame_before_and_never_the_truth(diffusion):
+    model, batch = make(diffusion=diffusion, recall=True)
+    tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
+    before, masked = tokens[:, :-1], jnp.ones(tokens[:, 1:].shape[:3], bool)
+
+    def said(before: jax.Array, ahead: jax.Array) -> np.ndarray:
+        return np.asarray(look_beside(model, before, ahead, masked, *rest).said)
+
+    told = said(before, tokens[:, 1:])
+    np.testing.assert_array_equal(said(before, jnp.zeros_like(before)), told)
+    # With temporal attention and the rest of the past cut away, the last frame alone still reaches the one after it.
+    other = said(before.at[:, -1].set(0), tokens[:, 1:])
+    np.testing.assert_array_equal(other[:, :-1], told[:, :-1])
+    assert (other[:, -1] != told[:, -1]).any()
+
+
+def test_in_one_pass_over_masked_frames_only_what_is_shown_is_recalled():
+    model, batch = make(recall=True)
+    tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
+    masked = jnp.zeros(tokens.shape, bool).at[:, 2:].set(True)
+
+    def said(tokens: jax.Array) -> np.ndarray:
+        return np.asarray(model(tokens, masked, *rest).said)
+
+    np.testing.assert_array_equal(said(tokens.at[:, 2:].set(0)), said(tokens))
+    changed = said(tokens.at[:, 1].set(0)) != said(tokens)
+    assert changed[:, 2].any()
+
+
 @pytest.mark.parametrize("setting", ["full", "policy", "inverse"])
 def test_settings_that_predict_actions_are_refused(setting):
     with pytest.raises(ConfigError, match=f"teacher_forcing is of settings .* '{setting}' predicts actions"):

@@ -1,0 +1,66 @@
+"""What makes the model better for as many steps?
+
+Question: held-out nats, PSNR and what actions decide, of the reference and of it with one thing changed: masked tokens that
+    also hold what stood there a frame earlier (`model.recall`), matrices moved by Muon (`train.optimizer.matrices`), and both. With
+    both, of the first seed alone, also the study's long runs.
+Paper figure: none.
+Command: python -m experiments.sweeps.ladder --preset cpu-full
+Cost: four training runs per seed of `ablation_seeds`, the control and the long ones; `--dry-run` prints it.
+Expected outcome: recall and Muon ahead of the reference, both ahead of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from experiments.program import run_sweep
+from experiments.running.trial import Trial
+from experiments.study import Study
+from experiments.sweeps.sweep import Point, Sweep, make_ablation, reference_trial
+
+REFERENCE, BEST = "reference", "recall, Muon"
+
+
+def recalling(trial: Trial) -> Trial:
+    return replace(trial, model=replace(trial.model, recall=True))
+
+
+def with_muon(trial: Trial) -> Trial:
+    optimizer = replace(trial.train.optimizer, matrices="muon")
+    return replace(trial, train=replace(trial.train, optimizer=optimizer))
+
+
+def with_both(trial: Trial) -> Trial:
+    return with_muon(recalling(trial))
+
+
+RUNGS: dict[str, Callable[[Trial], Trial]] = {
+    REFERENCE: lambda trial: trial,
+    "recall": recalling,
+    "Muon": with_muon,
+    BEST: with_both,
+}
+
+
+def plan(study: Study) -> Sweep:
+    """All datasets and trajectories on every rung; the best one for longer, which the label says."""
+    sweep = make_ablation(
+        study,
+        name="ladder",
+        axis="change",
+        variants=RUNGS,
+        default=REFERENCE,
+        question="What makes the model better for as many steps? The longest runs are of one seed.",
+        gain="such changes",
+        title="Ladder: what pays",
+    )
+    first, longer = study.seeds[0], study.designs.long
+    trials = [with_both(replace(reference_trial(study, first, n), measure_untrained=False)) for n in longer]
+    points = tuple(Point(len(RUNGS) + i, trial) for i, trial in enumerate(trials))
+    labels = tuple(f"{BEST}, {n:,} steps" for n in longer)
+    return replace(sweep, points=points + sweep.points, labels=sweep.labels + labels)
+
+
+if __name__ == "__main__":
+    run_sweep("ladder")
