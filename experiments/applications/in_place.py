@@ -1,5 +1,5 @@
 """Question: at the end of a window, do robots and objects stand where they truly would?
-Command: python -m experiments.applications.in_place RUN --out DIR
+Command: python -m experiments.applications.in_place RUN --out DIR [--robots NAME ...]
 Cost: half an hour of one core for forty robots, most of it the detector, which is made once.
 Expected: what moved is found within 2 pixels of 32 of its true place in most last frames of a model that follows
           actions, in nearly none of a still picture.
@@ -28,7 +28,7 @@ from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
 from experiments.progress import console, step
 from experiments.wrote import wrote
-from hma_jax.config import ExecutionConfig
+from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
@@ -90,15 +90,24 @@ def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
     return over_robots(near, "near") if near else (float("nan"), float("nan"), 0)
 
 
+def chosen(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
+    """Those of `names`, or all. Raises ConfigError for one that is not there."""
+    unknown = sorted(set(names) - set(robots))
+    require(not unknown, f"--robots: {', '.join(unknown)} cannot be watched; there are {', '.join(robots)}")
+    return {name: robot for name, robot in robots.items() if not names or name in names}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/in_place"))
+    parser.add_argument("--robots", nargs="+", default=(), metavar="NAME", help="only these; all that the suite knows")
     asked = parser.parse_args()
     options = {"execution": ExecutionConfig(remat="none"), "episodes": EPISODES, "history": 1}
     simulator = load_simulator(asked.run, **options)
-    robots, weights = known_robots(simulator.robots), asked.out / WEIGHTS
-    claim(asked.out, asked.run, simulator.model.params, {})  # a detector knows frames as one tokenizer shows them
+    robots, weights = chosen(known_robots(simulator.robots), asked.robots), asked.out / WEIGHTS
+    settings = {"robots": sorted(robots)} if asked.robots else {}
+    claim(asked.out, asked.run, simulator.model.params, settings)  # a detector knows frames as one tokenizer shows them
     if not weights.exists():
         make_detector(list(robots), simulator.tokenizer, asked.out)
     detector, rows, short = Detector.load(weights), [], []

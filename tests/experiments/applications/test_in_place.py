@@ -7,7 +7,7 @@ from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications import detector as detector_module
 from experiments.applications.detector import Detector, as_given, as_shown, enlarged, make_detector
-from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, in_place, watch_ends
+from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, chosen, in_place, watch_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError
@@ -46,6 +46,14 @@ def test_places_at_the_end_are_those_of_the_true_simulator(simulator):
     assert len(tools) == EPISODES and np.mean([row["moved_px"] > CLOSE for row in tools]) > 0.3
     # From the corner it is as far as the tool is.
     assert all(row["true_px"] == row["model_px"] == row["still_px"] > 0 for row in tools)
+
+
+def test_a_part_of_the_robots_is_watched_by_name():
+    robots = {name: object() for name in ("arm_sand", "pusher_sand")}
+    assert chosen(robots, ()) == robots
+    assert list(chosen(robots, ["pusher_sand"])) == ["pusher_sand"]
+    with pytest.raises(ConfigError, match="--robots: pusher_sad cannot be watched; there are arm_sand, pusher_sand"):
+        chosen(robots, ["pusher_sad"])
 
 
 def test_the_share_is_of_what_moved_and_a_mean_over_robots():
