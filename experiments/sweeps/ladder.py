@@ -1,11 +1,12 @@
 """What makes the model better for as many steps?
 
-Question: held-out nats, PSNR and what actions decide, of the reference and of it with one thing changed: masked tokens that
-    also hold what stood there a frame earlier (`model.recall`), matrices moved by Muon (`train.optimizer.matrices`), and both. With
-    both, of the first seed alone, also the study's long runs.
+Question: held-out nats, PSNR and what actions decide, of the reference and with masked tokens that also hold what stood
+    there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
+    change alone, and the study's long runs with both, are of the first seed.
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
-Cost: four training runs per seed of `ablation_seeds`, the control and the long ones; `--dry-run` prints it.
+Cost: two training runs per seed of `ablation_seeds`, one for each change alone, the control and the long ones;
+    `--dry-run` prints it.
 Expected outcome: recall and Muon ahead of the reference, both ahead of each.
 """
 
@@ -45,21 +46,24 @@ RUNGS: dict[str, Callable[[Trial], Trial]] = {
 
 def plan(study: Study) -> Sweep:
     """All datasets and trajectories on every rung; the best one for longer, which the label says."""
+    first, longer = study.seeds[0], study.designs.long
     sweep = make_ablation(
         study,
         name="ladder",
         axis="change",
         variants=RUNGS,
         default=REFERENCE,
-        question="What makes the model better for as many steps? The longest runs are of one seed.",
+        question="What makes the model better for as many steps? One change alone, and the longest runs, are of one seed.",
         gain="such changes",
         title="Ladder: what pays",
     )
-    first, longer = study.seeds[0], study.designs.long
+    both = (sweep.labels.index(REFERENCE), sweep.labels.index(BEST))
+    alone = study.ablation_seeds[0]
+    rungs = [point for point in sweep.points if point.x in both or point.trial.train.seed == alone]
     trials = [with_both(replace(reference_trial(study, first, n), measure_untrained=False)) for n in longer]
-    points = tuple(Point(len(RUNGS) + i, trial) for i, trial in enumerate(trials))
+    points = [Point(len(RUNGS) + i, trial) for i, trial in enumerate(trials)]
     labels = tuple(f"{BEST}, {n:,} steps" for n in longer)
-    return replace(sweep, points=points + sweep.points, labels=sweep.labels + labels)
+    return replace(sweep, points=(*points, *rungs), labels=sweep.labels + labels)
 
 
 if __name__ == "__main__":

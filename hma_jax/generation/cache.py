@@ -75,9 +75,8 @@ class Window(NamedTuple):
     def query(self, cache: FrameCache, last: jax.Array, frame: Frame, at: int | jax.Array) -> jax.Array:
         """What the model says [B, S, ...] of a partly masked frame at position `at`, after frame `last` [B, S (, C)]."""
         visible = jnp.append(cache.valid, True)[None]
-        options = {"before": last[:, None]}
-        said = self._pass(frame.values[:, None], frame.masked[:, None], at, cache.layers, visible, **options).said
-        return said[:, 0]
+        values, masked = frame.values[:, None], frame.masked[:, None]
+        return self._pass(values, masked, at, cache.layers, visible, before=last[:, None]).said[:, 0]
 
     def extend_and_query(
         self,

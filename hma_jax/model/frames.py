@@ -121,16 +121,14 @@ class Condition(nnx.Module):
 
 
 class Recall(nnx.Module):
-    """At masked tokens also what stood there in the frame before (`ModelConfig.recall`)."""
+    """At masked tokens also what stood there a frame earlier (`ModelConfig.recall`)."""
 
     def __init__(self, config: ModelConfig):
         self.gain = param((config.width,), ("D",), ones, role="vector")
 
-    def __call__(self, x: jax.Array, masked: jax.Array, before: jax.Array) -> jax.Array:
-        """x [..., S, D] of tokens that are `masked`, bool [..., S] or [..., S, cells], and the same places a frame earlier."""
-        if masked.ndim == x.ndim:
-            masked = masked.any(axis=-1)
-        return x + jnp.where(masked[..., None], scaled(before, self.gain.get_value()), 0)
+    def __call__(self, x: jax.Array, unknown: jax.Array, earlier: jax.Array) -> jax.Array:
+        """x [..., S, D] with `earlier`, of that shape, added where bool `unknown` [..., S]."""
+        return x + jnp.where(unknown[..., None], scaled(earlier, self.gain.get_value()), 0)
 
 
 def make_embed(config: ModelConfig) -> nnx.Module:

@@ -86,10 +86,12 @@ class HMA(nnx.Module):
         chunk executed after it was seen (reference section 1.3). Where `hidden_BT` the model is
         not shown them (`leak` is the release's exception, see `MaskingConfig.action_leak`); None
         instead of actions runs without action tokens and conditioning. The frames stand at window
-        positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T],
-        or with a leading B, defaults to causal: then padding at a window's end is seen by no real frame. The cache of the first `remember` frames is returned; of the frames before
-        `said_from` nothing is said. Where the parameters at hand are those of some robots only, `slice_B`
-        says which slice is each example's own.
+        positions `positions` (int [T], default `first` onwards); `visible` [T, T_past + T], or with a
+        leading B, defaults to causal: then padding at a window's end is seen by no real frame. `before`,
+        of the shape of `frames`, is the frame that precedes each of them, which `config.recall` is told
+        of; by default the one before it here. The cache of the first `remember` frames is returned; of
+        the frames before `said_from` nothing is said. Where the parameters at hand are those of some
+        robots only, `slice_B` says which slice is each example's own.
         """
         config = self.config
         count = frames.shape[1]
@@ -100,7 +102,8 @@ class HMA(nnx.Module):
         slice_B = embodiment_B if slice_B is None else slice_B
         x = self.embed(frames, masked, self.dtype)
         if self.recall is not None and masked is not None:
-            x = self.recall(x, masked, self._seen_before(frames, masked, before))
+            unknown = masked.any(axis=-1) if masked.ndim == x.ndim else masked
+            x = self.recall(x, unknown, self._a_frame_earlier(frames, unknown, before))
         action = None
         if actions_BTU is not None:
             feature = self.stem(actions_BTU, embodiment_B, slice_B, self.dtype)
@@ -118,14 +121,11 @@ class HMA(nnx.Module):
         said = self.frame_head(x, positions[said_from:]) if config.diffusion else self.frame_head(x)
         return Outputs(said, pooled, cache)
 
-    def _seen_before(self, frames: jax.Array, masked: jax.Array, before: jax.Array | None) -> jax.Array:
-        """[B, T, S, D] of the frame before each: of `before`, or of the one that precedes it in `frames`, where that is
-        shown."""
+    def _a_frame_earlier(self, frames: jax.Array, unknown_BTS: jax.Array, before: jax.Array | None) -> jax.Array:
+        """[B, T, S, D]: what stood at each token a frame earlier, 0 where that is not known either."""
         if before is not None:
             return self.embed(before, None, self.dtype)
-        x = self.embed(frames, None, self.dtype)
-        known = ~(masked.any(axis=-1) if masked.ndim > x.ndim - 1 else masked)
-        x = jnp.where(known[..., None], x, 0)
+        x = jnp.where(unknown_BTS[..., None], 0, self.embed(frames, None, self.dtype))
         return jnp.concatenate([jnp.zeros_like(x[:, :1]), x[:, :-1]], axis=1)
 
     def _action_tokens(

@@ -13,6 +13,7 @@ from hma_jax.config import (
     ModelConfig,
     MupConfig,
     OptimizerConfig,
+    TrainConfig,
 )
 from hma_jax.diagnostics.coordinate_check import Size, check_coordinates, measure, slopes
 from hma_jax.model.hma import declare_model
@@ -63,8 +64,8 @@ def windows(config: ModelConfig) -> dict[str, np.ndarray]:
     return random_batch(0, config, TRAIN.batch)
 
 
-def measured(config: ModelConfig, seeds: int) -> list[Size]:
-    return measure(config, TRAIN, TABLE, windows(config), (BASE, WIDE), range(seeds), FAST_TO_COMPILE)
+def measured(config: ModelConfig, seeds: int, train: TrainConfig = TRAIN) -> list[Size]:
+    return measure(config, train, TABLE, windows(config), (BASE, WIDE), range(seeds), FAST_TO_COMPILE)
 
 
 # --- Parameters ------------------------------------------------------------------------------
@@ -113,6 +114,14 @@ def test_at_the_base_width_mup_is_the_standard_parametrisation_bit_for_bit(name)
 @pytest.mark.parametrize("name", ["discrete", pytest.param("continuous", marks=pytest.mark.slow)])
 def test_activations_and_what_training_changes_keep_their_size_at_every_width(name):
     rows = measured(variant(name), 6)
+    assert check_coordinates(rows) == [], slopes(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VARIANTS)
+def test_they_keep_their_size_under_muon_too(name):
+    train = replace(TRAIN, optimizer=replace(TRAIN.optimizer, matrices="muon"))
+    rows = measured(variant(name, recall=True), 6, train)
     assert check_coordinates(rows) == [], slopes(rows)
 
 
