@@ -63,7 +63,9 @@ def plan(study: Study) -> Sweep:
     trials = [with_both(replace(reference_trial(study, first, n), measure_untrained=False)) for n in longer]
     points = [Point(len(RUNGS) + i, trial) for i, trial in enumerate(trials)]
     labels = tuple(f"{BEST}, {n:,} steps" for n in longer)
-    return replace(sweep, points=(*points, *rungs), labels=sweep.labels + labels)
+    # The long runs go on from the first of the best: in that order nobody waits for them at the end.
+    rungs.sort(key=lambda point: point.x != both[1])
+    return replace(sweep, points=(*rungs, *points), labels=sweep.labels + labels)
 
 
 if __name__ == "__main__":
