@@ -2,11 +2,12 @@
 
 Question: held-out nats, PSNR and what actions decide, of the reference and with masked tokens that also hold what stood
     there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
-    change alone, and the study's long runs with both, are of the first seed.
+    change alone, and the study's long runs with both, are of the first seed. The rungs have `designs.ablation_steps`;
+    the reference and both changes are trained for the study's own number of steps too.
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
-Cost: two training runs per seed of `ablation_seeds`, one for each change alone, the control and the long ones;
-    `--dry-run` prints it.
+Cost: two training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
+    and the long ones; `--dry-run` prints it.
 Expected outcome: recall and Muon ahead of the reference, both ahead of each.
 """
 
@@ -45,8 +46,8 @@ RUNGS: dict[str, Callable[[Trial], Trial]] = {
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories on every rung; the best one for longer, which the label says."""
-    first, longer = study.seeds[0], study.designs.long
+    """All datasets and trajectories on every rung; the reference and the best one for longer, which the label says."""
+    seeds, first = study.ablation_seeds, study.ablation_seeds[0]
     sweep = make_ablation(
         study,
         name="ladder",
@@ -57,15 +58,19 @@ def plan(study: Study) -> Sweep:
         gain="such changes",
         title="Ladder: what pays",
     )
-    both = (sweep.labels.index(REFERENCE), sweep.labels.index(BEST))
-    alone = study.ablation_seeds[0]
-    rungs = [point for point in sweep.points if point.x in both or point.trial.train.seed == alone]
-    trials = [with_both(replace(reference_trial(study, first, n), measure_untrained=False)) for n in longer]
-    points = [Point(len(RUNGS) + i, trial) for i, trial in enumerate(trials)]
-    labels = tuple(f"{BEST}, {n:,} steps" for n in longer)
-    # The long runs go on from the first of the best: in that order nobody waits for them at the end.
-    rungs.sort(key=lambda point: point.x != both[1])
-    return replace(sweep, points=(*rungs, *points), labels=sweep.labels + labels)
+    several = {sweep.labels.index(name) for name in (REFERENCE, BEST)}
+    points = [point for point in sweep.points if point.x in several or point.trial.train.seed == first]
+    labels = list(sweep.labels)
+    longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE)]
+    longer += [(BEST, steps, (first,)) for steps in study.designs.long]
+    for name, steps, chosen in longer:
+        for seed in chosen:
+            trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
+            points.append(Point(len(labels), RUNGS[name](trial)))
+        labels.append(f"{name}, {steps:,} steps")
+    # The longest goes on from the first of the best: in that order nobody waits for it at the end.
+    points.sort(key=lambda point: point.x != sweep.labels.index(BEST))
+    return replace(sweep, points=tuple(points), labels=tuple(labels))
 
 
 if __name__ == "__main__":
