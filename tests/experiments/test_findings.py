@@ -1,6 +1,7 @@
 """What findings.md and README say of cpu-full's axes follows from what is kept of its trials."""
 
 import csv
+import functools
 import json
 import re
 from dataclasses import replace
@@ -14,7 +15,7 @@ from experiments.analysis.preregistered import FILE, Expected, read_expected
 from experiments.applications.detector import CLOSE
 from experiments.applications.in_place import VIEWS, in_place
 from experiments.report.robots import robots_of
-from experiments.rows import OVERALL, curve, difference, read_rows
+from experiments.rows import OVERALL, Row, curve, difference, read_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
@@ -30,6 +31,12 @@ def findings(study: str = "cpu-full") -> str:
     return (RESULTS / study / "findings.md").read_text()
 
 
+@functools.cache
+def rows_of(study: str = "cpu-full") -> tuple[Row, ...]:
+    """The rows of its tables, which most tests need and which take seconds to read."""
+    return tuple(read_rows(Workspace(RESULTS / study)))
+
+
 def readme() -> str:
     """On one line."""
     return " ".join((ROOT / "README.md").read_text().split())
@@ -38,7 +45,7 @@ def readme() -> str:
 def test_the_first_axis_by_how_much_data_a_robot_has_is_as_its_findings_say():
     folder = RESULTS / "cpu-full-horizon"
     windows = {name: d["windows"] for name, d in json.loads((folder / "data.json").read_text()).items()}
-    rows = [r for r in read_rows(Workspace(folder)) if r.metric == "cross_entropy" and r.role == "point"]
+    rows = [r for r in rows_of(folder.name) if r.metric == "cross_entropy" and r.role == "point"]
     page = findings("cpu-full-horizon")
     for least, most in ((0, 400), (400, 2000), (2000, 10**9)):
         mine = [r for r in rows if least <= windows.get(r.scope, -1) < most]
@@ -80,7 +87,7 @@ def test_the_axis_horizon_is_as_findings_say():
         assert line in page, line
     of_steps = next(line for line in lines if "| 16,000 |" in line).strip("| ").split(" | ")
     steps, seeds, _, psnr, ahead, follow, changed, *_ = of_steps
-    table = read_rows(Workspace(RESULTS / "cpu-full"))
+    table = rows_of()
     (copying,) = {f"{r.mean:.2f}" for r in table if (r.sweep, r.scope, r.metric) == ("horizon", OVERALL, "psnr_copy")}
     said = f"three seeds of {steps} steps have {psnr} dB, copying {copying}, ahead of it on {ahead} of 40 robots; other"
     said = f"{said} actions cost nats on {follow} of the 36 with any, dB on {changed}."
@@ -119,7 +126,7 @@ def test_robots_that_do_not_stay_robots_are_as_findings_say():
 
 
 def test_what_knowing_robots_is_worth_to_new_ones_is_as_findings_say():
-    rows, page = read_rows(Workspace(RESULTS / "cpu-full")), " ".join(findings().split())
+    rows, page = rows_of(), " ".join(findings().split())
     found = {
         name: curve(rows, "fewshot", "cross_entropy", series=series)
         for name, series in {
@@ -173,7 +180,7 @@ def test_the_axis_lr_is_as_findings_say():
 
 def axis_rows(sweep: str) -> list[str]:
     """The lines of findings.md on an axis of cpu-full with one curve: means over seeds and judged robots."""
-    rows, digits = read_rows(Workspace(RESULTS / "cpu-full")), (3, 2, 2, 2)
+    rows, digits = rows_of(), (3, 2, 2, 2)
     lines = []
     for role in (POINT, CONTROL):
         curves = [curve(rows, sweep, m, role) for m in ("cross_entropy", "psnr", "action_nats", "delta_psnr")]
@@ -188,7 +195,7 @@ def axis_rows(sweep: str) -> list[str]:
 
 def gains() -> dict[str, dict[int, str]]:
     """{sweep: {robots: nats beside those of forty, mean and standard error over seeds}} of the designs over robots."""
-    rows = read_rows(Workspace(RESULTS / "cpu-full"))
+    rows = rows_of()
     found: dict[str, dict[int, str]] = {}
     for sweep in ("dilution", "transfer"):
         *fewer, forty = curve(rows, sweep, "cross_entropy")
@@ -199,7 +206,7 @@ def gains() -> dict[str, dict[int, str]]:
 
 def exponents() -> list[float]:
     """a of every trial of N robots: after S steps it has the loss of forty after S (40 / N)^a."""
-    rows = [r for r in read_rows(Workspace(RESULTS / "cpu-full")) if (r.metric, r.role) == ("cross_entropy", POINT)]
+    rows = [r for r in rows_of() if (r.metric, r.role) == ("cross_entropy", POINT)]
     robots = [r for r in rows if r.scope != OVERALL]
     steps = {"dilution": lambda x: 4000.0, "transfer": lambda x: 100 * x}
     found = []
@@ -244,7 +251,7 @@ def test_what_was_found_is_as_readme_says():
     assert f"predicted at {predicted:.3f} nats before it ran, came to {came}" in text
     alone, company = (gains()[sweep][5].split()[0][1:] for sweep in ("dilution", "transfer"))
     assert f"lose {alone} nats by sharing" in text and f"gain {company} if these bring their own" in text
-    poor = {p.label: p for p in curve(read_rows(Workspace(root)), "newcomers", "cross_entropy")}
+    poor = {p.label: p for p in curve(rows_of(root.name), "newcomers", "cross_entropy")}
     gained, _ = difference(poor["alone"], poor["all robots"])
     assert f"{gained:.2f} if the five have 8 trajectories each" in text
     assert f"best trunk grows as C^{best['a']:.2f}" in text
@@ -259,7 +266,7 @@ def test_an_axis_of_one_curve_is_as_findings_say(sweep):
 
 
 def test_what_was_predicted_of_conditioning_is_as_findings_say():
-    points = {p.label: p for p in curve(read_rows(Workspace(RESULTS / "cpu-full")), "conditioning", "cross_entropy")}
+    points = {p.label: p for p in curve(rows_of(), "conditioning", "cross_entropy")}
     lines = findings().splitlines()
     for (sweep, _, x), e in expectations().items():
         if sweep == "conditioning":
@@ -289,7 +296,7 @@ def expectations() -> dict[tuple[str, str, str], Expected]:
 def grid_rows(sweep: str, digits: int) -> list[str]:
     """The lines of findings.md on an axis of several curves: held-out nats along each, or how far behind another point
     where that was predicted, in brackets what was predicted, bold where that did not hold."""
-    rows, expected = read_rows(Workspace(RESULTS / "cpu-full")), expectations()
+    rows, expected = rows_of(), expectations()
     lines = []
     for series in dict.fromkeys(r.series for r in rows if (r.sweep, r.role) == (sweep, POINT)):
         cells = [series]
