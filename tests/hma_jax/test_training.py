@@ -16,9 +16,9 @@ from hma_jax.training.runs import load_run
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
 from hma_jax.training.train import train_model
-from tests.tiny import TABLE, batches, shallow_config, train_config
+from tests.tiny import SMALLER, TABLE, batches, model_config, train_config
 
-MODEL = shallow_config()
+MODEL = model_config(**SMALLER)
 EVERY_TWO = LoopOptions(checkpoint_every=2, log_every=1)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
-from tests.tiny import TABLE, batches, model_config, train_config
+from tests.tiny import SMALLER, TABLE, batches, model_config, train_config
 
 
 def announce(step: int, steps: int, metrics: dict) -> None:
@@ -15,11 +15,12 @@ def announce(step: int, steps: int, metrics: dict) -> None:
 
 
 if __name__ == "__main__":
+    model = model_config(**SMALLER)
     train_model(
-        model_config(),
+        model,
         TABLE,
         train_config(steps=12),
-        batches(model_config()),
+        batches(model),
         run_dir=Path(sys.argv[1]),
         provenance={},
         options=LoopOptions(checkpoint_every=3, log_every=1),
