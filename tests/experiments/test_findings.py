@@ -178,9 +178,9 @@ def test_the_axis_lr_is_as_findings_say():
     assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}  # as README says
 
 
-def axis_rows(sweep: str) -> list[str]:
-    """The lines of findings.md on an axis of cpu-full with one curve: means over seeds and judged robots."""
-    rows, digits = rows_of(), (3, 2, 2, 2)
+def axis_rows(sweep: str, study: str = "cpu-full") -> list[str]:
+    """The lines of findings.md on an axis of a study with one curve: means over seeds and judged robots."""
+    rows, digits = rows_of(study), (3, 2, 2, 2)
     lines = []
     for role in (POINT, CONTROL):
         curves = [curve(rows, sweep, m, role) for m in ("cross_entropy", "psnr", "action_nats", "delta_psnr")]
@@ -257,9 +257,12 @@ def test_what_was_found_is_as_readme_says():
     assert f"best trunk grows as C^{best['a']:.2f}" in text
 
 
-@pytest.mark.parametrize("sweep", ["width", "dilution", "transfer", "newcomers", "settings", "conditioning"])
-def test_an_axis_of_one_curve_is_as_findings_say(sweep):
-    page, lines = findings(), axis_rows(sweep)
+OF_ONE_CURVE = [(sweep, "cpu-full") for sweep in ("width", "dilution", "transfer", "newcomers", "settings", "conditioning")]
+
+
+@pytest.mark.parametrize(("sweep", "study"), [*OF_ONE_CURVE, ("ladder", "ladder")])
+def test_an_axis_of_one_curve_is_as_findings_say(sweep, study):
+    page, lines = findings(study), axis_rows(sweep, study)
     assert len(lines) >= 4
     for line in lines:  # further columns may follow
         assert line.removesuffix("|") in page, line
@@ -286,6 +289,19 @@ def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
         if sweep == "settings":
             section = " ".join(page[page.index("## `settings`") :].split())
             assert re.search(rf"{e.mean:.2f}( nats| behind it)? {re.escape(interval)}", section), (x, interval)
+
+
+def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
+    """Bold where it did not hold."""
+    page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
+    assert len(expected) == 6
+    for e in expected:
+        points = {p.label: p for p in curve(rows_of("ladder"), "ladder", e.metric)}
+        mean = difference(points[e.x], points[e.against])[0] if e.against else points[e.x].mean
+        came = f"{mean:+.2f}" if e.against else f"{mean:.2f}"
+        came = came if e.low <= mean <= e.high else f"**{came}**"
+        against = f" beside {e.against}" if e.against else ""
+        assert f"| {e.x}{against} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
 
 
 def expectations() -> dict[tuple[str, str, str], Expected]:
