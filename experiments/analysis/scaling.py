@@ -20,7 +20,7 @@ from experiments.analysis.fits import DRAWS, PowerFit, fit_power
 from experiments.analysis.isoflop import IsoFlop, fit_isoflop
 from experiments.analysis.measured import PRIOR, Measured, Place, measure
 from experiments.running.provenance import Provenance
-from experiments.running.trial import Trial, trial_id
+from experiments.running.trial import Trial, drop_later_fields, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ModelConfig
 from hma_jax.config.json import stable_hash, to_dict
@@ -180,6 +180,7 @@ def _without_steps(trial: Trial) -> dict[str, Any]:
     for name in ("steps", "seed"):
         values["train"].pop(name)
     values.pop("measure_untrained")
+    drop_later_fields(values)  # or runs would be drawn again in another order for every field that is added
     return values
 
 

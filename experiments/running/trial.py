@@ -127,6 +127,13 @@ def _identity(trial: Trial) -> dict[str, Any]:
     return fields | {"altered": altered} if altered else fields
 
 
+def drop_later_fields(fields: dict[str, Any]) -> None:
+    """Takes away, where they have the value that all had before, the fields of configurations that came later (`LATER`)."""
+    for path, before in LATER.items():
+        if "." in path:
+            _drop(fields, path.split("."), before)
+
+
 def _drop(fields: dict[str, Any], path: list[str], value: Any) -> None:
     """Deletes the entry at `path` where it is `value`."""
     *parents, name = path
