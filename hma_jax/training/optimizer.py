@@ -93,7 +93,7 @@ def init_adam(params: Params, embodiments: int) -> AdamState:
     )
 
 
-MUON_MOMENTUM = 0.95
+MUON_MOMENTUM = 0.95  # with one look ahead (Nesterov)
 MUON_GAIN = 0.2
 """Root mean square of a square matrix's update in units of the rate, about what Adam's is (Liu et al. 2025), so that both
 take the same rate."""
@@ -126,10 +126,10 @@ def apply_update(
 ) -> tuple[Params, AdamState]:
     """New parameters and state after one step.
 
-    p <- p - rate * (multiplier * adam + weight_decay * p), the second term only where the
-    declaration says so; with `config.matrices` muon, matrices between two widths take `muon_direction` in place of the
-    first, of their momentum with one look ahead, and have no second moment. Weight decay is not divided by m: muP scales a hidden matrix's decay
-    up as much as its rate down (reference section 4.4).
+    p <- p - rate * (multiplier * adam + weight_decay * p), the second term only where the declaration says so. With
+    `config.matrices` muon, matrices between two widths take `muon_direction` in place of the first and have no second
+    moment. Weight decay is not divided by m: muP scales a hidden matrix's decay up as much as its rate down (reference
+    section 4.4).
     """
     count = {use: n + presence.shared[use] for use, n in state.count.items()}
     count_E = {use: n + presence.robots[use] for use, n in state.count_E.items()}

@@ -304,6 +304,26 @@ def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
         assert f"| {e.x}{against} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
 
 
+def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
+    """Beside the same robots of cpu-full's long reference."""
+    page, rows = " ".join(findings("ladder").split()), {}
+    for name in ("ladder", "32000"):
+        with open(RESULTS / "in_place" / f"{name}.csv", newline="") as file:
+            rows[name] = list(csv.DictReader(file))
+    robots = {row["robot"] for row in rows["ladder"]}
+    before = [row for row in rows["32000"] if row["robot"] in robots]
+
+    def share(mine: list[dict[str, str]], view: str = "model") -> str:
+        mean, half, count = in_place(mine, view)
+        assert count == len(robots) == 12
+        return f"{100 * mean:.1f} ± {100 * half:.1f} %"
+
+    tools, objects = ([r for r in rows["ladder"] if r["what"].startswith(kind)] for kind in ("tool", "colour"))
+    assert f"of what moved, {share(rows['ladder'])} stands" in page and f"{share(before)} on the same twelve" in page
+    assert f"true frames {share(rows['ladder'], 'true')}" in page
+    assert f"Of tools it is {share(tools)}, of objects {share(objects)}." in page
+
+
 def expectations() -> dict[tuple[str, str, str], Expected]:
     """{(axis, curve, x): what was written down before}."""
     return {(e.sweep, e.series, e.x): e for e in read_expected(RESULTS / "cpu-full" / "predictions" / FILE)}
