@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
 from experiments.analysis.changes import METRICS
-from experiments.analysis.paired import require_same_windows
+from experiments.analysis.paired import agree, require_same_windows
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Sweep
@@ -91,11 +91,13 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
     Raises NotComparable unless all tables are of the same windows.
     """
     first = next(iter(tables.values()))
-    first = first.rows(np.flatnonzero(np.isin(first.dataset, robots)))
+    first = first.among(robots)
     matched = {}
     for steps, table in tables.items():
-        require_same_windows(first, table)
-        matched[steps] = table.rows(np.flatnonzero(np.isin(table.dataset, robots))).matched_to(first)
+        own = table.among(robots)
+        if not agree(first, own):
+            require_same_windows(first, table)
+        matched[steps] = own.matched_to(first)
     half = halves(first)
     chosen = []
     for h in (0, 1):

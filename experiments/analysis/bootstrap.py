@@ -15,11 +15,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
 from experiments.analysis.intervals import LEVEL, Interval, critical, satterthwaite
-from experiments.analysis.paired import NotComparable, require_same_windows
+from experiments.analysis.paired import NotComparable, agree, require_same_windows
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
 
@@ -78,16 +80,18 @@ def make_panel(points: Sequence[dict[int, WindowTable]], metric: str, robots: Se
     """
     first = next(iter(points[0].values()))
     chosen = first.datasets if robots is None else tuple(robots)
-    first = first.rows(np.flatnonzero(np.isin(first.dataset, chosen)))
+    first = first.among(chosen)
     lacking = [name for name in chosen if name not in first.datasets]
     if lacking:
         raise NotComparable(f"not judged: {', '.join(lacking)}")
 
     def values(table: WindowTable) -> np.ndarray:
-        shared = require_same_windows(first, table)
-        if len(shared) < len(chosen):
-            raise NotComparable(f"not judged in every trial: {', '.join(sorted(set(chosen) - set(shared)))}")
-        own = table.rows(np.flatnonzero(np.isin(table.dataset, chosen))).matched_to(first)
+        own = table.among(chosen)
+        if not agree(first, own):
+            shared = require_same_windows(first, table)
+            if len(shared) < len(chosen):
+                raise NotComparable(f"not judged in every trial: {', '.join(sorted(set(chosen) - set(shared)))}")
+            own = own.matched_to(first)
         require(metric in own.metrics, f"a trial has no {metric}; it has {', '.join(own.metrics)}")
         return own.metrics[metric]
 
@@ -114,7 +118,11 @@ def resample(
     rng = np.random.default_rng(seed)
     sums, counts, ends = _by_episode(panel)
     value = _mean_of_robots(sums, counts, ends)  # [all seeds of all points]
-    drawn = _resample_episodes(sums, counts, ends, draws, rng) if over_episodes else np.tile(value, (draws, 1))
+    if over_episodes:
+        episode_weights, rng.bit_generator.state = _episode_weights(tuple(np.diff(ends, prepend=0)), draws, seed)
+        drawn = _resample_episodes(sums, counts, ends, episode_weights, rng)
+    else:
+        drawn = np.tile(value, (draws, 1))
     weights: dict[tuple[int, ...], np.ndarray] = {}
     found, points, at = [], [], 0
     for seeds in panel.seeds:
@@ -159,7 +167,8 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0, level: 
 def _by_episode(panel: Panel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(sums of values [all seeds, episodes], windows [episodes], where each robot's episodes end [robots])."""
     robots = list(dict.fromkeys(panel.robot.tolist()))
-    code = np.asarray([robots.index(r) for r in panel.robot.tolist()])
+    number = {robot: i for i, robot in enumerate(robots)}
+    code = np.asarray([number[r] for r in panel.robot.tolist()])
     names, which = np.unique(np.stack([code, panel.episode]), axis=1, return_inverse=True)
     values, episodes = np.concatenate(panel.points), names.shape[1]
     sums = np.stack([np.bincount(which.ravel(), weights=row, minlength=episodes) for row in values])
@@ -188,18 +197,17 @@ def _freedom(sums: np.ndarray, counts: np.ndarray, ends: np.ndarray) -> float:
 
 
 def _resample_episodes(
-    sums: np.ndarray, counts: np.ndarray, ends: np.ndarray, draws: int, rng: np.random.Generator
+    sums: np.ndarray, counts: np.ndarray, ends: np.ndarray, weights: Sequence[np.ndarray], rng: np.random.Generator
 ) -> np.ndarray:
     """[draws, all seeds]: the mean over robots, of which each has other episodes in every draw."""
-    means, known, alone = [], [], []
-    for start, end in zip(np.r_[0, ends[:-1]], ends, strict=True):
+    means, known, alone, draws = [], [], [], len(weights[0])
+    for start, end, weight in zip(np.r_[0, ends[:-1]], ends, weights, strict=True):
         own_sums, own_counts = sums[:, start:end], counts[start:end]
         measured = own_sums.sum(1) / own_counts.sum()
         if end - start == 1:
             alone.append(len(means))
             means.append(np.tile(measured, (draws, 1)))
             continue
-        weight = _weights(end - start, draws, rng)
         drawn = weight @ own_sums.T / (weight @ own_counts)[:, None]
         known.append((drawn - measured) * math.sqrt(end - start))  # of one episode
         means.append(drawn)
@@ -208,6 +216,17 @@ def _resample_episodes(
         for i in alone:
             means[i] = means[i] + deviations[rng.integers(len(known), size=draws), rng.permutation(draws)]
     return np.mean(means, axis=0)
+
+
+@lru_cache(maxsize=8)
+def _episode_weights(counts: tuple[int, ...], draws: int, seed: int) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
+    """The weights of the episodes of each robot, which has so many, and the state of their generator afterwards.
+
+    Every metric and pair of models that is judged on some windows has the same ones, and drawing them takes longer
+    than what is done with them."""
+    rng = np.random.default_rng(seed)
+    weights = tuple(_weights(count, draws, rng) for count in counts)
+    return weights, rng.bit_generator.state
 
 
 def _weights(n: int, draws: int, rng: np.random.Generator) -> np.ndarray:

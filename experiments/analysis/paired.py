@@ -34,6 +34,8 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
 
     Raises NotComparable, naming the first window that differs, unless both saw the same windows of each.
     """
+    if agree(a, b):
+        return list(a.datasets)
     shared = [name for name in a.datasets if name in b.datasets]
     if not shared:
         raise NotComparable(
@@ -59,8 +61,16 @@ def paired(
     Raises NotComparable.
     """
     shared = require_same_windows(a, b)
-    mine, theirs = (x.rows(np.flatnonzero(np.isin(x.dataset, shared))) for x in (a, b))
+    mine, theirs = (x.among(shared) for x in (a, b))
     return intervals(paired_difference(mine, theirs, perplexity_group), level)
+
+
+def agree(a: WindowTable, b: WindowTable) -> bool:
+    """Whether both saw the same windows in the same order: quicker found out than which one differs."""
+    if not a.stands_as(b) or not np.array_equal(a.frames, b.frames):
+        return False
+    both = TRUTH in a.metrics and TRUTH in b.metrics
+    return not both or bool((np.abs(a.metrics[TRUTH] - b.metrics[TRUTH]) <= SAME).all())
 
 
 def _require_equal(

@@ -106,7 +106,8 @@ def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePo
 
 def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Change]) -> str:
     """The numbers of one curve of several, as of a sweep that has it alone."""
-    own = [dataclasses.replace(r, series="") for r in rows if r.sweep == sweep.name and r.series == name]
+    own = [r for r in rows if r.sweep == sweep.name and r.series == name and not r.of_robot]
+    own = [dataclasses.replace(r, series="") for r in own]
     return f"<h4>{html.escape(name)}</h4>{_curve(sweep, own, changes, name)}" if own else ""
 
 

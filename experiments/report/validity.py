@@ -19,7 +19,7 @@ from experiments.rows import LOSS, OVERALL, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
-from hma_jax.evaluation.summary import Summary, summarise
+from hma_jax.evaluation.summary import Summary, means
 from hma_jax.evaluation.windows import WindowTable
 
 Verdict = Literal["good", "bad", "open"]
@@ -127,9 +127,9 @@ def _same(a: float, b: float) -> bool:
 
 def _follows(result: Mapping[str, Any], windows: WindowTable, group: int) -> bool:
     """Whether the means of a result are those of the windows."""
-    said, found = Summary.from_dict(result["evaluation"]).datasets, summarise(windows, group).datasets
+    said, found = Summary.from_dict(result["evaluation"]).datasets, means(windows, group)
     return said.keys() == found.keys() and all(
-        metric in found[robot] and math.isclose(stat.mean, found[robot][metric].mean, rel_tol=EXACT, abs_tol=EXACT)
+        metric in found[robot] and math.isclose(stat.mean, found[robot][metric], rel_tol=EXACT, abs_tol=EXACT)
         for robot, stats in said.items()
         for metric, stat in stats.items()
     )

@@ -104,8 +104,15 @@ def from_json(cls: type, text: str) -> Any:
 
 def stable_hash(config: Any, length: int = 16) -> str:
     """Hex digest of the canonical JSON: the same on every machine and Python version."""
-    canonical = json.dumps(to_dict(config), sort_keys=True, separators=(",", ":"))
+    # Not `to_dict` of all of it: most of what is hashed is JSON already, and copying it takes longer than the rest.
+    canonical = json.dumps(config, sort_keys=True, separators=(",", ":"), default=_of_dataclass)
     return hashlib.sha256(canonical.encode()).hexdigest()[:length]
+
+
+def _of_dataclass(config: Any) -> dict[str, Any]:
+    if not dataclasses.is_dataclass(config):
+        raise TypeError(f"Object of type {type(config).__name__} is not JSON serializable")
+    return to_dict(config)
 
 
 def diff(old: Any, new: Any, path: str = "") -> list[str]:

@@ -21,6 +21,7 @@ import io
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -54,7 +55,7 @@ class WindowTable:
     def __len__(self) -> int:
         return len(self.dataset)
 
-    @property
+    @cached_property
     def datasets(self) -> tuple[str, ...]:
         """In the order of their first windows."""
         return tuple(dict.fromkeys(self.dataset.tolist()))
@@ -65,17 +66,35 @@ class WindowTable:
         columns = (self.dataset.tolist(), self.episode.tolist(), self.start.tolist())
         return list(zip(*columns, strict=True))
 
+    @cached_property
+    def distinct(self) -> bool:
+        """Whether no window stands there twice."""
+        return len(set(self.names)) == len(self)
+
     def of(self, dataset: str) -> WindowTable:
         """The windows of one dataset."""
         return self.rows(np.flatnonzero(self.dataset == dataset))
+
+    def among(self, datasets: Sequence[str]) -> WindowTable:
+        """The windows of some datasets, as they stand here."""
+        if set(self.datasets) <= set(datasets):
+            return self
+        return self.rows(np.flatnonzero(np.isin(self.dataset, list(datasets))))
 
     def rows(self, index: np.ndarray) -> WindowTable:
         metrics = {name: column[index] for name, column in self.metrics.items()}
         return WindowTable(self.dataset[index], self.episode[index], self.start[index], self.frames[index], metrics)
 
+    def stands_as(self, other: WindowTable) -> bool:
+        """Whether it has the windows of `other`, each once and in the same order."""
+        named = ("dataset", "episode", "start")
+        return all(np.array_equal(getattr(self, n), getattr(other, n)) for n in named) and self.distinct
+
     def matched_to(self, other: WindowTable) -> WindowTable:
         """The same windows in the order of `other`. Raises ConfigError, naming the first window that differs, if
         `other` has others, or one of them twice."""
+        if self.stands_as(other):  # as trials of one study do
+            return self
         mine, theirs = self.names, other.names
         at = {name: i for i, name in enumerate(mine)}
         for names in (mine, theirs):
@@ -119,19 +138,20 @@ class WindowTable:
     def from_arrow(cls, table: pa.Table) -> WindowTable:
         """The inverse, of one trial's rows in any order of metrics. Raises ValueError unless every metric has the
         same windows in the same order."""
-        metric = np.asarray(table["metric"].to_pylist(), object)
-        names = list(dict.fromkeys(metric.tolist()))
-        blocks = [np.flatnonzero(metric == name) for name in names]
-        if not blocks or len(set(table["trial"].to_pylist())) != 1:
+        (metrics, metric), (trials, trial), (robots, robot) = (_coded(table[n]) for n in ("metric", "trial", "robot"))
+        codes, firsts = np.unique(metric, return_index=True)
+        codes = codes[np.argsort(firsts)]
+        names, blocks = [metrics[code] for code in codes], [np.flatnonzero(metric == code) for code in codes]
+        if not blocks or len({trials[code] for code in np.unique(trial)}) != 1:
             raise ValueError("it holds no trial, or several")
-        columns = {name: table[name].to_numpy() for name in ("robot", "episode", "window", "frames", "value")}
+        columns = {"robot": robot} | {n: table[n].to_numpy() for n in ("episode", "window", "frames", "value")}
         first = {name: column[blocks[0]] for name, column in columns.items()}
         for name, block in zip(names, blocks, strict=True):
             if any(not np.array_equal(columns[c][block], first[c]) for c in ("robot", "episode", "window", "frames")):
                 raise ValueError(f"{name} is of other windows than {names[0]}")
         whole = (np.asarray(first[name], np.int64) for name in ("episode", "window", "frames"))
         values = {n: columns["value"][block].astype(np.float64) for n, block in zip(names, blocks, strict=True)}
-        return cls(np.asarray(first["robot"], str), *whole, values)
+        return cls(np.asarray(robots, str)[first["robot"]], *whole, values)
 
     def save(self, path: str | Path, trial: str) -> None:
         """Writes the Parquet file; whole or not at all, and the same bytes for the same numbers."""
@@ -165,6 +185,18 @@ def read_arrow(path: str | Path) -> pa.Table:
 
     with open(path, "rb") as file:  # its own error for a file that is not there
         return pq.read_table(file, page_checksum_verification=True)
+
+
+def _coded(column: pa.ChunkedArray) -> tuple[list[str], np.ndarray]:
+    """The names in a column, and for every row the number of its own. Raises ValueError where a name is missing."""
+    import pyarrow as pa
+
+    coded = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+    whole = coded.unify_dictionaries().combine_chunks()
+    names = whole.dictionary.to_pylist()
+    if whole.null_count or len(set(names)) < len(names):
+        raise ValueError("a name is missing, or stands twice in the list of names")
+    return names, whole.indices.to_numpy()
 
 
 def _first_twice(names: Sequence[tuple[str, int, int]]) -> tuple[str, int, int] | None:
