@@ -30,7 +30,7 @@ play: $(VENV)/installed-play
 	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play $(RUN) --port $(PORT)
 
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
-PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8
+PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal
 
 # Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py.
 EXACT = $(shell grep -rl --include='test_*.py' 'mark.exact' tests)

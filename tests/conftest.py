@@ -12,7 +12,9 @@ from pathlib import Path
 CACHE = Path(__file__).parent.parent / ".jax_cache"
 # Environment, not jax.config: child processes of the tests must find it too.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+# However small: thousands of programs that take less than a tenth of a second are most of what is compiled, and many
+# tests, in this process and in others, compile the same ones.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Tiny programs run once or twice: compiling them well costs more than it saves. Tests marked `exact` are run
 # again without this (`make test`): what is promised to be equal has to be so as users compile it.

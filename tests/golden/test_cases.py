@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -14,16 +13,6 @@ from tests.golden import verify
 
 HERE = Path(__file__).parent
 CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exists())
-
-
-@pytest.fixture(autouse=True, scope="module")
-def keep_small_programs():
-    """Comparisons are many small programs, which together are worth keeping compiled."""
-    name = "jax_persistent_cache_min_compile_time_secs"
-    before = getattr(jax.config, name)
-    jax.config.update(name, 0.0)
-    yield
-    jax.config.update(name, before)
 
 
 VARIANTS = {"08d_mar_joint_actions", "08e_mar_mup_unit_width"}

@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+import jax
+
 from hma_jax.training.hashes import NAME
 from hma_jax.training.loop import LoopOptions
 from tests.toy import fit_toy
@@ -22,6 +24,8 @@ def fill(step: int, steps: int, metrics: dict) -> None:
     checkpoints = Path(sys.argv[1]) / "checkpoints"
     while not (checkpoints / "2" / NAME).exists():  # it is saved in the background
         time.sleep(0.01)
+    # Nor can compiled programs be kept: one that is cut off stays so, in the cache that other tests use.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
     if sys.argv[2] == "full":
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))
     else:
