@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,7 +46,10 @@ def imports_of(path: Path) -> Iterator[str]:
                     yield node.module
 
 
-GRAPH = {name: set(imports_of(path)) - {name} for name, path in MODULES.items()}
+@functools.cache
+def graph_of_imports() -> dict[str, set[str]]:
+    """Not when this file is imported, as every worker does: to read all files takes seconds."""
+    return {name: set(imports_of(path)) - {name} for name, path in MODULES.items()}
 
 
 def find_circle(graph: dict[str, set[str]]) -> list[str]:
@@ -71,19 +75,17 @@ def find_circle(graph: dict[str, set[str]]) -> list[str]:
 
 @pytest.mark.parametrize("package", PACKAGES)
 def test_a_package_imports_only_those_below_it(package: str):
-    for name, imported in GRAPH.items():
+    for name, imported in graph_of_imports().items():
         if name.split(".")[0] == package:
             strangers = {other for other in imported if other.split(".")[0] not in MAY_IMPORT[package]}
             assert not strangers, f"{name} imports {', '.join(sorted(strangers))}"
 
 
-CORE = {name: imported for name, imported in GRAPH.items() if name.startswith("hma_jax.")}
-
-
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_files_of_a_package_import_each_other_in_a_circle(package: str):
     """What is imported in functions, or for type checkers alone, counts too."""
-    circle = find_circle({name: imported for name, imported in GRAPH.items() if name.split(".")[0] == package})
+    own = {name: imported for name, imported in graph_of_imports().items() if name.split(".")[0] == package}
+    circle = find_circle(own)
     assert not circle, " -> ".join(circle)
 
 
@@ -100,14 +102,15 @@ def folders_of(graph: dict[str, set[str]]) -> dict[str, set[str]]:
 
 
 def test_no_folders_of_the_core_import_each_other_in_a_circle():
-    circle = find_circle(folders_of(CORE))
+    core = {name: imported for name, imported in graph_of_imports().items() if name.startswith("hma_jax.")}
+    circle = find_circle(folders_of(core))
     assert not circle, " -> ".join(circle)
 
 
 def test_the_way_of_data_into_batches_has_no_circle_of_folders():
     """tokens -> windows -> loading, all of them above sampling."""
     way = {f"data_pipelines.{name}" for name in ("sampling", "tokens", "windows", "loading")}
-    imports = {folder: below & way for folder, below in folders_of(GRAPH).items() if folder in way}
+    imports = {folder: below & way for folder, below in folders_of(graph_of_imports()).items() if folder in way}
     assert set(imports) == way and not imports["data_pipelines.sampling"]
     circle = find_circle(imports)
     assert not circle, " -> ".join(circle)
