@@ -6,8 +6,11 @@ import atexit
 import gc
 import os
 import shutil
+import sys
 import tempfile
 from pathlib import Path
+
+import pytest
 
 CACHE = Path(__file__).parent.parent / ".jax_cache"
 # Environment, not jax.config: child processes of the tests must find it too.
@@ -33,3 +36,29 @@ if "HMA_CACHE_DIR" not in os.environ:  # not the user's
 
 def pytest_report_header() -> str:
     return f"XLA_FLAGS: {os.environ['XLA_FLAGS'] or 'none, as users compile'}"
+
+
+KEPT = {
+    "hma_jax.model.hma": "declare_model",
+    "hma_jax.tokenizers.autoencoder": "declare_tokenizer",
+    "hma_jax.tokenizers.train": "_jitted_step",
+    "hma_jax.training.train": "_jitted_step",
+}
+"""What a process remembers: declarations, and steps that it has traced."""
+
+
+@pytest.fixture(autouse=True)
+def programs_without_replaced_parts(request: pytest.FixtureRequest):
+    """A test that replaces parts of the program gets no step that was traced before, and leaves none to others."""
+    replaces = "monkeypatch" in request.fixturenames
+    if replaces:
+        forget_programs()
+    yield
+    if replaces:
+        forget_programs()
+
+
+def forget_programs() -> None:
+    for module, name in KEPT.items():
+        if module in sys.modules:
+            getattr(sys.modules[module], name).cache_clear()

@@ -6,6 +6,7 @@ need. Masking and losses are in `objective`, decoding in `generation`.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -158,6 +159,7 @@ class HMA(nnx.Module):
         return jnp.concatenate([jnp.ones_like(hidden_BT[:, :1]), hidden_BT[:, :-1]], axis=1)
 
 
+@lru_cache(maxsize=16)
 def declare_model(
     config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
 ) -> Declared:

@@ -7,6 +7,7 @@ What a token is, is up to the kinds: `lfq` makes ids, `continuous` latents. Trai
 from __future__ import annotations
 
 import abc
+from functools import lru_cache
 
 import jax
 import numpy as np
@@ -20,6 +21,7 @@ from hma_jax.tokenizers.network import Autoencoder, from_pixels, to_pixels
 from hma_jax.tokenizers.shared import BaseTokenizer
 
 
+@lru_cache(maxsize=16)
 def declare_tokenizer(config: TokenizerConfig) -> Declared:
     """The network's parameters, without arrays."""
     return declare(lambda: Autoencoder(config))

@@ -6,6 +6,7 @@ Where the images come from is the caller's business.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def train_tokenizer(
     shapes = TrainState(jax.ShapeDtypeStruct((), jnp.int32), shapes, jax.eval_shape(optimizer.init, shapes))
     described = {"tokenizer": to_dict(config), "train": to_dict(train), "provenance": provenance or {}}
     result = fit(
-        jax.jit(make_train_step(config, train, declared), donate_argnums=0),
+        _jitted_step(make_train_step, config, train),
         with_sharding(shapes, device),
         make_state,
         make_batches,
@@ -121,6 +122,12 @@ def _regularisers(z: jax.Array, config: TokenizerConfig) -> tuple[jax.Array, dic
     commit = commitment(z)
     total = config.entropy_weight * (uncertainty - diversity) + config.commitment_weight * commit
     return total, {"uncertainty": uncertainty, "diversity": diversity, "commitment": commit}
+
+
+@lru_cache(maxsize=4)
+def _jitted_step(make: Callable[..., Callable], config: TokenizerConfig, train: TokenizerTrainConfig) -> Callable:
+    """The step that `make` makes, kept for the next training of this process, which is often the same one, resumed."""
+    return jax.jit(make(config, train, declare_tokenizer(config)), donate_argnums=0)
 
 
 def make_train_step(

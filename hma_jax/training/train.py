@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig
 from hma_jax.config.json import to_dict
@@ -71,12 +72,7 @@ def train_model(
 
     everywhere = NamedSharding(device_mesh, PartitionSpec())
     with jax.set_mesh(device_mesh):
-        step = jax.jit(
-            make_train_step(declared, table, model, config, execution.accumulate),
-            donate_argnums=0,
-            # Numbers lie everywhere, so that every process can read them.
-            out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), everywhere),
-        )
+        step = _jitted_step(make_train_step, model, table, replace(config, seed=0), execution, device_mesh)
         seed = jax.device_put(jax.random.key_data(jax.random.key(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
@@ -102,3 +98,28 @@ def train_model(
             watch=validation and make_watch(validation, declared, table, model, config.masking, put),
             progress=progress,
         )
+
+
+@lru_cache(maxsize=4)
+def _jitted_step(
+    make: Callable[..., Callable],
+    model: ModelConfig,
+    table: EmbodimentTable,
+    config: TrainConfig,
+    execution: ExecutionConfig,
+    device_mesh: Mesh,
+) -> Callable:
+    """The step that `make` makes, of runs of any seed, which comes with the batch.
+
+    Kept for the next run of the same process, which is often the same one, resumed, or one of another seed: tracing
+    and compiling a step takes seconds.
+    """
+    declared = declare_model(model, table, execution)
+    shapes = state_shapes(declared, table, device_mesh, execution.mesh, average=config.ema_decay > 0)
+    everywhere = NamedSharding(device_mesh, PartitionSpec())
+    return jax.jit(
+        make(declared, table, model, config, execution.accumulate),
+        donate_argnums=0,
+        # Numbers lie everywhere, so that every process can read them.
+        out_shardings=(jax.tree.map(lambda x: x.sharding, shapes), everywhere),
+    )
