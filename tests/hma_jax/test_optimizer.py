@@ -1,3 +1,4 @@
+import functools
 from typing import get_args
 
 import jax
@@ -31,10 +32,21 @@ def gradients(params, seed=0):
     return jax.tree.unflatten(treedef, [jnp.asarray(rng.normal(size=x.shape), jnp.float32) for x in leaves])
 
 
-def update(declared, params, state, present, seed=0, config=CONFIG):
-    ones = jax.tree.map(lambda _: 1.0, declared.specs, is_leaf=is_spec)
-    here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, jnp.array(present)))
-    return apply_update(gradients(params, seed), state, params, declared.specs, ones, here, 1e-2, config)
+def update(params, state, present, seed=0, config=CONFIG):
+    return compiled(config)(gradients(params, seed), state, params, jnp.array(present))
+
+
+@functools.cache
+def compiled(config: OptimizerConfig):
+    """One program for all updates of the shallow model, in place of one for each operation and shape."""
+    specs = declare_model(shallow_config(), TABLE).specs
+    ones = jax.tree.map(lambda _: 1.0, specs, is_leaf=is_spec)
+
+    def step(gradients, state, params, present):
+        here = Presence(dict.fromkeys(USES, jnp.array(True)), dict.fromkeys(USES, present))
+        return apply_update(gradients, state, params, specs, ones, here, 1e-2, config)
+
+    return jax.jit(step)
 
 
 def slices(declared, tree, robot):
@@ -53,8 +65,8 @@ def slices(declared, tree, robot):
 def test_robots_absent_from_a_step_do_not_move(config):
     declared, params = lively_params(shallow_config())
     state = init_adam(params, TABLE.size)
-    params1, state1 = update(declared, params, state, [True, True, True], config=config)
-    params2, state2 = update(declared, params1, state1, [True, False, True], seed=1, config=config)
+    params1, state1 = update(params, state, [True, True, True], config=config)
+    params2, state2 = update(params1, state1, [True, False, True], seed=1, config=config)
     for name, before in slices(declared, params1, 1).items():
         np.testing.assert_array_equal(before, slices(declared, params2, 1)[name], err_msg=name)
     for old, new in ((state1.first, state2.first), (state1.second, state2.second)):
@@ -69,10 +81,10 @@ def test_robots_absent_from_a_step_do_not_move(config):
 def test_a_robot_that_returns_goes_on_as_if_the_steps_between_had_not_been():
     declared, params = lively_params(shallow_config())
     state = init_adam(params, TABLE.size)
-    a, sa = update(declared, params, state, [True, True, True], seed=0)
-    away, s_away = update(declared, a, sa, [True, False, True], seed=5)
-    back, _ = update(declared, away, s_away, [True, True, True], seed=1)
-    direct, _ = update(declared, a, sa, [True, True, True], seed=1)
+    a, sa = update(params, state, [True, True, True], seed=0)
+    away, s_away = update(a, sa, [True, False, True], seed=5)
+    back, _ = update(away, s_away, [True, True, True], seed=1)
+    direct, _ = update(a, sa, [True, True, True], seed=1)
     for name, expected in slices(declared, direct, 1).items():
         np.testing.assert_array_equal(expected, slices(declared, back, 1)[name], err_msg=name)
 
@@ -86,7 +98,7 @@ def test_with_everyone_present_it_is_adamw():
     theirs, opt = params, reference.init(params)
     ours, state = params, init_adam(params, TABLE.size)
     for seed in range(3):
-        ours, state = update(declared, ours, state, [True] * 3, seed)
+        ours, state = update(ours, state, [True] * 3, seed)
         updates, opt = reference.update(gradients(params, seed), opt, theirs)
         theirs = optax.apply_updates(theirs, updates)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), ours, theirs)
@@ -104,7 +116,7 @@ def singular_values(x: jax.Array, spec: ParamSpec) -> np.ndarray:
 def test_muon_moves_every_matrix_by_as_much_in_every_direction_and_all_else_as_adamw():
     declared, params = lively_params(shallow_config())
     state, here = init_adam(params, TABLE.size), [True, True, True]
-    (adamw, _), (muon, after) = (update(declared, params, state, here, config=c) for c in (CONFIG, MUON))
+    (adamw, _), (muon, after) = (update(params, state, here, config=c) for c in (CONFIG, MUON))
     flat = [jax.tree.leaves(tree) for tree in (params, adamw, muon, after.second)]
     matrices = 0
     for (path, spec), was, usual, moved, second in zip(declared.leaves().items(), *flat, strict=True):
