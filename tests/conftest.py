@@ -42,6 +42,7 @@ KEPT = {
     "hma_jax.model.hma": "declare_model",
     "hma_jax.tokenizers.autoencoder": "declare_tokenizer",
     "hma_jax.tokenizers.train": "_jitted_step",
+    "hma_jax.training.state": "_jitted_zeros",
     "hma_jax.training.train": "_jitted_step",
 }
 """What a process remembers: declarations, and steps that it has traced."""

@@ -114,7 +114,7 @@ def make_tokenizer(
     with step("train the tokenizer") as update:
         tokenizer = train_tokenizer(
             config, train, frames, aside, provenance=made_from.identity(),
-            options=LoopOptions(checkpoint_every=max(train.steps // CHECKPOINTS, 1)),
+            options=LoopOptions(checkpoint_every=train.steps // CHECKPOINTS),
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
             records=lambda index: frames(0).describe(index),
         )  # fmt: skip

@@ -13,7 +13,8 @@ UNSET = arg(help_behavior_hint="")
 """For an option whose text says what happens without it."""
 
 CHECKPOINTS = 5
-"""Saved per training run, evenly spread, besides those by time: what an interrupted trial resumes from."""
+"""Saved per training run, evenly spread, besides those by time: what an interrupted trial resumes from. A run of fewer
+steps is saved at its end alone, as saving would take longer than its steps."""
 
 VALIDATIONS = 20
 """Per training run that is validated while it trains, unless told otherwise."""
@@ -51,7 +52,7 @@ class RunOptions:
 
     def steps_between(self, steps: int) -> tuple[int, int]:
         """(checkpoints, validations) of a run of `steps`; 0: none."""
-        saves = max(steps // CHECKPOINTS, 1) if self.checkpoint_every is None else self.checkpoint_every
+        saves = steps // CHECKPOINTS if self.checkpoint_every is None else self.checkpoint_every
         views = steps // VALIDATIONS if self.validate_every is None else self.validate_every
         return saves, views
 

@@ -5,6 +5,8 @@ A checkpoint keeps each field of a state as an item of its own (`training.checkp
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -51,18 +53,33 @@ def init_state(
     its state, never them.
     """
     shapes = state_shapes(declared, table) if shapes is None else shapes
-    layout = None if shapes.step.sharding is None else jax.tree.map(lambda x: x.sharding, shapes)
+    layout = _layout(shapes)
     if params is None:
         params = declared.init(seed, layout and layout.params)
     else:
         params = jax.tree.map(lambda x, like: place(np.array(x), like.sharding), params, shapes.params)
-    make_rest = jax.jit(
-        lambda: (jnp.zeros((), jnp.int32), init_adam(shapes.params, table.size)),
-        out_shardings=layout and (layout.step, layout.opt_state),
-    )
-    step, opt_state = make_rest()
+    leaves, treedef = jax.tree.flatten(shapes)
+    step, opt_state = _jitted_zeros(treedef, tuple(leaves), table.size)()
     ema = None if shapes.ema is None else jax.tree.map(copy, params)
     return TrainState(step, params, opt_state, ema)
+
+
+def _layout(shapes: TrainState) -> TrainState | None:
+    """Where its arrays lie; None: on the default device."""
+    return None if shapes.step.sharding is None else jax.tree.map(lambda x: x.sharding, shapes)
+
+
+@lru_cache(maxsize=4)
+def _jitted_zeros(
+    treedef: Any, leaves: tuple[jax.ShapeDtypeStruct, ...], robots: int
+) -> Callable[[], tuple[jax.Array, Any]]:
+    """Counter and moments of a state of these shapes before step 1; kept for the next run of the same process."""
+    shapes = jax.tree.unflatten(treedef, leaves)
+    layout = _layout(shapes)
+    return jax.jit(
+        lambda: (jnp.zeros((), jnp.int32), init_adam(shapes.params, robots)),
+        out_shardings=layout and (layout.step, layout.opt_state),
+    )
 
 
 def all_finite(tree: Any) -> jax.Array:

@@ -62,7 +62,7 @@ def study(arm, tmp_path_factory):
     root = tmp_path_factory.mktemp("study")
     short = write_rlds(root / "rlds", BASE, [3, 2, 3, 3])
     data = ("--data", str(arm), str(short))
-    assert main(["train", *SMOKE, "--out", str(root / "out"), *data]) == 0
+    assert main(["train", *SMOKE, "--out", str(root / "out"), *data, "--checkpoint-every", "1"]) == 0
     return root / "out", data
 
 

@@ -42,7 +42,7 @@ def where(tmp_path_factory) -> tuple[str, ...]:
 def study(where) -> Path:
     """A prepared study with a trained and evaluated model, in `model`."""
     out = Path(where[3])
-    assert main(["train", *where]) == 0
+    assert main(["train", *where, "--checkpoint-every", "1"]) == 0
     assert main(["evaluate", str(out / "model"), *where]) == 0
     return out
 

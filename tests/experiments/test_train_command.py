@@ -9,6 +9,7 @@ import pytest
 
 from experiments.cli.main import main
 from experiments.running import trial as trials
+from experiments.running.run_options import RunOptions
 from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
@@ -63,6 +64,10 @@ def test_fewer_trajectories_when_asked_for(train):
 def test_checkpoints_are_saved_as_often_as_asked_for(train, asked, every):
     _, _, options = train("--set", "train.steps=12", *(["--checkpoint-every", asked] if asked else []))
     assert options.steps_between(12)[0] == every
+
+
+def test_a_run_of_few_steps_is_saved_at_its_end_alone():
+    assert RunOptions().steps_between(4) == (0, 0) and RunOptions().steps_between(5)[0] == 1
 
 
 def test_checkpoints_are_saved_by_the_minute_and_kept_as_asked_for(train, tmp_path):
