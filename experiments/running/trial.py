@@ -107,7 +107,13 @@ def trial_id(trial: Trial, provenance: Provenance) -> str:
     return stable_hash({"trial": _identity(trial), "provenance": to_dict(provenance)})
 
 
-LATER: dict[str, Any] = {"capped": [], "source": None, "model.recall": False, "train.optimizer.matrices": "adamw"}
+LATER: dict[str, Any] = {
+    "capped": [],
+    "source": None,
+    "model.recall": False,
+    "model.diffusion.weight_cap": 0.0,
+    "train.optimizer.matrices": "adamw",
+}
 """Fields that came after trials were published, by their path (`train.masking.own_past`), with the value that all had
 before: they name a trial where they have another. A new field of `Trial` or of a configuration within it is added here,
 or every trial that is finished, committed ones too, is another trial and has to be run again."""

@@ -39,12 +39,16 @@ class DiffusionConfig:
     steps: int = 1000  # of the noising process
     clip: float = 10.0  # predicted clean values are kept in +-clip while sampling
     repeats: int = 1  # noised copies of each token per training step
+    # In training the squared error of the noise counts, as released, the same at every step (0), or is weighed by noise
+    # over signal up to this, which makes it the squared error of the clean vector: mostly of what noise hides.
+    weight_cap: float = 0.0
 
     def __post_init__(self):
         for name in ("channels", "patch", "width", "depth", "steps", "repeats"):
             value = getattr(self, name)
             require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")
         require(self.clip > 0, f"diffusion.clip must be positive, got {self.clip}")
+        require(self.weight_cap >= 0, f"diffusion.weight_cap must not be negative, got {self.weight_cap}")
 
     @property
     def cells(self) -> int:

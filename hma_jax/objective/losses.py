@@ -121,7 +121,7 @@ def masked_loss(
     if masking.predicts_frames:
         weight, tokens = masked.targets_TS[:, SAID_FROM:].astype(jnp.float32), tokens[:, SAID_FROM:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.said, tokens, key_B)
+            per_token = frame_diffusion_loss(model, out.said, tokens, key_B, model.config.diffusion.weight_cap)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
             per_token, right = smoothed_cross_entropy(out.said, labels, masking.label_smoothing)
@@ -139,15 +139,21 @@ def seen_by_all(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
     return everything if real_BT is None else everything & real_BT[:, None]
 
 
-def frame_diffusion_loss(model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array) -> jax.Array:
-    """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4)."""
+def frame_diffusion_loss(
+    model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array, weight_cap: float = 0.0
+) -> jax.Array:
+    """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4).
+
+    The former is weighed as `DiffusionConfig.weight_cap` says, when a model is trained; it is judged without.
+    """
     config = model.config.diffusion
     process = make_process(config.steps)
+    weights = jnp.asarray(process.noise_over_signal(weight_cap), jnp.float32)
 
     def one(key: jax.Array, z: jax.Array, x0: jax.Array) -> jax.Array:
         time, noise = draw_noise(key, x0.shape, config)
         mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z), x0, time, noise, process)
-        return mse + vb
+        return (mse * weights[time] if weight_cap else mse) + vb
 
     # The trunk's work is shared by all noised copies of a token.
     keys_RB = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]

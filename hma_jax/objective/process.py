@@ -44,6 +44,10 @@ class Process:
         """log(sqrt(abar) / sqrt(1 - abar)), falling."""
         return 0.5 * np.log(self.alphas_cumprod / (1.0 - self.alphas_cumprod))
 
+    def noise_over_signal(self, cap: float) -> np.ndarray:
+        """(1 - abar) / abar, at most `cap`: the squared error of the noise times this is that of the clean vector."""
+        return np.minimum(1.0 / self.alphas_cumprod - 1.0, cap)
+
 
 def _from_betas(betas: np.ndarray, timestep_map: np.ndarray) -> Process:
     abar = np.cumprod(1.0 - betas)

@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DiffusionConfig
 from hma_jax.model.heads import timestep_embedding
+from hma_jax.model.hma import declare_model
 from hma_jax.objective.diffusion import diffusion_loss
+from hma_jax.objective.losses import draw_noise, frame_diffusion_loss
 from hma_jax.objective.process import (
     make_process,
     respace,
     respace_by_log_snr,
 )
+from tests.tiny import TABLE, shallow_config
 
 FULL = make_process(1000)
 
@@ -200,3 +203,36 @@ def test_the_network_sees_vectors_noised_to_their_step():
     np.testing.assert_array_equal(times, t)
     np.testing.assert_allclose(mse, np.full((2, 3), 0.25), rtol=1e-6)
     assert vb.shape == (2, 3)
+
+
+def test_the_error_of_the_noise_times_noise_over_signal_is_that_of_the_clean_vector():
+    x0, t, noise, eps, variance = rows_of_every_kind()
+    mse, _ = terms(x0, t, noise, eps, variance)
+    abar = FULL.alphas_cumprod[t][:, None]
+    x_t = np.sqrt(abar) * x0.astype(np.float64) + np.sqrt(1 - abar) * noise
+    clean = (x_t - np.sqrt(1 - abar) * eps) / np.sqrt(abar)
+    want = np.square(clean - x0).mean(-1)
+    np.testing.assert_allclose(mse * FULL.noise_over_signal(math.inf)[t], want, rtol=1e-4)
+    weights = FULL.noise_over_signal(20.0)
+    assert weights.max() == 20.0 and np.all(np.diff(weights) >= 0) and np.sum(weights < 20.0) > 800
+
+
+def test_the_weighed_loss_of_a_token_is_the_error_times_its_weight_and_the_bound_as_it_was():
+    """A denoiser before its first step says 0, and errs by the noise itself."""
+    config = DiffusionConfig(channels=3, patch=1, width=8, depth=1, weight_cap=2.0)
+    model_config = shallow_config(diffusion=config)
+    declared = declare_model(model_config, TABLE)
+    params = declared.init(0)
+    rng = np.random.default_rng(0)
+    z, x0 = (jnp.asarray(rng.normal(size=(2, 3, 4, c)), jnp.float32) for c in (model_config.width, 3))
+    keys = jax.random.split(jax.random.key(0), 2)
+
+    @jax.jit
+    def losses():
+        model = declared.merge(params)
+        return [frame_diffusion_loss(model, z, x0, keys, cap) for cap in (0.0, config.weight_cap)]
+
+    plain, weighed = losses()
+    time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, 0), x0.shape[1:], config))(keys)
+    weight = FULL.noise_over_signal(2.0)[np.asarray(time)]
+    np.testing.assert_allclose(weighed, plain + (weight - 1) * np.square(noise).mean(-1), rtol=1e-4, atol=1e-5)
