@@ -170,6 +170,24 @@ CPU_CONTINUOUS = replace(
     eval=replace(CPU.eval, decode=DecodeConfig(sampler=SamplerConfig(steps=20, temperature=0.0))),
 )
 
+CPU_FULL_CONTINUOUS = replace(
+    CPU_FULL,
+    name="cpu-full-continuous",  # whether latents do as well, with what the ladder found: three seeds, a control
+    tokenizer=CPU_CONTINUOUS.tokenizer,
+    model=replace(
+        CPU_FULL.model, recall=True,
+        # As released actions are hardly followed: what counts most is noise so small that the frame shows through it.
+        diffusion=DiffusionConfig(channels=16, patch=1, width=48, depth=2, weight_cap=20.0, time_shift=4.0),
+    ),
+    train=replace(CPU_FULL.train, steps=16_000, optimizer=replace(CPU_FULL.train.optimizer, matrices="muon")),
+    eval=replace(
+        CPU_FULL.eval, other_actions=3,
+        decode=DecodeConfig(sampler=SamplerConfig(kind="dpm++", steps=12, temperature=0.0)),
+    ),
+    designs=replace(CPU_FULL.designs, budgets=(), long=()),
+    axes=("horizon",),
+)  # fmt: skip
+
 PLAY = replace(
     CPU,
     name="play",  # the model of `make play`: eight robots to drive, 64 pixels, two cores, hours
@@ -194,7 +212,12 @@ PLAY = replace(
     transfer=TransferConfig(widths=(32, 48, 64), datasets=8, steps=1200),
 )
 
-PRESETS = {p.name: p for p in (SMOKE, CPU, CPU_FULL, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS, PLAY)}
+PRESETS = {
+    p.name: p
+    for p in (
+        SMOKE, CPU, CPU_FULL, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS, CPU_FULL_CONTINUOUS, PLAY,
+    )
+}  # fmt: skip
 
 
 def get_preset(name: str) -> Study:

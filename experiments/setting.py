@@ -22,7 +22,9 @@ from experiments.study import Study, on_tokenizer, on_user_data, override
 from hma_jax.config import ConfigError
 from hma_jax.training.claim import is_address
 
-Preset = Literal["smoke", "cpu", "cpu-full", "accelerator", "paper", "smoke-continuous", "cpu-continuous", "play"]
+Preset = Literal[
+    "smoke", "cpu", "cpu-full", "accelerator", "paper", "smoke-continuous", "cpu-continuous", "cpu-full-continuous", "play"
+]
 
 
 @dataclass(frozen=True)

@@ -112,6 +112,7 @@ LATER: dict[str, Any] = {
     "source": None,
     "model.recall": False,
     "model.diffusion.weight_cap": 0.0,
+    "model.diffusion.time_shift": 1.0,
     "train.optimizer.matrices": "adamw",
 }
 """Fields that came after trials were published, by their path (`train.masking.own_past`), with the value that all had

@@ -42,6 +42,9 @@ class DiffusionConfig:
     # In training the squared error of the noise counts, as released, the same at every step (0), or is weighed by noise
     # over signal up to this, which makes it the squared error of the clean vector: mostly of what noise hides.
     weight_cap: float = 0.0
+    # In training steps are drawn evenly, as released (1), or shifted towards noise: of the way from the cleanest to the
+    # noisiest a share u becomes k u / (1 + (k - 1) u) (Esser et al. 2024).
+    time_shift: float = 1.0
 
     def __post_init__(self):
         for name in ("channels", "patch", "width", "depth", "steps", "repeats"):
@@ -49,6 +52,7 @@ class DiffusionConfig:
             require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")
         require(self.clip > 0, f"diffusion.clip must be positive, got {self.clip}")
         require(self.weight_cap >= 0, f"diffusion.weight_cap must not be negative, got {self.weight_cap}")
+        require(self.time_shift > 0, f"diffusion.time_shift must be positive, got {self.time_shift}")
 
     @property
     def cells(self) -> int:

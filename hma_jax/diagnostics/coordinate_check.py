@@ -102,11 +102,11 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     note("conditions" if diffusion else "logits", out.said)
     if diffusion:
         key = jax.random.key(0)
-        time, noise = draw_noise(key, batch["tokens"].shape, diffusion)
+        time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)
         _watch(model.denoiser, "condition", lambda y: note("denoiser condition", y))
         note("denoiser", model.denoiser(noise, time, out.said))
     if model.action_head is not None and out.actions is not None:
-        args = draw_noise(key, batch["actions"].shape, diffusion)[::-1] if diffusion else ()
+        args = draw_noise(key, batch["actions"].shape, diffusion.steps)[::-1] if diffusion else ()
         note("actions", model.action_head(*args, out.actions, embodiment_B))
     return seen
 

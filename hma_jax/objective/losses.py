@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import DiffusionConfig, MaskingConfig
+from hma_jax.config import MaskingConfig
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
@@ -121,7 +121,7 @@ def masked_loss(
     if masking.predicts_frames:
         weight, tokens = masked.targets_TS[:, SAID_FROM:].astype(jnp.float32), tokens[:, SAID_FROM:]
         if model.config.diffusion:
-            per_token = frame_diffusion_loss(model, out.said, tokens, key_B, model.config.diffusion.weight_cap)
+            per_token = frame_diffusion_loss(model, out.said, tokens, key_B, training=True)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
             per_token, right = smoothed_cross_entropy(out.said, labels, masking.label_smoothing)
@@ -140,20 +140,22 @@ def seen_by_all(frames: int, real_BT: jax.Array | None = None) -> jax.Array:
 
 
 def frame_diffusion_loss(
-    model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array, weight_cap: float = 0.0
+    model: HMA, z_BTSD: jax.Array, tokens_BTSC: jax.Array, key_B: jax.Array, training: bool = False
 ) -> jax.Array:
     """Per token [B, T, S]: squared error of the noise plus the bound's variance term (reference section 2.4).
 
-    The former is weighed as `DiffusionConfig.weight_cap` says, when a model is trained; it is judged without.
+    Which steps are drawn, and what the error counts at each, is configured for `training` alone
+    (`DiffusionConfig.time_shift`, `weight_cap`): models are judged alike.
     """
     config = model.config.diffusion
     process = make_process(config.steps)
-    weights = jnp.asarray(process.noise_over_signal(weight_cap), jnp.float32)
+    shift, cap = (config.time_shift, config.weight_cap) if training else (1.0, 0.0)
+    weights = jnp.asarray(process.noise_over_signal(cap), jnp.float32)
 
     def one(key: jax.Array, z: jax.Array, x0: jax.Array) -> jax.Array:
-        time, noise = draw_noise(key, x0.shape, config)
+        time, noise = draw_noise(key, x0.shape, config.steps, shift)
         mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z), x0, time, noise, process)
-        return (mse * weights[time] if weight_cap else mse) + vb
+        return (mse * weights[time] if cap else mse) + vb
 
     # The trunk's work is shared by all noised copies of a token.
     keys_RB = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]
@@ -161,10 +163,14 @@ def frame_diffusion_loss(
     return jnp.stack([jax.vmap(one)(key, z_BTSD, x0) for key in keys_RB]).mean(axis=0)
 
 
-def draw_noise(key: jax.Array, shape: tuple[int, ...], config: DiffusionConfig) -> tuple[jax.Array, jax.Array]:
-    """(time int [...], noise [..., C]) for values of `shape` [..., C]."""
+def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float = 1.0) -> tuple[jax.Array, jax.Array]:
+    """(time int [...], noise [..., C]) for values of `shape` [..., C]; `shift` as `DiffusionConfig.time_shift`."""
     time_key, noise_key = jax.random.split(key)
-    return jax.random.randint(time_key, shape[:-1], 0, config.steps), jax.random.normal(noise_key, shape)
+    time = jax.random.randint(time_key, shape[:-1], 0, steps)
+    if shift != 1:
+        u = (time + 0.5) / steps
+        time = (steps * shift * u / (1 + (shift - 1) * u)).astype(jnp.int32)
+    return time, jax.random.normal(noise_key, shape)
 
 
 def action_loss_per_step(
@@ -184,7 +190,7 @@ def action_loss_per_step(
     alive_BTU = jnp.broadcast_to(jnp.asarray(model.table.alive())[embodiment_B][:, None], target.shape)
     if model.config.diffusion:
         keys = jax.vmap(lambda k: jax.random.fold_in(k, 2**20))(key_B)  # not one of the repeats'
-        time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion))(keys)
+        time, noise = jax.vmap(lambda k: draw_noise(k, target.shape[1:], model.config.diffusion.steps))(keys)
 
         def network(x: jax.Array, t: jax.Array) -> jax.Array:
             return model.action_head(x, t, pooled_BTD, slice_B)

@@ -230,9 +230,21 @@ def test_the_weighed_loss_of_a_token_is_the_error_times_its_weight_and_the_bound
     @jax.jit
     def losses():
         model = declared.merge(params)
-        return [frame_diffusion_loss(model, z, x0, keys, cap) for cap in (0.0, config.weight_cap)]
+        return [frame_diffusion_loss(model, z, x0, keys, training) for training in (False, True)]
 
     plain, weighed = losses()
-    time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, 0), x0.shape[1:], config))(keys)
+    time, noise = jax.vmap(lambda k: draw_noise(jax.random.fold_in(k, 0), x0.shape[1:], config.steps))(keys)
     weight = FULL.noise_over_signal(2.0)[np.asarray(time)]
     np.testing.assert_allclose(weighed, plain + (weight - 1) * np.square(noise).mean(-1), rtol=1e-4, atol=1e-5)
+
+
+def test_shifted_steps_are_drawn_as_often_as_the_shift_says():
+    """P(time < t) = u with k u / (1 + (k - 1) u) = t / steps; without a shift, evenly."""
+    key, shape = jax.random.key(0), (20_000, 1)
+    for k in (0.5, 1.0, 4.0):
+        time, noise = draw_noise(key, shape, 100, k)
+        assert time.min() >= 0 and time.max() < 100
+        for share in (0.2, 0.5, 0.9):
+            want = share / (k - (k - 1) * share)
+            assert abs(float(np.mean(np.asarray(time) < 100 * share)) - want) < 0.02, (k, share)
+        np.testing.assert_array_equal(noise, draw_noise(key, shape, 100)[1])
