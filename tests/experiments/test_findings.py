@@ -14,7 +14,7 @@ from data_pipelines.suite.embodiments import TRAINED
 from experiments.analysis.preregistered import FILE, Expected, read_expected
 from experiments.applications.detector import CLOSE
 from experiments.applications.in_place import VIEWS, in_place
-from experiments.report.robots import robots_of
+from experiments.report.robots import Robot, robots_of
 from experiments.rows import OVERALL, Row, curve, difference, read_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
@@ -54,27 +54,41 @@ def test_the_first_axis_by_how_much_data_a_robot_has_is_as_its_findings_say():
         assert f"| {line} |" in page, line
 
 
-def horizon_rows() -> list[str]:
-    """The lines of findings.md on the axis `horizon` of cpu-full, from every window's numbers."""
-    workspace = Workspace(RESULTS / "cpu-full")
+ACTING = {e.name for e in TRAINED if not e.video_only}
+"""Robots that are trained with actions."""
+
+
+@functools.cache
+def robots_at(study: str, axis: str, role: str = POINT) -> dict[float, tuple[list[Robot], int]]:
+    """{x: (every robot, from every window's numbers, trials)} of the points of `role` of an axis of a study."""
+    workspace = Workspace(RESULTS / study)
     record = load_record(workspace)
-    (sweep,) = plan_sweeps(record.study, ("horizon",))
-    acting = {e.name for e in TRAINED if not e.video_only}
-    ids = {trial_id(p.trial, record.provenance): p for p in sweep.points if p.role == POINT}
-    windows = {id: WindowTable.load(workspace.trials / id / WINDOWS) for id in ids}
+    (sweep,) = plan_sweeps(record.study, (axis,))
+    points = tuple(replace(p, role=POINT) for p in sweep.points if p.role == role)
+    found = {}
+    for x in sorted({p.x for p in points}):
+        ids = [trial_id(p.trial, record.provenance) for p in points if p.x == x]
+        windows = {id: WindowTable.load(workspace.trials / id / WINDOWS) for id in ids}
+        at_x = replace(sweep, points=points, reference_x=x)
+        found[x] = robots_of([], at_x, record.provenance, windows), len(ids)
+    return found
+
+
+def counts(robots: list[Robot]) -> list[int]:
+    """How many are ahead of copying; of those that act, action-nats beyond 3 standard errors, delta PSNR beyond 2."""
+    follow = [r.follows for r in robots if r.name in ACTING]
+    beyond = [sum(f[metric].errors > n for f in follow) for metric, n in (("action_nats", 3), ("delta_psnr", 2))]
+    return [sum(r.ahead > 0 for r in robots), *beyond]
+
+
+def horizon_rows() -> list[str]:
+    """The lines of findings.md on the axis `horizon` of cpu-full."""
+    curves = {m: {p.x: p for p in curve(rows_of(), "horizon", m)} for m in ("cross_entropy", "psnr")}
     lines = []
-    for x in sorted({p.x for p in ids.values()}):
-        tables = [windows[id] for id, p in ids.items() if p.x == x]
-        robots = robots_of([], replace(sweep, reference_x=x), record.provenance, windows)
-        follow = [r.follows for r in robots if r.name in acting]
-
-        def mean(metric: str, tables=tables) -> float:
-            return float(np.mean([t.of(name).metrics[metric].mean() for t in tables for name in t.datasets]))
-
+    for x, (robots, trials) in robots_at("cpu-full", "horizon").items():
+        follow = [r.follows for r in robots if r.name in ACTING]
         cells = [
-            f"{x:,}", len(tables), f"{mean('cross_entropy'):.2f}", f"{mean('psnr'):.2f}",
-            sum(r.ahead > 0 for r in robots),
-            sum(f["action_nats"].errors > 3 for f in follow), sum(f["delta_psnr"].errors > 2 for f in follow),
+            f"{x:,}", trials, *(f"{points[x].mean:.2f}" for points in curves.values()), *counts(robots),
             *(f"{np.mean([f[metric].mean for f in follow]):.2f}" for metric in ("action_nats", "retrieval")),
         ]  # fmt: skip
         lines.append(f"| {' | '.join(map(str, cells))} |")
@@ -294,7 +308,7 @@ def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
 def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
     """Bold where it did not hold."""
     page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
-    assert len(expected) == 6
+    assert len(expected) == 8
     for e in expected:
         points = {p.label: p for p in curve(rows_of("ladder"), "ladder", e.metric)}
         mean = difference(points[e.x], points[e.against])[0] if e.against else points[e.x].mean
@@ -304,23 +318,38 @@ def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
         assert f"| {e.x}{against} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
 
 
+def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():
+    page = findings("ladder").splitlines()
+    labels = [p.label for p in curve(rows_of("ladder"), "ladder", "psnr")]
+    found = {labels[int(x)]: counts(robots) for x, (robots, _) in robots_at("ladder", "ladder").items()}
+    ((controls, _),) = robots_at("ladder", "ladder", CONTROL).values()
+    for label, said in (found | {"reference, control": counts(controls)}).items():
+        [line] = [line for line in page if re.match(rf"\| {label} \| \d", line)]
+        assert line.endswith(f" | {' | '.join(map(str, said))} |"), (label, said)
+    longest, _ = max(robots_at("ladder", "ladder").items())[1]
+    gain = np.mean([r.ahead for r in longest])
+    assert f"64,000 steps, is {gain:.2f} dB ahead of copying**, on {found[labels[-1]][0]} of 40 robots" in " ".join(page)
+
+
 def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
     """Beside the same robots of cpu-full's long reference."""
     page, rows = " ".join(findings("ladder").split()), {}
-    for name in ("ladder", "32000"):
+    for name in ("ladder-64000", "ladder", "32000"):
         with open(RESULTS / "in_place" / f"{name}.csv", newline="") as file:
             rows[name] = list(csv.DictReader(file))
-    robots = {row["robot"] for row in rows["ladder"]}
-    before = [row for row in rows["32000"] if row["robot"] in robots]
+    longest, before, robots = rows["ladder-64000"], rows["ladder"], {row["robot"] for row in rows["ladder"]}
+    of_others = [row for row in rows["32000"] if row["robot"] in robots]
 
     def share(mine: list[dict[str, str]], view: str = "model") -> str:
         mean, half, count = in_place(mine, view)
         assert count == len(robots) == 12
         return f"{100 * mean:.1f} ± {100 * half:.1f} %"
 
-    tools, objects = ([r for r in rows["ladder"] if r["what"].startswith(kind)] for kind in ("tool", "colour"))
-    assert f"of what moved, {share(rows['ladder'])} stands" in page and f"{share(before)} on the same twelve" in page
-    assert f"true frames {share(rows['ladder'], 'true')}" in page
+    tools, objects = ([r for r in longest if r["what"].startswith(kind)] for kind in ("tool", "colour"))
+    said = f"of what moved, {share(longest)} stands within 2 pixels of 32 of its place in the last frame of a window after"
+    assert f"{said} 64,000 steps, {share(before)} after 32,000" in page
+    assert f"{share(of_others)} on the same twelve robots" in page
+    assert share(longest, "true") == share(before, "true") and f"true frames {share(longest, 'true')}" in page
     assert f"Of tools it is {share(tools)}, of objects {share(objects)}." in page
 
 
