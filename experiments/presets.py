@@ -166,27 +166,23 @@ CPU_CONTINUOUS = replace(
     CPU,
     name="cpu-continuous",  # the same study on latents instead of ids
     tokenizer=replace(CPU.tokenizer, quantise=False, bits=16),
-    model=replace(CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=128, depth=2)),
-    eval=replace(CPU.eval, decode=DecodeConfig(sampler=SamplerConfig(steps=20, temperature=0.0))),
+    # As released actions are hardly followed: what counts most is noise so small that the frame shows through it.
+    model=replace(
+        CPU.model, diffusion=DiffusionConfig(channels=16, patch=1, width=48, depth=2, weight_cap=20.0, time_shift=4.0)
+    ),
+    eval=replace(CPU.eval, decode=DecodeConfig(sampler=SamplerConfig(kind="dpm++", steps=12, temperature=0.0))),
 )
 
 CPU_FULL_CONTINUOUS = replace(
     CPU_FULL,
     name="cpu-full-continuous",  # whether latents do as well, with what the ladder found: three seeds, a control
     tokenizer=CPU_CONTINUOUS.tokenizer,
-    model=replace(
-        CPU_FULL.model, recall=True,
-        # As released actions are hardly followed: what counts most is noise so small that the frame shows through it.
-        diffusion=DiffusionConfig(channels=16, patch=1, width=48, depth=2, weight_cap=20.0, time_shift=4.0),
-    ),
+    model=replace(CPU_CONTINUOUS.model, recall=True),
     train=replace(CPU_FULL.train, steps=16_000, optimizer=replace(CPU_FULL.train.optimizer, matrices="muon")),
-    eval=replace(
-        CPU_FULL.eval, other_actions=3,
-        decode=DecodeConfig(sampler=SamplerConfig(kind="dpm++", steps=12, temperature=0.0)),
-    ),
+    eval=CPU_CONTINUOUS.eval,
     designs=replace(CPU_FULL.designs, budgets=(), long=()),
     axes=("horizon",),
-)  # fmt: skip
+)
 
 PLAY = replace(
     CPU,
