@@ -118,7 +118,7 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
     """PSNR and delta PSNR over the time per frame, every point named."""
     import matplotlib.pyplot as plt
 
-    from experiments.report.plot_style import COLOURS, STYLE, plain_log, save
+    from experiments.report.plot_style import COLOURS, DEFAULT, STYLE, plain_log, save
 
     cost = "milliseconds_per_frame"
     with plt.rc_context(STYLE):
@@ -127,16 +127,17 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
             panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
         ):
             kinds = dict.fromkeys(row.decoding.split()[0] for row in rows)
-            for kind, colour, lift in zip(kinds, COLOURS.values(), (5, -12, 12), strict=False):
+            colours = (*COLOURS.values(), DEFAULT)  # as many as SAMPLER_STEPS has kinds
+            for kind, colour, lift in zip(kinds, colours, (5, -12, 12)[: len(kinds)], strict=False):
                 ours = [r for r in rows if r.decoding.split()[0] == kind]
                 time, value, sem = ([getattr(r, f) for r in ours] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(
                     time, value, sem, color=colour, marker="o", markersize=4, linewidth=1.2, capsize=2, label=kind
                 )
                 for row in ours:
-                    number = row.decoding.split()[-1]
+                    steps = row.decoding.split()[-1]
                     at = (getattr(row, cost), getattr(row, metric))
-                    panel.annotate(number, at, xytext=(4, lift), textcoords="offset points", fontsize=7.5)
+                    panel.annotate(steps, at, xytext=(4, lift), textcoords="offset points", fontsize=7.5)
             if len(rows) > len(kinds) > 1:
                 panel.legend()
             plain_log(panel, panel.xaxis)
