@@ -192,12 +192,17 @@ def test_the_axis_lr_is_as_findings_say():
     assert {way: max(steps) - min(steps) for way, steps in moved.items()} == {"muP": 1, "standard": 4}  # as README says
 
 
-def axis_rows(sweep: str, study: str = "cpu-full") -> list[str]:
+IDS = {"cross_entropy": 3, "psnr": 2, "action_nats": 2, "delta_psnr": 2}
+LATENTS = {"diffusion_loss": 4, "psnr": 2, "action_nats": 4, "delta_psnr": 2}
+"""Metrics of a table in findings.md, and their digits."""
+
+
+def axis_rows(sweep: str, study: str = "cpu-full", metrics: dict[str, int] = IDS) -> list[str]:
     """The lines of findings.md on an axis of a study with one curve: means over seeds and judged robots."""
-    rows, digits = rows_of(study), (3, 2, 2, 2)
+    rows, digits = rows_of(study), tuple(metrics.values())
     lines = []
     for role in (POINT, CONTROL):
-        curves = [curve(rows, sweep, m, role) for m in ("cross_entropy", "psnr", "action_nats", "delta_psnr")]
+        curves = [curve(rows, sweep, m, role) for m in metrics]
         for points in zip(*curves, strict=True):
             x = points[0].label or f"{points[0].x:,.0f}"
             cells = [x + ", control" * (role == CONTROL), str(len(points[0].seeds))]
@@ -328,7 +333,30 @@ def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():
         assert line.endswith(f" | {' | '.join(map(str, said))} |"), (label, said)
     longest, _ = max(robots_at("ladder", "ladder").items())[1]
     gain = np.mean([r.ahead for r in longest])
+    psnr = curve(rows_of("ladder"), "ladder", "psnr")[-1].mean
+    with open(RESULTS / "in_place" / "ladder-64000.csv", newline="") as file:
+        share, _, _ = in_place(list(csv.DictReader(file)), "model")
+    assert f"a better recipe and 64,000 come to {psnr:.2f} dB and {100 * share:.0f} %" in readme()
     assert f"64,000 steps, is {gain:.2f} dB ahead of copying**, on {found[labels[-1]][0]} of 40 robots" in " ".join(page)
+
+
+def test_the_reference_on_latents_is_as_its_findings_say():
+    study = "cpu-full-continuous"
+    page = " ".join(findings(study).split())
+    told = [counts(robots) for role in (POINT, CONTROL) for robots, _ in robots_at(study, "horizon", role).values()]
+    lines = axis_rows("horizon", study, LATENTS)
+    for line, said in zip(lines, told, strict=True):
+        assert f"{line.removesuffix(' |')} | {' | '.join(map(str, said))} |" in page, (line, said)
+    ((robots, _),) = robots_at(study, "horizon").values()
+    beyond = sum(r.follows["delta_psnr"].errors > 3 for r in robots if r.name in ACTING)
+    gain = np.mean([r.ahead for r in robots])
+    assert f"{gain:.2f} dB ahead of copying" in page and f"ΔPSNR beyond 3 on {beyond} of the 36" in page
+    (psnr,) = curve(rows_of(study), "horizon", "psnr")
+    assert f"On latents two seeds of {psnr.x:,.0f} have {psnr.mean:.2f} dB" in readme() and len(psnr.seeds) == 2
+    for e in read_expected(RESULTS / study / "predictions" / FILE):
+        (point,) = curve(rows_of(study), "horizon", e.metric)
+        came = f"{point.mean:.2f}" if e.low <= point.mean <= e.high else f"**{point.mean:.2f}**"
+        assert f"| {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.metric, came)
 
 
 def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
