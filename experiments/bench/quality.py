@@ -127,8 +127,8 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
             panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
         ):
             kinds = dict.fromkeys(row.decoding.split()[0] for row in rows)
-            colours = (*COLOURS.values(), DEFAULT)  # as many as SAMPLER_STEPS has kinds
-            for kind, colour, lift in zip(kinds, colours, (5, -12, 12)[: len(kinds)], strict=False):
+            looks = ((*COLOURS.values(), DEFAULT), (5, -12, 12))  # for as many kinds as SAMPLER_STEPS has
+            for kind, colour, lift in zip(kinds, *(look[: len(kinds)] for look in looks), strict=True):
                 ours = [r for r in rows if r.decoding.split()[0] == kind]
                 time, value, sem = ([getattr(r, f) for r in ours] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(

@@ -150,12 +150,13 @@ def frame_diffusion_loss(
     config = model.config.diffusion
     process = make_process(config.steps)
     shift, cap = (config.time_shift, config.weight_cap) if training else (1.0, 0.0)
-    weights = jnp.asarray(process.noise_over_signal(cap), jnp.float32)
 
     def one(key: jax.Array, z: jax.Array, x0: jax.Array) -> jax.Array:
         time, noise = draw_noise(key, x0.shape, config.steps, shift)
         mse, vb = diffusion_loss(lambda x, t: model.denoiser(x, t, z), x0, time, noise, process)
-        return (mse * weights[time] if cap else mse) + vb
+        if cap:
+            mse *= jnp.asarray(process.noise_over_signal(cap), jnp.float32)[time]
+        return mse + vb
 
     # The trunk's work is shared by all noised copies of a token.
     keys_RB = [jax.vmap(lambda k, r=r: jax.random.fold_in(k, r))(key_B) for r in range(config.repeats)]

@@ -37,6 +37,12 @@ def rows_of(study: str = "cpu-full") -> tuple[Row, ...]:
     return tuple(read_rows(Workspace(RESULTS / study)))
 
 
+def in_place_rows(name: str) -> list[dict[str, str]]:
+    """Where things stand at the end of windows of one model."""
+    with open(RESULTS / "in_place" / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def readme() -> str:
     """On one line."""
     return " ".join((ROOT / "README.md").read_text().split())
@@ -112,8 +118,7 @@ def test_the_axis_horizon_is_as_findings_say():
 def test_robots_that_do_not_stay_robots_are_as_findings_say():
     page, shares, medians = " ".join(findings().split()), {}, {}
     for steps in (4000, 32_000):
-        with open(RESULTS / "in_place" / f"{steps}.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = in_place_rows(str(steps))
         kinds = {"all": rows, "tool": [r for r in rows if r["what"].startswith("tool")]}
         kinds["object"] = [r for r in rows if r["what"].startswith("colour")]
         for kind, mine in kinds.items():
@@ -334,8 +339,7 @@ def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():
     longest, _ = max(robots_at("ladder", "ladder").items())[1]
     gain = np.mean([r.ahead for r in longest])
     psnr = curve(rows_of("ladder"), "ladder", "psnr")[-1].mean
-    with open(RESULTS / "in_place" / "ladder-64000.csv", newline="") as file:
-        share, _, _ = in_place(list(csv.DictReader(file)), "model")
+    share, _, _ = in_place(in_place_rows("ladder-64000"), "model")
     assert f"a better recipe and 64,000 come to {psnr:.2f} dB and {100 * share:.0f} %" in readme()
     assert f"64,000 steps, is {gain:.2f} dB ahead of copying**, on {found[labels[-1]][0]} of 40 robots" in " ".join(page)
 
@@ -361,12 +365,10 @@ def test_the_reference_on_latents_is_as_its_findings_say():
 
 def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
     """Beside the same robots of cpu-full's long reference."""
-    page, rows = " ".join(findings("ladder").split()), {}
-    for name in ("ladder-64000", "ladder", "32000"):
-        with open(RESULTS / "in_place" / f"{name}.csv", newline="") as file:
-            rows[name] = list(csv.DictReader(file))
-    longest, before, robots = rows["ladder-64000"], rows["ladder"], {row["robot"] for row in rows["ladder"]}
-    of_others = [row for row in rows["32000"] if row["robot"] in robots]
+    page = " ".join(findings("ladder").split())
+    longest, before = in_place_rows("ladder-64000"), in_place_rows("ladder")
+    robots = {row["robot"] for row in before}
+    of_others = [row for row in in_place_rows("32000") if row["robot"] in robots]
 
     def share(mine: list[dict[str, str]], view: str = "model") -> str:
         mean, half, count = in_place(mine, view)
