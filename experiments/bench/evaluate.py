@@ -92,7 +92,7 @@ def _every_frame(
 
         first = predict(blank_frame(hma.config, len(tokens)))
         keys = jax.vmap(lambda k: jax.random.fold_in(k, t))(key_B)
-        entropy = factored_cross_entropy(first, tokens[:, t]).mean(-1)
+        entropy = factored_cross_entropy(hma.logits(first, tokens[:, t]), tokens[:, t]).mean(-1)
         return entropy, decode_frame(hma, first, predict, keys, decode)
 
     entropies, frames = jax.lax.map(one, jnp.arange(1, tokens.shape[1]))

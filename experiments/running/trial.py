@@ -111,6 +111,7 @@ LATER: dict[str, Any] = {
     "capped": [],
     "source": None,
     "model.recall": False,
+    "model.chain_factors": False,
     "model.diffusion.weight_cap": 0.0,
     "model.diffusion.time_shift": 1.0,
     "train.optimizer.matrices": "adamw",

@@ -3,12 +3,13 @@
 Question: held-out nats, PSNR and what actions decide, of the reference and with masked tokens that also hold what stood
     there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
     change alone, and the study's long runs with both, are of the first seed. The rungs have `designs.ablation_steps`;
-    the reference and both changes are trained for the study's own number of steps too.
+    for the study's own number of steps all are trained too, and both changes with factors that are chained
+    (`model.chain_factors`).
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
-Cost: two training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
+Cost: three training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
     and the long ones; `--dry-run` prints it.
-Expected outcome: recall and Muon ahead of the reference, both ahead of each.
+Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of more nats, not of more dB.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, make_ablation, reference_trial
 
-REFERENCE, BEST = "reference", "recall, Muon"
+REFERENCE, RECALL, MUON, BEST = "reference", "recall", "Muon", "recall, Muon"
+CHAINED = f"{BEST}, chained"
 
 
 def recalling(trial: Trial) -> Trial:
@@ -37,16 +39,22 @@ def with_both(trial: Trial) -> Trial:
     return with_muon(recalling(trial))
 
 
+def chained(trial: Trial) -> Trial:
+    return replace(trial, model=replace(trial.model, chain_factors=True))
+
+
 RUNGS: dict[str, Callable[[Trial], Trial]] = {
     REFERENCE: lambda trial: trial,
-    "recall": recalling,
-    "Muon": with_muon,
+    RECALL: recalling,
+    MUON: with_muon,
     BEST: with_both,
 }
 
+LONGER = RUNGS | {CHAINED: lambda trial: chained(with_both(trial))}
+
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories on every rung; the reference and the best one for longer, which the label says."""
+    """All datasets and trajectories on every rung; `LONGER` for longer, which the label says."""
     seeds, first = study.ablation_seeds, study.ablation_seeds[0]
     sweep = make_ablation(
         study,
@@ -61,12 +69,13 @@ def plan(study: Study) -> Sweep:
     several = {sweep.labels.index(name) for name in (REFERENCE, BEST)}
     points = [point for point in sweep.points if point.x in several or point.trial.train.seed == first]
     labels = list(sweep.labels)
-    longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE)]
+    longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED)]
+    longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON)]
     longer += [(BEST, steps, (first,)) for steps in study.designs.long]
     for name, steps, chosen in longer:
         for seed in chosen:
             trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
-            points.append(Point(len(labels), RUNGS[name](trial)))
+            points.append(Point(len(labels), LONGER[name](trial)))
         labels.append(f"{name}, {steps:,} steps")
     # The longest goes on from the first of the best: in that order nobody waits for it at the end.
     points.sort(key=lambda point: point.x != sweep.labels.index(BEST))

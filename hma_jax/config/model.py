@@ -96,6 +96,9 @@ class ModelConfig:
     # What stands at a masked token: one learned vector and, where `recall`, what was there in the frame before, so that
     # the first block already sees what is to move. DIFFERS: the release has the vector alone.
     recall: bool = False
+    # A token's factors are drawn one after the other, each given those before it. DIFFERS: the release draws them as if
+    # independent, so that where two tokens are likely it may show a third, made of a piece of each.
+    chain_factors: bool = False
     mlp_ratio: float = 4.0
     qkv_bias: bool = False
     proj_bias: bool = True
@@ -113,6 +116,10 @@ class ModelConfig:
         for name in ("width", "layers", "heads", "frames", "tokens", "factors", "action_tokens"):
             require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
+        require(
+            not self.chain_factors or (self.factors > 1 and self.diffusion is None),
+            "model.chain_factors needs ids of several factors: model.factors of at least 2 and no model.diffusion",
+        )
 
     @property
     def head_width(self) -> int:

@@ -48,6 +48,8 @@ def require_official(model: ModelConfig, table: EmbodimentTable) -> None:
         reasons.append("model.conditioning is 'cross_attention', which the release computes otherwise")
     if model.recall:
         reasons.append("model.recall is true, the release's masked tokens hold one learned vector")
+    if model.chain_factors:
+        reasons.append("model.chain_factors is true, the release draws a token's factors independently")
     if math.isqrt(model.tokens) ** 2 != model.tokens:
         reasons.append(f"model.tokens {model.tokens} do not make a square, the release's frames are square")
     if model.diffusion and model.diffusion.steps != 1000:

@@ -99,7 +99,10 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
         masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden
     )
     diffusion = model.config.diffusion
-    note("conditions" if diffusion else "logits", out.said)
+    if diffusion:
+        note("conditions", out.said)
+    else:
+        note("logits", model.logits(out.said, batch["tokens"]))
     if diffusion:
         key = jax.random.key(0)
         time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)

@@ -179,6 +179,6 @@ def make_loss(
         if model.diffusion:
             keys = jax.vmap(jax.random.key)(jnp.arange(len(tokens)))  # common noise under all changes
             return mean_over_frames(frame_diffusion_loss(hma, said, tokens[:, 1:], keys), followed)
-        return mean_over_frames(factored_cross_entropy(said, tokens[:, 1:]), followed)
+        return mean_over_frames(factored_cross_entropy(hma.logits(said, tokens[:, 1:]), tokens[:, 1:]), followed)
 
     return loss

@@ -42,6 +42,7 @@ from hma_jax.model.embodiments import EmbodimentTable, normalise
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
+from hma_jax.model.readout import likeliest
 from hma_jax.objective.losses import frame_diffusion_loss
 
 Batch = dict[str, jax.Array]
@@ -212,9 +213,9 @@ def _likelihood(
     """Per window [B]: what `out` says of the true tokens."""
     if model.config.diffusion:
         return {"diffusion_loss": mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)}
-    guess = compose(jnp.argmax(out, -1), model.config.factor_vocab)
+    guess = compose(model.frame_head.factors_in_turn(out, likeliest)[0], model.config.factor_vocab)
     return {
-        "cross_entropy": mean_over_frames(factored_cross_entropy(out, truth), real_BT),
+        "cross_entropy": mean_over_frames(factored_cross_entropy(model.logits(out, truth), truth), real_BT),
         "accuracy": mean_over_frames((guess == truth).astype(jnp.float32), real_BT),
     }
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from hma_jax.config import DecodeConfig, ModelConfig, require
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
+from hma_jax.model.readout import ChainedReadout, Readout, drawing
 from hma_jax.objective.diffusion import sample_with_key
 from hma_jax.objective.process import make_process, sampling_process
 
@@ -55,23 +56,18 @@ def masked_counts(config: ModelConfig, steps: int) -> list[int]:
 
 
 def sample_tokens(
-    logits_BSQV: jax.Array, key_B: jax.Array, temperature: float, top_k: int = 0
+    head: Readout | ChainedReadout, said_BS: jax.Array, key_B: jax.Array, temperature: float, top_k: int = 0
 ) -> tuple[jax.Array, jax.Array]:
-    """(ids [B, S], confidence [B, S]): factors are drawn independently, confidence is the
-    product of the chosen probabilities."""
-    if temperature == 0:
-        ids = jnp.argmax(logits_BSQV, axis=-1)
-    else:
-        scaled = logits_BSQV / temperature
-        if top_k:
-            entries = logits_BSQV.shape[-1]
-            require(top_k <= entries, f"decode.top_k {top_k} exceeds the {entries} entries of a factor")
-            least = jax.lax.top_k(scaled, top_k)[0][..., -1:]
-            scaled = jnp.where(scaled < least, -jnp.inf, scaled)
-        ids = jax.vmap(jax.random.categorical)(key_B, scaled)
-    probabilities = jax.nn.softmax(logits_BSQV, axis=-1)
-    chosen = jnp.take_along_axis(probabilities, ids[..., None], axis=-1)[..., 0]
-    return compose(ids, logits_BSQV.shape[-1]).astype(jnp.int32), jnp.prod(chosen, axis=-1)
+    """(ids [B, S], confidence [B, S]) from what is said of tokens; confidence is the product of the chosen factors'
+    probabilities."""
+
+    def one(said_S: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        choose = drawing(key, head.shape(said_S), temperature, top_k)
+        digits, logits = head.factors_in_turn(said_S, choose)
+        chosen = jnp.take_along_axis(jax.nn.softmax(logits, axis=-1), digits[..., None], axis=-1)[..., 0]
+        return compose(digits, logits.shape[-1]).astype(jnp.int32), jnp.prod(chosen, axis=-1)
+
+    return jax.vmap(one)(said_BS, key_B)
 
 
 def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_masked: int) -> Frame:
@@ -105,17 +101,17 @@ def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Arra
     return _decode_tokens(model, first, predict, key_B, decode)
 
 
-def _decode_tokens(model: HMA, logits: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
-    batch, size = logits.shape[:2]
+def _decode_tokens(model: HMA, said: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
+    batch, size = said.shape[:2]
     frame = blank_frame(model.config, batch)
     for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
         keys = jax.vmap(lambda k, s=step: jax.random.split(jax.random.fold_in(k, s)))(key_B)
-        sampled, score = sample_tokens(logits, keys[:, 0], decode.temperature, decode.top_k)
+        sampled, score = sample_tokens(model.frame_head, said, keys[:, 0], decode.temperature, decode.top_k)
         if decode.order == "random":
             score = jax.vmap(lambda k: jax.random.uniform(k, (size,)))(keys[:, 1])
         frame = unmask(frame, sampled, score, still_masked)
         if still_masked:
-            logits = predict(frame)
+            said = predict(frame)
     return frame.values
 
 

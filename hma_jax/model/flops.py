@@ -46,6 +46,8 @@ def pass_flops(
     stem = table.action_width * d + d * d
     embedding = config.tokens * config.diffusion.token_channels * d if config.diffusion else 0
     outputs = d if config.diffusion else config.factors * config.factor_vocab
+    if config.chain_factors:
+        outputs += d + (config.factors - 1) * config.factor_vocab
     shared = config.layers * (p * per_token + per_frame) + stem + embedding
     return 2.0 * (frames * shared + said * config.tokens * d * outputs)
 

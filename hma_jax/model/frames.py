@@ -1,6 +1,6 @@
 """How frames enter the trunk and leave it, for both variants.
 
-Discrete: ids with one table per vocabulary factor in, logits out. Continuous: latent patches
+Discrete: ids with one table per vocabulary factor in, what is said of each factor (`readout`) out. Continuous: latent patches
 in, out the vectors that condition the diffusion head (`heads.Denoiser`). Masked tokens enter
 as one learned vector in both.
 """
@@ -14,8 +14,9 @@ from flax import nnx
 from hma_jax.config import DiffusionConfig, ModelConfig
 from hma_jax.kernels.dense import look_up
 from hma_jax.kernels.pointwise import replaced, scaled
-from hma_jax.model.initial import input_fan_out, readout_init, trunk_init
+from hma_jax.model.initial import input_fan_out, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
+from hma_jax.model.readout import ChainedReadout, Readout
 from hma_jax.model.params import normal, ones, param, used, xavier_uniform, zeros
 
 
@@ -90,20 +91,6 @@ class LatentEmbed(nnx.Module):
         return tokens.astype(dtype) @ self.kernel.astype(dtype)
 
 
-class Readout(nnx.Module):
-    """Trunk outputs [..., D] -> float32 logits [..., Q, V]."""
-
-    def __init__(self, config: ModelConfig):
-        self.factors, self.multiplier = config.factors, config.mup_multiplier("readout")
-        entries = config.factors * config.factor_vocab
-        init = readout_init(config, entries)
-        self.linear = Linear((config.width, entries), ("D", "V"), init=init, role="output")
-
-    def __call__(self, x: jax.Array) -> jax.Array:
-        y = self.linear(x / self.multiplier, dtype=jnp.float32)
-        return y.reshape(*y.shape[:-1], self.factors, y.shape[-1] // self.factors)
-
-
 class Condition(nnx.Module):
     """Trunk outputs -> what the diffusion head is told of each token (reference section 2.2)."""
 
@@ -136,4 +123,5 @@ def make_embed(config: ModelConfig) -> nnx.Module:
 
 
 def make_frame_head(config: ModelConfig) -> nnx.Module:
-    return used("frames_predicted", Condition(config) if config.diffusion else Readout(config))
+    head = Condition if config.diffusion else ChainedReadout if config.chain_factors else Readout
+    return used("frames_predicted", head(config))

@@ -18,7 +18,7 @@ from hma_jax.config.training import ActionLeak
 from hma_jax.kernels.pointwise import over_tokens, replaced, shifted
 from hma_jax.model.conditioning import ActionFeature
 from hma_jax.model.embodiments import EmbodimentTable
-from hma_jax.model.frames import Recall, make_embed, make_frame_head
+from hma_jax.model.frames import Recall, factorise, make_embed, make_frame_head
 from hma_jax.model.heads import Denoiser, make_action_head
 from hma_jax.model.layers import FINE_EPS, LayerNorm
 from hma_jax.model.params import Declared, declare, param, used, zeros
@@ -35,7 +35,8 @@ def causal(frames: int) -> jax.Array:
 class Outputs(NamedTuple):
     """What a pass says of the frames it was given, or of those from `said_from` on."""
 
-    said: jax.Array  # of tokens: logits [B, T, S, Q, V], or conditions of the denoiser [B, T, S, D]; float32
+    # Of tokens, float32: logits [B, T, S, Q, V]; where factors are chained, or of the denoiser, conditions [B, T, S, D].
+    said: jax.Array
     actions: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
     cache: TemporalCache | None  # of the frames that are to be remembered
 
@@ -137,6 +138,12 @@ class HMA(nnx.Module):
             vectors_TD = jnp.take(self.action_mask.get_value(), positions, axis=0)
             feature_BTD = replaced(feature_BTD, hidden_BT, vectors_TD)
         return over_tokens(feature_BTD, self.config.action_tokens)
+
+    def logits(self, said: jax.Array, ids: jax.Array) -> jax.Array:
+        """[..., Q, V]: what is `said` of tokens [...] about each factor, given those of `ids` [...] before it where
+        factors are chained."""
+        digits = factorise(ids, self.config.factors, self.config.factor_vocab)
+        return self.frame_head.factors_in_turn(said, lambda factor, _: digits[..., factor])[1]
 
     def align(self, actions: jax.Array) -> jax.Array:
         """Recorded chunks [..., T, U] -> the chunk that conditions each frame: its own as released,

@@ -124,7 +124,8 @@ def masked_loss(
             per_token = frame_diffusion_loss(model, out.said, tokens, key_B, training=True)
         else:
             labels = factorise(tokens, model.config.factors, model.config.factor_vocab)
-            per_token, right = smoothed_cross_entropy(out.said, labels, masking.label_smoothing)
+            logits = model.logits(out.said, tokens)
+            per_token, right = smoothed_cross_entropy(logits, labels, masking.label_smoothing)
             correct = jnp.sum(right * weight)
         loss = jnp.sum(per_token * weight)
     if masking.predicts_actions:

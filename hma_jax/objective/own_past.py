@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
+from hma_jax.model.readout import drawing
 
 
 def draw_own_past(
@@ -32,13 +33,14 @@ def draw_own_past(
     """
     masked = jnp.ones(before.shape, bool)
     said = look_beside(model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, slice_B=slice_B).said
-    logits = jax.lax.stop_gradient(said[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
+    said, head = jax.lax.stop_gradient(said[:, :-1]), model.frame_head  # of frames 1 .. T-2; nothing follows the last one
 
-    def draw(key: jax.Array, logits_TSQV: jax.Array, true_TS: jax.Array) -> jax.Array:
+    def draw(key: jax.Array, said_TS: jax.Array, true_TS: jax.Array) -> jax.Array:
         ids_key, share_key, frame_key = jax.random.split(key, 3)
-        ids = compose(jax.random.categorical(ids_key, logits_TSQV), logits_TSQV.shape[-1])
+        digits, _ = head.factors_in_turn(said_TS, drawing(ids_key, head.shape(said_TS)))
+        ids = compose(digits, model.config.factor_vocab)
         share = greatest_share * jax.random.uniform(share_key)
         own_T = jax.random.uniform(frame_key, (len(ids),)) < share
         return jnp.where(own_T[:, None], ids.astype(true_TS.dtype), true_TS)
 
-    return jnp.concatenate([before[:, :1], jax.vmap(draw)(key_B, logits, before[:, 1:])], axis=1)
+    return jnp.concatenate([before[:, :1], jax.vmap(draw)(key_B, said, before[:, 1:])], axis=1)

@@ -162,12 +162,13 @@ class Decoder:
         )
         frame = Frame(jnp.zeros_like(window[:, t]), jnp.ones(window[:, t].shape, bool))
         states, first = [], None
+        head = self.case.declared.merge(self.case.params).frame_head
         for step, keep in enumerate(masked_counts(config, steps)):
             ids, masked = window.at[:, t].set(frame.values), unknown.at[:, t].set(frame.masked)
             out = self.apply(ids, masked, self.actions, robots, self.hidden)
             logits = out.said[:, t]
             first = logits if first is None else first
-            sampled, score = sample_tokens(logits, keys, 0.0)
+            sampled, score = sample_tokens(head, logits, keys, 0.0)
             if keep and scores is not None:
                 score = jnp.asarray(scores[step].reshape(batch, -1))
             frame = unmask(frame, sampled, score, keep)

@@ -114,6 +114,15 @@ def test_the_cached_rollout_is_exact_where_masked_tokens_recall_the_frame_before
     assert (got != forgetful).any()
 
 
+def test_the_cached_rollout_is_exact_where_factors_are_chained():
+    """Drawn, not the likeliest: with the same random numbers. And what is chosen of a factor counts for the next."""
+    config = shallow_config(chain_factors=True, frames=4)
+    decode = DecodeConfig(2, temperature=1.0)
+    got = compare_with_naive(config, decode, 2, frames=6)
+    independent = compare_with_naive(replace(config, chain_factors=False), decode, 2, frames=6)
+    assert (got != independent).any()
+
+
 @pytest.mark.exact
 @pytest.mark.parametrize("resample", some([False, True]))
 def test_the_cached_rollout_is_exact_for_continuous_tokens(resample: bool):

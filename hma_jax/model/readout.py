@@ -1,0 +1,102 @@
+"""What is said of a token's factors, and how they are chosen from it: all at once or one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from hma_jax.config import ModelConfig, require
+from hma_jax.kernels.dense import contract, look_up
+from hma_jax.kernels.pointwise import gelu
+from hma_jax.model.initial import readout_init, trunk_init
+from hma_jax.model.layers import LayerNorm, Linear
+from hma_jax.model.params import normal, param, zeros
+
+Choose = Callable[[int, jax.Array], jax.Array]
+"""(q, logits [..., V] of factor q) -> its digits [...]."""
+
+
+class Readout(nnx.Module):
+    """Trunk outputs [..., D] -> what is said of tokens: float32 logits [..., Q, V] of factors, independent of each other."""
+
+    def __init__(self, config: ModelConfig):
+        self.factors, self.multiplier = config.factors, config.mup_multiplier("readout")
+        entries = config.factors * config.factor_vocab
+        init = readout_init(config, entries)
+        self.linear = Linear((config.width, entries), ("D", "V"), init=init, role="output")
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        y = self.linear(x / self.multiplier, dtype=jnp.float32)
+        return y.reshape(*y.shape[:-1], self.factors, y.shape[-1] // self.factors)
+
+    def shape(self, said: jax.Array) -> tuple[int, ...]:
+        """[..., Q, V] of the logits."""
+        return said.shape
+
+    def factors_in_turn(self, said: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
+        """(digits [..., Q], logits [..., Q, V]) as `choose` finds them, factor by factor."""
+        digits = [choose(q, said[..., q, :]) for q in range(self.factors)]
+        return jnp.stack(digits, axis=-1), said
+
+
+class ChainedReadout(nnx.Module):
+    """The same, each factor given those before it (`ModelConfig.chain_factors`): to what `Readout` says of a factor is
+    added what a layer of width D makes of the trunk's output and of the digits chosen so far.
+    """
+
+    def __init__(self, config: ModelConfig):
+        q, v, d = config.factors, config.factor_vocab, config.width
+        self.alone = Readout(config)
+        self.condition = Linear((d, d), ("D", "D_out"), init=trunk_init(config, d, d), role="hidden")
+        self.norm = LayerNorm(d)
+        self.tables = param((q - 1, v, d), ("Q", "V", "D"), normal(1.0), role="vector", precise=True)
+        self.out = param((q - 1, d, v), ("Q", "D", "V"), zeros, role="output")
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """The trunk's outputs [..., D] themselves: factors are said one by one."""
+        return x.astype(jnp.float32)
+
+    def shape(self, said: jax.Array) -> tuple[int, ...]:
+        return (*said.shape[:-1], len(self.out) + 1, self.out.shape[-1])
+
+    def factors_in_turn(self, said: jax.Array, choose: Choose) -> tuple[jax.Array, jax.Array]:
+        alone = self.alone(said)
+        hidden = self.norm(self.condition(said))
+        logits = [alone[..., 0, :]]
+        digits = [choose(0, logits[0])]
+        for q in range(len(self.tables)):
+            hidden = hidden + look_up(self.tables[q], digits[q])
+            further = contract(gelu(hidden) / self.alone.multiplier, self.out[q])
+            logits.append(alone[..., q + 1, :] + further)
+            digits.append(choose(q + 1, logits[-1]))
+        return jnp.stack(digits, axis=-1), jnp.stack(logits, axis=-2)
+
+
+def drawing(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, top_k: int = 0) -> Choose:
+    """Draws factors of one example, whose logits have `shape` [..., Q, V]; temperature 0 takes the likeliest, `top_k`
+    draws among so many. Raises ConfigError if there are not as many.
+
+    Factors that are chosen in turn have the noise that they would have if they were drawn at once.
+    """
+    require(top_k <= shape[-1], f"decode.top_k {top_k} exceeds the {shape[-1]} entries of a factor")
+    if temperature == 0:
+        return likeliest
+    noise = jax.random.gumbel(key, shape)
+
+    def choose(factor: int, logits: jax.Array) -> jax.Array:
+        scaled = logits / temperature
+        if top_k:
+            least = jax.lax.top_k(scaled, top_k)[0][..., -1:]
+            scaled = jnp.where(scaled < least, -jnp.inf, scaled)
+        return jnp.argmax(noise[..., factor, :] + scaled, axis=-1)
+
+    return choose
+
+
+def likeliest(factor: int, logits: jax.Array) -> jax.Array:
+    """The likeliest digits, as a `Choose`."""
+    del factor
+    return jnp.argmax(logits, axis=-1)

@@ -1,0 +1,124 @@
+"""Factors that are chained: a distribution over tokens that no product of factors is."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+from hma_jax.config import ConfigError
+from hma_jax.model.frames import compose
+from hma_jax.model.params import declare
+from hma_jax.model.readout import ChainedReadout, Readout, drawing, likeliest
+from tests.tiny import DIFFUSION, SMALLER, lively_params, model_config
+
+FACTORS, ENTRIES = 3, 4
+CONFIG = model_config(**SMALLER | {"factors": FACTORS, "chain_factors": True})
+EVERY = jnp.asarray(list(itertools.product(range(ENTRIES), repeat=FACTORS)))
+"""Digits of all tokens, [V^Q, Q]."""
+
+
+def lively_head() -> tuple[nnx.Module, jax.Array]:
+    """(head, what it is told of one token [D])."""
+    declared, params = lively_params(CONFIG)
+    return declared.merge(params).frame_head, jax.random.normal(jax.random.key(1), (CONFIG.width,))
+
+
+def logits(head: nnx.Module, said: jax.Array, digits: jax.Array) -> jax.Array:
+    return head.factors_in_turn(said, lambda factor, _: digits[..., factor])[1]
+
+
+def log_likelihood(head: nnx.Module, said: jax.Array, digits: jax.Array) -> jax.Array:
+    log_p = jax.nn.log_softmax(logits(head, said, digits))
+    return jnp.take_along_axis(log_p, digits[..., None], axis=-1)[..., 0].sum(-1)
+
+
+def of_every_token(head: nnx.Module, said: jax.Array) -> np.ndarray:
+    """Probabilities [V^Q]."""
+    every = jnp.broadcast_to(said, (len(EVERY), *said.shape))
+    return np.exp(np.asarray(log_likelihood(head, every, EVERY), np.float64))
+
+
+def test_probabilities_of_all_tokens_add_up_to_one_and_are_no_product():
+    of = of_every_token(*lively_head())
+    assert of.sum() == pytest.approx(1, abs=1e-5)
+    table = of.reshape((ENTRIES,) * FACTORS)
+    product = np.einsum("a,b,c->abc", table.sum((1, 2)), table.sum((0, 2)), table.sum((0, 1)))
+    assert np.abs(table - product).max() > 0.01
+
+
+def test_a_factor_is_given_those_before_it_and_none_after():
+    head, said = lively_head()
+    before = logits(head, said, jnp.zeros(FACTORS, int))
+    for changed in range(FACTORS):
+        after = logits(head, said, jnp.zeros(FACTORS, int).at[changed].set(1))
+        np.testing.assert_array_equal(after[: changed + 1], before[: changed + 1])
+        assert (after[changed + 1 :] != before[changed + 1 :]).any(axis=-1).all()
+
+
+def test_tokens_are_drawn_as_often_as_they_are_likely():
+    head, said = lively_head()
+    draws = 20_000
+    told = jnp.broadcast_to(said, (draws, *said.shape))
+    digits, _ = head.factors_in_turn(told, drawing(jax.random.key(0), head.shape(told)))
+    share = np.bincount(np.asarray(compose(digits, ENTRIES)), minlength=ENTRIES**FACTORS) / draws
+    wanted = of_every_token(head, said)
+    ids = np.asarray(compose(EVERY, ENTRIES))
+    # Five standard errors, of 64 shares.
+    assert np.abs(share[ids] - wanted).max() < 5 * np.sqrt(wanted.max() / draws)
+
+
+def test_the_likeliest_factor_follows_the_likeliest_before_it():
+    head, said = lively_head()
+    digits, of_each = head.factors_in_turn(said, likeliest)
+    np.testing.assert_array_equal(digits, jnp.argmax(logits(head, said, digits), axis=-1))
+    np.testing.assert_array_equal(of_each, logits(head, said, digits))
+
+
+def test_it_begins_as_if_factors_were_independent():
+    declared = declare(lambda: ChainedReadout(CONFIG), 1)
+    params = declared.init(0)
+    head = declared.merge(params)
+    said = jax.random.normal(jax.random.key(1), (5, CONFIG.width))
+    for digits in (jnp.zeros((5, FACTORS), int), jnp.ones((5, FACTORS), int)):
+        np.testing.assert_array_equal(logits(head, said, digits), head.alone(said))
+
+
+@pytest.mark.parametrize(("kind", "nats"), [(ChainedReadout, np.log(ENTRIES)), (Readout, FACTORS * np.log(ENTRIES))])
+def test_what_stands_in_all_factors_at_once_costs_a_chain_once(kind: type, nats: float):
+    """Tokens whose factors are all the same: log V nats, where factors that know nothing of each other cost Q log V."""
+    declared = declare(lambda: kind(CONFIG), 1)
+    params = declared.init(0)
+    said = jnp.zeros((ENTRIES, CONFIG.width))
+    same = jnp.broadcast_to(jnp.arange(ENTRIES)[:, None], (ENTRIES, FACTORS))
+    adam = optax.adam(3e-2)
+
+    def loss(params) -> jax.Array:
+        head = declared.merge(params)
+        return -log_likelihood(head, head(said), same).mean()
+
+    def step(carry, _):
+        params, state = carry
+        value, gradient = jax.value_and_grad(loss)(params)
+        updates, state = adam.update(gradient, state)
+        return (optax.apply_updates(params, updates), state), value
+
+    losses = jax.jit(lambda params: jax.lax.scan(step, (params, adam.init(params)), length=300)[1])(params)
+    assert losses[0] == pytest.approx(FACTORS * np.log(ENTRIES), abs=0.1)
+    assert losses[-1] == pytest.approx(nats, abs=0.05)
+
+
+def test_more_entries_than_there_are_cannot_be_drawn_among():
+    with pytest.raises(ConfigError, match="decode.top_k 5 exceeds the 4 entries"):
+        drawing(jax.random.key(0), (FACTORS, ENTRIES), top_k=5)
+
+
+@pytest.mark.parametrize("changes", [{"factors": 1}, {"diffusion": DIFFUSION}], ids=["one factor", "latents"])
+def test_there_must_be_several_factors_to_chain(changes: dict):
+    with pytest.raises(ConfigError, match="model.chain_factors needs ids of several factors"):
+        model_config(chain_factors=True, **changes)
+
+
