@@ -356,7 +356,7 @@ def test_the_reference_on_latents_is_as_its_findings_say():
     gain = np.mean([r.ahead for r in robots])
     assert f"{gain:.2f} dB ahead of copying" in page and f"ΔPSNR beyond 3 on {beyond} of the 36" in page
     (psnr,) = curve(rows_of(study), "horizon", "psnr")
-    assert f"On latents two seeds of {psnr.x:,.0f} have {psnr.mean:.2f} dB" in readme() and len(psnr.seeds) == 2
+    assert f"On latents three seeds of {psnr.x:,.0f} have {psnr.mean:.2f} dB" in readme() and len(psnr.seeds) == 3
     for e in read_expected(RESULTS / study / "predictions" / FILE):
         (point,) = curve(rows_of(study), "horizon", e.metric)
         came = f"{point.mean:.2f}" if e.low <= point.mean <= e.high else f"**{point.mean:.2f}**"
