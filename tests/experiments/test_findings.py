@@ -318,7 +318,7 @@ def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
 def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
     """Bold where it did not hold."""
     page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
-    assert len(expected) == 8
+    assert len(expected) == 12
     for e in expected:
         points = {p.label: p for p in curve(rows_of("ladder"), "ladder", e.metric)}
         mean = difference(points[e.x], points[e.against])[0] if e.against else points[e.x].mean
