@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from data_pipelines.simulators.simulator import PHYSICS, PhysicsSimulator, can_simulate, physics_starts
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
 from data_pipelines.tokens.store import TokenStore
+from data_pipelines.true_simulator import TrueSimulator
 from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.simulator.folder import ROBOTS, TOKENIZER
@@ -47,7 +49,7 @@ def load_simulator(run: Path, **options: Any) -> Simulator:
         simulator.starts = find_starts(simulator, study)
     require(
         bool(simulator.starts),
-        f"{run}: there is no {STARTS} beside the run, and neither a robot of the suite nor held-out frames in "
+        f"{run}: there is no {STARTS} beside the run, and neither a robot with a true simulator nor held-out frames in "
         f"{study.store} to start from",
     )
     return simulator
@@ -56,23 +58,42 @@ def load_simulator(run: Path, **options: Any) -> Simulator:
 def make_simulator(run: Path, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
     """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
 
-    Raises ConfigError; for "true" if a robot is not of the suite.
+    Raises ConfigError; for "true" if a robot has no true simulator.
     """
     learned = load_simulator(run, episodes=episodes, **options)
     return learned if world == "learned" else true_simulator(learned, tuple(learned.robots.values()), episodes)
 
 
-def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 1) -> SuiteSimulator:
+def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 1) -> TrueSimulator:
     """The true simulator of some robots of a learned one, which sees what that sees."""
     size = learned.tokenizer.image_size
-    true = SuiteSimulator(robots, episodes=episodes, image_size=size, outside=learned.outside)
+    true = true_worlds(robots, episodes=episodes, image_size=size, outside=learned.outside)
     true.starts = learned.starts
     return true
 
 
+def true_worlds(robots: Sequence[Robot], **options: Any) -> TrueSimulator:
+    """Of robots that are all of the suite, or all of physics simulators. Raises ConfigError for others."""
+    physics = bool(robots) and all(robot.name in PHYSICS for robot in robots)
+    return (PhysicsSimulator if physics else SuiteSimulator)(robots, **options)
+
+
 def has_truth(robot: Robot) -> bool:
-    """Whether the suite has this robot."""
+    """Whether this robot has a true simulator here: in the suite, or in a physics simulator that is installed."""
+    return in_suite(robot) or can_simulate(robot)
+
+
+def in_suite(robot: Robot) -> bool:
     return robot.name in SPECS and SPECS[robot.name].action_dim == robot.action_dim
+
+
+def true_starts(robot: Robot, count: int, frames: int, size: int, *, seed: int = 0) -> list[Start]:
+    """`frames` frames, of `size`, of the robot's held-out episodes: those of the suite's first `count` that are long
+    enough, or so many new ones of its physics simulator."""
+    if not in_suite(robot):
+        return physics_starts(robot.name, count, frames, stride=robot.stride, image_size=size, seed=seed)
+    made = suite_starts(robot.name, count, frames, stride=robot.stride, seed=seed)
+    return [Start(s.robot, fit_images(s.images, size), s.actions, s.seed) for s in made]
 
 
 def describe_robots(simulator: Simulator, workspace: Workspace) -> list[Robot]:
@@ -97,13 +118,12 @@ def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:
 
 
 def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_PER_ROBOT) -> tuple[Start, ...]:
-    """Starts of every robot: of held-out episodes of the suite, otherwise those whose frames the token store kept."""
+    """Starts of every robot: of held-out episodes of its true simulator, otherwise those whose frames the token store kept."""
     store = TokenStore(workspace.store) if workspace.store.is_dir() else None
     starts: list[Start] = []
     for robot in simulator.robots.values():
         if has_truth(robot):
-            made = suite_starts(robot.name, count, START_FRAMES, stride=robot.stride)
-            starts += [_fitted(start, simulator.tokenizer.image_size) for start in made]
+            starts += true_starts(robot, count, START_FRAMES, simulator.tokenizer.image_size)
         elif store is not None and robot.name in store.names:
             starts += _stored_starts(store, robot, simulator.tokenizer.image_shape, count)
     return tuple(starts)
@@ -119,10 +139,6 @@ def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Sta
     ]
     chunks = [s.actions[given : given + frames * robot.stride] for s in whole]
     return starts, np.array(chunks, np.float32).reshape(len(starts), frames, robot.stride, robot.action_dim)
-
-
-def _fitted(start: Start, size: int) -> Start:
-    return Start(start.robot, fit_images(start.images, size), start.actions, start.seed)
 
 
 def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int], count: int) -> list[Start]:

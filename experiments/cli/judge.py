@@ -25,6 +25,7 @@ def judge(
     frames: Annotated[int | None, UNSET] = None,
     demonstrations: int = 3000,
     steps: int = 6000,
+    head_episodes: int = 3000,
     head_steps: int = 6000,
     cloned: int = 6,
     diffusion: int = 3,
@@ -41,15 +42,16 @@ def judge(
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.
-        robot: Which of its robots; the suite must have it.
+        robot: Which of its robots; it must have a true simulator (of the suite, or metaworld_drawer and others).
         out: Where everything is written.
-        task: The robot's own task (push or carry the puck to the mark), reaching the mark with the tool, or hovering
+        task: The robot's own task; of the suite's robots also reaching the mark with the tool, or hovering
             with the tool above a puck.
         starts: Held-out episodes at whose beginning every policy starts.
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's.
         demonstrations: Episodes of the scripted expert that the policies are trained on.
         steps: Of training of each kind of policy.
+        head_episodes: Recorded episodes that the success head is trained on.
         head_steps: Of training of the success head.
         cloned: Checkpoints of behaviour cloning.
         diffusion: Checkpoints of the Diffusion Policy.
@@ -82,6 +84,7 @@ def judge(
         demonstrations=demonstrations,
         ladder=ladder,
         head=replace(HeadConfig(), fit=replace(HeadConfig().fit, steps=head_steps)),
+        head_episodes=head_episodes,
     )
     judged = judge_run(run, out, config, step)
     summary = summarise(judged)
@@ -91,7 +94,7 @@ def judge(
     command = (
         f"hma judge {shlex.quote(str(run))} --robot {robot} --task {task} --starts {starts} "
         f"--batch {config.batch} --frames {config.task.frames} "
-        f"--demonstrations {demonstrations} --steps {steps} --head-steps {head_steps} --cloned {cloned} "
+        f"--demonstrations {demonstrations} --steps {steps} --head-episodes {head_episodes} --head-steps {head_steps} --cloned {cloned} "
         f"--diffusion {diffusion} --seed {seed} --out {shlex.quote(str(out))}"
     )
     page = write_page(judged, summary, out, command)

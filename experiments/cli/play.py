@@ -16,7 +16,7 @@ from experiments.setting import UNSET
 from hma_jax.config import ConfigError, ExecutionConfig, require
 
 if TYPE_CHECKING:
-    from data_pipelines.suite.simulator import SuiteSimulator
+    from data_pipelines.true_simulator import TrueSimulator
     from hma_jax.simulator.robots import Robot
 
 def play(
@@ -51,7 +51,7 @@ def play(
         if error.name != "aiohttp":
             raise
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
-    from experiments.applications.simulators import has_truth, load_simulator, true_simulator
+    from experiments.applications.simulators import in_suite, load_simulator, true_simulator
     from hma_jax.simulator.folder import find_decode
     from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
@@ -70,8 +70,9 @@ def play(
     console.print(f"{run}: {len(simulator.robots)} robots; compiling")
     warm_up(simulator, together=1)
 
-    def truth(robot: Robot) -> SuiteSimulator | None:
-        return true_simulator(simulator, [robot]) if has_truth(robot) else None
+    def truth(robot: Robot) -> TrueSimulator | None:
+        # What draws a physics simulator belongs to one thread; turns are taken in several.
+        return true_simulator(simulator, [robot]) if in_suite(robot) else None
 
     app, ended = make_app(simulator, truth), threading.Event()
     # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.

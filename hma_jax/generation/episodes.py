@@ -30,16 +30,19 @@ def start_each(
     embodiment_B: jax.Array,
     given_B: jax.Array,
     count_B: jax.Array,
+    *,
+    hidden: bool = False,
 ) -> Episodes:
     """Episodes that have seen the first `given_B` of `frames` [B, T - 1, S (, C)], with at least one each.
 
     `chunks_BTU` [B, T - 2, U] are those executed between them; what stands after the given ones is arbitrary.
     `count_B` are the frames of each episode so far: as many as given, or more where `given_B` is T - 1 and older
-    ones have left the window.
+    ones have left the window. `hidden`: the model is shown no action.
     """
 
     def one(frames: jax.Array, chunks: jax.Array, robot: jax.Array, given: jax.Array, count: jax.Array) -> Session:
-        session = start(model, frames[None], chunks[None], robot[None])
+        unseen = jnp.full((1, len(chunks)), hidden)
+        session = start(model, frames[None], chunks[None], robot[None], hidden_BT=unseen)
         room = session.cache.room
         # Attention is causal: what is arbitrary was seen by nothing that is kept.
         cache = session.cache._replace(valid=jnp.arange(room) < given - 1)
@@ -57,16 +60,23 @@ def _slots(cache: object) -> Sequence[tuple[jax.Array, int]]:
 
 
 def advance_each(
-    model: HMA, episodes: Episodes, chunk_BU: jax.Array, key_B: jax.Array, decode: DecodeConfig
+    model: HMA,
+    episodes: Episodes,
+    chunk_BU: jax.Array,
+    key_B: jax.Array,
+    decode: DecodeConfig,
+    *,
+    hidden: bool = False,
 ) -> tuple[Episodes, jax.Array]:
     """(episodes, frames [B, S (, C)]): `session.advance` for every episode, wherever in its window it stands.
 
-    Frame t of an episode is drawn from fold_in(key, t), t being its own count.
+    Frame t of an episode is drawn from fold_in(key, t), t being its own count. `hidden`: the model is shown no action.
     """
 
     def each(phase: Phase) -> tuple[Episodes, jax.Array]:
         def one(session: Session, chunk: jax.Array, key: jax.Array) -> tuple[Session, jax.Array]:
-            session, frame = advance(model, session, chunk[None], key[None], decode, phase=phase)
+            unseen = jnp.full(1, hidden)
+            session, frame = advance(model, session, chunk[None], key[None], decode, hidden_B=unseen, phase=phase)
             return session, frame[0]
 
         return jax.vmap(one)(episodes, chunk_BU, key_B)

@@ -68,12 +68,13 @@ class Programs:
     def __init__(self, model: Model, tokenizer: BaseTokenizer, episodes: int, decode: DecodeConfig):
         self.weights = Weights(model.params, tokenizer.params)
         declared, room = model.declared, model.config.frames - 1
+        hidden = model.run.train.masking.setting == "passive"  # trained without actions: it is shown none
         decoded: Callable[[Weights, jax.Array], jax.Array] = lambda w, x: tokenizer.decode_uint8_fn(w.tokenizer, x)
 
         def fresh(weights: Weights, tokens: jax.Array, at: Beginning) -> Episodes:
             chunks, robots = jnp.asarray(at.chunks), jnp.asarray(at.robots)
             given, counts = jnp.asarray(at.given), jnp.asarray(at.counts)
-            return start_each(declared.merge(weights.model), tokens, chunks, robots, given, counts)
+            return start_each(declared.merge(weights.model), tokens, chunks, robots, given, counts, hidden=hidden)
 
         def again(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array]:
             tokens = jnp.asarray(at.frames)
@@ -92,7 +93,8 @@ class Programs:
             weights: Weights, state: Episodes, rows_n: jax.Array, chunk_nU: jax.Array, seed_n: jax.Array
         ) -> tuple[Episodes, jax.Array, jax.Array]:
             keys = jax.vmap(jax.random.key)(seed_n)
-            new, frames = advance_each(declared.merge(weights.model), take(state, rows_n), chunk_nU, keys, decode)
+            before, hma = take(state, rows_n), declared.merge(weights.model)
+            new, frames = advance_each(hma, before, chunk_nU, keys, decode, hidden=hidden)
             state = jax.tree.map(lambda whole, part: whole.at[rows_n].set(part), state, new)
             return state, frames, decoded(weights, frames)
 

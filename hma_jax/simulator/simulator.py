@@ -39,7 +39,8 @@ class Simulator:
     An episode must begin (`reset`) before it advances (`step`). Frames are uint8 [B, H, W, 3], as the tokenizer
     decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
     frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
-    says. ConfigError is raised for whatever cannot be done; nothing has changed then.
+    says. A model trained on passive video is shown no action: it goes on as if none was known. ConfigError is raised
+    for whatever cannot be done; nothing has changed then.
     """
 
     def __init__(

@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.publishing.files import write_file
-from data_pipelines.sources.rlds.images import fit_images
-from data_pipelines.suite.simulator import SuiteSimulator, suite_starts
+from data_pipelines.suite.simulator import SuiteSimulator
+from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, reached
-from experiments.applications.simulators import START_FRAMES
+from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.interface import AnySimulator
+from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
 STARTS_SEED = 2
@@ -41,22 +42,16 @@ class Rollout:
 
 def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
     """`count` beginnings of held-out episodes of the task's robot at which its goal is not reached yet."""
+    dim = task.spec.action_dim if task.in_suite else task.physics.action_dim
+    robot = Robot(task.robot, stride, (-1.0,) * dim, (1.0,) * dim, (0.0,) * dim)
     for times in (2, 4, 8, 16, 32):
-        found = suite_starts(task.robot, times * count, START_FRAMES, stride=stride, seed=STARTS_SEED)
-        simulator = SuiteSimulator([_robot(task, stride)], episodes=len(found))
-        simulator.reset(found)
-        done = reached(task.spec, [simulator.state(b) for b in range(len(found))])
-        chosen = [start for start, already in zip(found, done, strict=True) if not already]
-        if len(chosen) >= count:
-            return [Start(s.robot, fit_images(s.images, size), s.actions, s.seed) for s in chosen[:count]]
+        chosen, simulator = [], true_worlds([robot], image_size=size)
+        for start in true_starts(robot, times * count, START_FRAMES, size, seed=STARTS_SEED):
+            simulator.reset(start)
+            chosen += [start] * (not _reached(simulator, task)[0])
+            if len(chosen) == count:
+                return chosen
     raise ConfigError(f"{task.robot}: hardly a held-out episode begins without its goal reached")
-
-
-def _robot(task: Task, stride: int):
-    from data_pipelines.suite.simulator import suite_robot
-
-    wide = [1.0] * task.spec.action_dim
-    return suite_robot(task.robot, [-x for x in wide], wide, [0.0] * len(wide), stride)
 
 
 def run(
@@ -102,9 +97,9 @@ def _run(simulator, policy: Policy, starts, seeds, task: Task, shuffled: bool) -
 
 
 def _reached(simulator: AnySimulator, task: Task) -> np.ndarray:
-    if not isinstance(simulator, SuiteSimulator):
-        return np.zeros(len(simulator), bool)
-    return reached(task.spec, [simulator.state(b) for b in range(len(simulator))])
+    if isinstance(simulator, SuiteSimulator):
+        return reached(task.spec, [simulator.state(b) for b in range(len(simulator))])
+    return simulator.success() if isinstance(simulator, TrueSimulator) else np.zeros(len(simulator), bool)
 
 
 def save_rollout(rollout: Rollout, path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from data_pipelines.sources.rlds.writer import encode_jpeg
-from data_pipelines.suite.simulator import SuiteSimulator
+from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.play.recording import Recording
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.metrics import psnr
@@ -21,7 +21,7 @@ from hma_jax.simulator.simulator import Simulator
 Kind = Literal["start", "act", "rewind", "record", "truth"]
 Message = dict[str, Any]
 
-Truth = Callable[[Robot], SuiteSimulator | None]
+Truth = Callable[[Robot], TrueSimulator | None]
 """The true simulator of a robot, where there is one."""
 
 
@@ -45,7 +45,7 @@ class Seat:
     episode: int
     robot: Robot | None = None
     start: int = 0
-    truth: SuiteSimulator | None = None
+    truth: TrueSimulator | None = None
     recording: Recording | None = None
     recorded: bool = False  # frames are being added to it
 
@@ -101,7 +101,7 @@ def _start(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> N
     seat.robot, seat.start, seat.truth, seat.recorded, seat.recording = robot, number, true, False, None
 
 
-def _begun(truth: Truth, robot: Robot, start: Any) -> SuiteSimulator | None:
+def _begun(truth: Truth, robot: Robot, start: Any) -> TrueSimulator | None:
     true = truth(robot)
     if true is not None:
         true.reset(start)

@@ -11,13 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.publishing.files import write_file
-from data_pipelines.sources.rlds.images import fit_images
-from data_pipelines.suite.appearance import draw_appearance
-from data_pipelines.suite.behaviour import Behaviour
-from data_pipelines.suite.render import render_frames
-from data_pipelines.suite.rollout import episode_seeds
-from data_pipelines.suite.world import World
-from experiments.applications.policies.scripted import make_expert, noisy
+from experiments.applications.policies.driving import Driven, drive, new_episodes
 from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import ConfigError, require
 
@@ -31,7 +25,7 @@ class Demonstrations:
 
     images uint8 [N, L, H, W, 3], actions float32 [N, L, A] in raw units, lengths int [N] (frames that count),
     reached bool [N, L] (the goal is reached at this frame), successes bool [N] (`Task.hold` frames in a row),
-    seeds int64 [N] (with which the suite makes them; -1: it did not).
+    seeds int64 [N] (with which their true simulator begins them; -1: there is none).
     """
 
     images: np.ndarray
@@ -78,7 +72,7 @@ def record(
     """`count` episodes of the scripted expert, of `task.frames` frames each, a function of the arguments.
 
     Of several `noise`s every one makes an equal share. The actions are those that were executed, the imprecise ones.
-    `play`: the suite's own restless behaviour instead of the expert. `after`: so many frames after it succeeded an
+    `play`: restless behaviour instead of the expert. `after`: so many frames after it succeeded an
     episode ends (None: at its full length). `only_successes` leaves failures out; episodes are then drawn until there
     are enough. Raises ConfigError if the expert hardly ever succeeds.
     """
@@ -90,9 +84,10 @@ def record(
         for _ in range(50):
             if found >= wanted:
                 break
-            seeds = episode_seeds(task.spec, first + wanted, seed, SPLIT)[first:]
+            seeds = new_episodes(task, first + wanted, seed, SPLIT)[first:]
             first += wanted
-            made = _drive(task, seeds, stride, image_size, level, play, after)
+            driven = drive(task, seeds, stride, image_size, noise=level, play=play)
+            made = _finished(task, driven, seeds, after)
             made = made.take(np.flatnonzero(made.successes)) if only_successes else made
             parts.append(made.take(slice(wanted - found)))
             found += len(parts[-1])
@@ -110,27 +105,9 @@ def join(parts: Sequence[Demonstrations]) -> Demonstrations:
     )
 
 
-def _drive(
-    task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool, after: int | None
-) -> Demonstrations:
-    world = World(noisy(task, noise), seeds)
-    rng = np.random.default_rng([int(seeds[0]), len(seeds), 13])
-    behaviour = Behaviour(world, rng) if play else make_expert(world, int(seeds[0]))
-    q, objects, actions, reached = [], [], [], []
-    for _ in range(task.frames):
-        q.append(world.q.copy())
-        objects.append(world.objects.copy())
-        reached.append(world.success())
-        actions.append(behaviour.act().astype(np.float32))
-        for _ in range(stride):
-            world.step(actions[-1].astype(np.float64))
-    n, frames = len(seeds), task.frames
-    flat = [np.stack(x, 1).reshape(n * frames, *x[0].shape[1:]) for x in (q, objects)]
-    looks = draw_appearance(world.spec, seeds)
-    images = render_frames(world.spec, looks, world.goals, *flat, np.repeat(np.arange(n), frames))
-    images = fit_images(images, image_size)
-    images, acted, done = images.reshape(n, frames, *images.shape[1:]), np.stack(actions, 1), np.stack(reached, 1)
-    solved = held(done, task.hold)
+def _finished(task: Task, driven: Driven, seeds: np.ndarray, after: int | None) -> Demonstrations:
+    images, acted, done = driven
+    solved, (n, frames) = held(done, task.hold), done.shape
     lengths = np.full(n, frames)
     if after is not None:
         lengths = np.minimum(lengths, np.where(solved.any(1), solved.argmax(1) + 1 + after, frames))

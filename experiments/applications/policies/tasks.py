@@ -1,4 +1,4 @@
-"""What policies of the suite's robots are to do, and when it is done: by the simulator's state."""
+"""What policies of robots that have a true simulator are to do, and when it is done: by that simulator's state."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from data_pipelines.simulators.record import instruction
+from data_pipelines.simulators.simulator import PHYSICS
+from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.tasks import Push, Reach, Scene
@@ -15,6 +18,12 @@ from hma_jax.config import require
 
 OWN, REACH, HOVER = "own", "reach", "hover"
 TASKS = (OWN, REACH, HOVER)
+
+EXPERTS = {name: spec for name, spec in PHYSICS.items() if spec.success and spec.expert}
+"""Robots of physics simulators that say when their one task is done, and of which there is an expert."""
+
+PHYSICS_FRAMES = 24
+"""Half as many again as an undisturbed expert takes to open the drawer, at 4 frames a second."""
 
 RADIUS = 0.22
 """Within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own."""
@@ -66,13 +75,23 @@ class Task:
     hold: int = 2
 
     def __post_init__(self):
-        require(self.robot in SPECS, f"the suite has no robot {self.robot!r}; it has {', '.join(SPECS)}")
-        require(self.name in TASKS, f"no task {self.name!r}; there are {', '.join(TASKS)}")
+        require(
+            self.robot in SPECS or self.robot in EXPERTS,
+            f"no task of a robot {self.robot!r}; there are {', '.join([*SPECS, *EXPERTS])}",
+        )
+        known = TASKS if self.in_suite else (OWN,)
+        require(self.name in known, f"no task {self.name!r} of {self.robot}; there are {', '.join(known)}")
         require(1 <= self.hold <= self.frames, f"a goal held for {self.hold} frames does not fit {self.frames} frames")
 
     @property
+    def in_suite(self) -> bool:
+        """Of a robot of the suite, not of a physics simulator."""
+        return self.robot in SPECS
+
+    @property
     def spec(self) -> EmbodimentSpec:
-        """The robot with this task. Only what counts as done differs from its own: frames look the same."""
+        """The suite's robot with this task. Only what counts as done differs from its own: frames look the same."""
+        require(self.in_suite, f"{self.robot} is of a physics simulator: `hma judge` knows its task, nothing else does")
         spec = SPECS[self.robot]
         if self.name == OWN:
             return spec
@@ -80,8 +99,15 @@ class Task:
         return replace(spec, task=kind(own.radius, own.objects, own.size, own.carries, own.marks_object))
 
     @property
+    def physics(self) -> SimSpec:
+        """The robot of a physics simulator."""
+        return EXPERTS[self.robot]
+
+    @property
     def goal(self) -> str:
         """In words."""
+        if not self.in_suite:
+            return instruction(self.physics, self.physics.envs[0])
         if self.name != OWN:
             return "the tool on the mark" if self.name == REACH else "the tool above a puck"
         return "the puck on the mark" if isinstance(SPECS[self.robot].task, Push) else "the puck carried to the mark"
@@ -90,6 +116,7 @@ class Task:
 def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int | None = None) -> Task:
     """A task with its usual length, unless another is given. Raises ConfigError for one that there is not."""
     task = Task(robot, name)
+    task = task if task.in_suite else replace(task, frames=PHYSICS_FRAMES)
     # A tool that wanders passes over the mark; one that was steered there stays.
     task = replace(task, frames=16, hold=4) if name != OWN else task
     return replace(task, frames=task.frames if frames is None else frames, hold=task.hold if hold is None else hold)

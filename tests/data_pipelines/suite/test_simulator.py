@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.environment import Environment
-from data_pipelines.suite.simulator import SuiteSimulator, judge_by_state, suite_robot, suite_starts
+from data_pipelines.suite.simulator import SuiteSimulator, suite_robot, suite_starts
+from data_pipelines.true_simulator import judge_by_state
 from hma_jax.config import ConfigError
 
 
@@ -73,7 +74,7 @@ def test_what_the_suite_has_not_is_said():
     other = type(PUSHER)("walker", 1, (0.0,), (1.0,), (0.0,))
     with pytest.raises(ConfigError, match="no robot 'walker'"):
         SuiteSimulator([other])
-    with pytest.raises(ConfigError, match="2 action values in the suite, not 3"):
+    with pytest.raises(ConfigError, match="2 action values in truth, not 3"):
         SuiteSimulator([type(PUSHER)("pusher_sand", 2, (0.0,) * 3, (1.0,) * 3, (0.0,) * 3)])
     start = suite_starts("pusher_sand", 8, 1)[0]
     with pytest.raises(ConfigError, match="with which seed"):

@@ -1,15 +1,18 @@
 """The simulator against `rollout`, and everything that may be done to its episodes."""
 
 import logging
+from dataclasses import replace
 
 import jax
 import jax.monitoring
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.generation import rollout
+from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
+from hma_jax.training.runs import Run
 from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, actions, parts, simulator, start
 from tests.tiny import TABLE
 
@@ -240,3 +243,21 @@ def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
     compiled: list[int] = []
     warm_up_more(Compiling(range(16)), 1, ended=lambda: len(compiled) == 2)
     assert compiled == [n for n in sizes(16) if n > 1][:2] and len(sizes(16)) > 3
+
+
+def test_a_model_trained_without_actions_goes_on_alike_under_all_of_them():
+    model, tokenizer = parts()
+    passive = replace(model.run, train=TrainConfig(masking=MaskingConfig(setting="passive")))
+    first, plans = start(1, 2), (chunks_of(1, FRAMES), chunks_of(1, FRAMES, seed=10))
+    other = Start(first.robot, first.images, -first.actions)
+
+    def images(run: Run) -> np.ndarray:
+        sim = Simulator(replace(model, run=run), tokenizer, decode=DECODE, episodes=2)
+        sim.reset([first, other], seeds=[1, 1])
+        for t in range(FRAMES):
+            seen = sim.step([plan[t] for plan in plans])
+        return seen
+
+    blind, sighted = images(passive), images(model.run)
+    np.testing.assert_array_equal(blind[0], blind[1])
+    assert (sighted[0] != sighted[1]).any()

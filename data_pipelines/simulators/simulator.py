@@ -1,0 +1,114 @@
+"""Robots of public simulators as `TrueSimulator`s. Only those of one environment: a `Start` names a robot and a seed."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from data_pipelines.simulators.behaviour import Behaviour
+from data_pipelines.simulators.embodiments import EMBODIMENTS
+from data_pipelines.simulators.episode import Simulator
+from data_pipelines.simulators.packages import missing_packages, prepare_process, require_packages
+from data_pipelines.simulators.spec import SimSpec
+from data_pipelines.true_simulator import TrueSimulator
+from hma_jax.simulator.robots import Outside, Robot
+from hma_jax.simulator.starts import Start
+
+PHYSICS = {spec.name: spec for spec in EMBODIMENTS if len(spec.envs) == 1}
+
+
+def can_simulate(robot: Robot) -> bool:
+    """Whether this robot has a true simulator here, its packages installed."""
+    spec = PHYSICS.get(robot.name)
+    return spec is not None and spec.action_dim == robot.action_dim and not missing_packages([spec])
+
+
+class PhysicsWorld:
+    """One environment, opened at once: one episode at a time, seen in frames of `size`."""
+
+    def __init__(self, spec: SimSpec, size: int):
+        """Raises ConfigError where packages are missing, or TensorFlow is loaded in this process."""
+        require_packages([spec])
+        prepare_process()
+        from data_pipelines.simulators.backends import open_simulator
+
+        self.spec = spec
+        self.simulator: Simulator = open_simulator(spec, size)
+        self._reached = False
+
+    def reset(self, seed: int) -> None:
+        self.simulator.start(self.spec.envs[0], seed)
+        self._reached = False
+
+    def step(self, action: np.ndarray) -> None:
+        self._reached = self.simulator.step(np.asarray(action, np.float64))[1]
+
+    def get_state(self) -> tuple[np.ndarray, bool]:
+        return self.simulator.physics(), self._reached
+
+    def set_state(self, state: tuple[np.ndarray, bool]) -> None:
+        physics, self._reached = state
+        self.simulator.set_physics(physics)
+
+    def render(self) -> np.ndarray:
+        return self.simulator.frame()
+
+    def success(self) -> bool:
+        """By the environment's word after the last action."""
+        return self._reached
+
+    def close(self) -> None:
+        self.simulator.close()
+
+
+class PhysicsSimulator(TrueSimulator[PhysicsWorld]):
+    """B episodes, each in an environment of its own; `close` it after use."""
+
+    def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int = 64, outside: Outside = "clip"):
+        super().__init__(robots, episodes=episodes, image_size=image_size, outside=outside)
+        self._opened: list[PhysicsWorld] = []
+
+    @staticmethod
+    def dims() -> dict[str, int]:
+        return {name: spec.action_dim for name, spec in PHYSICS.items()}
+
+    def open_world(self, name: str) -> PhysicsWorld:
+        self._opened.append(PhysicsWorld(PHYSICS[name], self.image_size))
+        return self._opened[-1]
+
+    def close(self) -> None:
+        for world in self._opened:
+            world.close()
+        self._opened, self._worlds = [], [None] * len(self)
+
+
+def new_seeds(name: str, count: int, seed: int, split: str) -> np.ndarray:
+    """int64 [count]: of episodes that no dataset of `hma data sim` has; more of them begin with the same ones."""
+    return np.array([zlib.crc32(f"{split}/{seed}/{name}/{i}".encode()) for i in range(count)], np.int64)
+
+
+def physics_starts(
+    name: str, count: int, frames: int, *, stride: int, image_size: int, seed: int = 0, split: str = "starts"
+) -> list[Start]:
+    """The first `frames` frames, every `stride` native steps, of `count` new episodes under the dataset's behaviour."""
+    spec, starts = PHYSICS[name], []
+    world = PhysicsWorld(spec, image_size)
+    try:
+        for number in new_seeds(name, count, seed, split):
+            world.reset(int(number))
+            sim, rng = world.simulator, np.random.default_rng([int(number), 1])
+            behaviour = Behaviour(spec, sim.low, sim.high, sim.rest(), sim.expert(rng), rng)
+            images, actions, reached = [world.render()], [], False
+            for _ in range(frames - 1):
+                for _ in range(stride):
+                    actions.append(behaviour.act(reached))
+                    world.step(actions[-1])
+                    reached = reached or world.success()
+                images.append(world.render())
+            acted = np.array(actions, np.float32).reshape(-1, spec.action_dim)
+            starts.append(Start(name, np.stack(images), acted, int(number)))
+    finally:
+        world.close()
+    return starts

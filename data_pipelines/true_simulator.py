@@ -1,0 +1,152 @@
+"""True robots stepped side by side under the interface of the learned simulator: `hma_jax.simulator` says what calls mean.
+
+Owns what all true simulators share; each kind says which robots it has and opens their worlds.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from data_pipelines.sources.rlds.images import fit_image
+from hma_jax.config import require
+from hma_jax.simulator.robots import Outside, Robot
+from hma_jax.simulator.starts import Start
+
+
+class World(Protocol):
+    """One robot's world, whose episodes are begun by a seed and advance by native actions, float32 [A]."""
+
+    def reset(self, seed: int) -> None: ...
+
+    def step(self, action: np.ndarray) -> None: ...
+
+    def get_state(self) -> Any:
+        """A copy of what `set_state` goes on from."""
+
+    def set_state(self, state: Any) -> None: ...
+
+    def render(self) -> np.ndarray:
+        """uint8 [H, W, 3]."""
+        ...
+
+    def success(self) -> bool:
+        """Whether the task's goal is reached now."""
+        ...
+
+
+W = TypeVar("W", bound=World)
+
+
+class TrueSimulator(ABC, Generic[W]):
+    """B episodes of true robots, as they really go; nothing is random after the start."""
+
+    def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int, outside: Outside = "clip"):
+        """Raises ConfigError for robots that there are not, or with other actions."""
+        for robot in robots:
+            dim = self.dims().get(robot.name)
+            require(dim is not None, f"there is no robot {robot.name!r}: it has no true simulator here")
+            require(robot.action_dim == dim, f"{robot.name} has {dim} action values in truth, not {robot.action_dim}")
+        self.robots = {robot.name: robot for robot in robots}
+        self.starts: tuple[Start, ...] = ()
+        self.outside, self.image_size = outside, image_size
+        self.clipped: list[tuple[str, ...]] = [()] * episodes
+        self._worlds: list[tuple[W, Robot] | None] = [None] * episodes
+        self._before: list[list[Any]] = [[] for _ in range(episodes)]
+        self._images = np.zeros((episodes, image_size, image_size, 3), np.uint8)
+
+    @staticmethod
+    @abstractmethod
+    def dims() -> dict[str, int]:
+        """A of every robot that there is."""
+
+    @abstractmethod
+    def open_world(self, name: str) -> W:
+        """A world of this robot; it is reset before anything else."""
+
+    def __len__(self) -> int:
+        return len(self._worlds)
+
+    @property
+    def images(self) -> np.ndarray:
+        return self._images
+
+    def reset(
+        self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
+    ) -> np.ndarray:
+        """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no effect."""
+        del seeds
+        which = range(len(self)) if episodes is None else episodes
+        each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
+        require(len(each) == len(which), f"{len(which)} episodes need as many starts, got {len(each)}")
+        for b, start in zip(which, each, strict=True):
+            require(start.robot in self.robots, f"no robot {start.robot!r} here; there are {', '.join(self.robots)}")
+            require(start.seed is not None, f"the start of {start.robot} does not say with which seed the truth begins")
+            now = self._worlds[b]
+            again = now is not None and now[1].name == start.robot
+            world = now[0] if again else self.open_world(start.robot)
+            world.reset(start.seed)
+            for action in start.actions:
+                world.step(action)
+            self._worlds[b], self._before[b] = (world, self.robots[start.robot]), []
+            self._draw(b, world)
+        return self.images
+
+    def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray:
+        require(len(actions) == len(self), f"{len(self)} episodes need as many actions, got {len(actions)}")
+        asked, clipped = {}, [()] * len(self)
+        for b, action in enumerate(actions):
+            if action is None:
+                continue
+            world, robot = self._begun(b)
+            chunk, beyond = robot.confine(robot.chunk(action), self.outside)
+            clipped[b] = tuple(np.array(robot.dimensions)[beyond].tolist())
+            asked[b] = world, chunk
+        self.clipped = clipped
+        for b, (world, chunk) in asked.items():
+            self._before[b].append(world.get_state())
+            for action in chunk:
+                world.step(action)
+            self._draw(b, world)
+        return self.images
+
+    def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
+        for b in range(len(self)) if episodes is None else episodes:
+            world, before = self._begun(b)[0], self._before[b]
+            require(0 <= frames <= len(before), f"episode {b} can be taken back by {len(before)} frames, not by {frames}")
+            if frames:
+                world.set_state(before[-frames])
+                del before[-frames:]
+            self._draw(b, world)
+        return self.images
+
+    def reach(self, b: int) -> int:
+        """By how many frames episode b can be taken back."""
+        return len(self._before[b])
+
+    def state(self, b: int) -> Any:
+        """A copy of the true state of episode b."""
+        return self._begun(b)[0].get_state()
+
+    def success(self) -> np.ndarray:
+        """bool [B]: the task's goal is reached now."""
+        return np.array([world is not None and world[0].success() for world in self._worlds])
+
+    def _begun(self, b: int) -> tuple[W, Robot]:
+        world = self._worlds[b]
+        require(world is not None, f"episode {b} has not begun; reset it first")
+        return world
+
+    def _draw(self, b: int, world: W) -> None:
+        images = self._images.copy()  # callers keep the frames they were given
+        images[b] = fit_image(world.render(), self.image_size)
+        self._images = images
+
+
+def judge_by_state(simulator: TrueSimulator) -> tuple[np.ndarray, np.ndarray]:
+    """A judge of true episodes: 1 and the end where the task's goal is reached."""
+    done = simulator.success()
+    return done.astype(float), done
