@@ -3,13 +3,14 @@
 Question: is a policy that was trained on 10 recorded and 90 generated trajectories as good as one on 100 recorded?
 Paper: Table 6.
 Command: python -m experiments.applications.synthetic
-Cost: half an hour of one core; goes on where it was stopped.
+Cost: half an hour of one core; goes on where it was stopped, also with more seeds or the second control.
 Expected: success grows with the generated trajectories; those of a model that is given other actions do not help.
 
 The 100 trajectories are an expert's, from starts that the world model never saw. For each seed ten of them are kept as
 recorded; of the others the actions are kept, and replayed from their own first frame in the learned simulator. Policies
 are trained on what it shows, not on that frame. Control: the same simulator under another trajectory's actions, so that
-pictures and actions do not belong together. All policies are trained alike (behaviour cloning, as many steps), and
+pictures and actions do not belong together. With --without-actions RUN there is a second control, what a model generates
+that was trained on the same video without actions (`--set train.masking.setting=passive`). All policies are trained alike (behaviour cloning, as many steps), and
 judged from the same starts in the true simulator.
 
 The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations. With --actions
@@ -36,6 +37,8 @@ from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.applications import SHIPPED
 from experiments.applications.generating.conditions import (
     ALL,
+    BLIND,
+    BLIND_KIND,
     CONDITIONS,
     CONTROL,
     FEW,
@@ -44,6 +47,7 @@ from experiments.applications.generating.conditions import (
     Condition,
     Trials,
     markdown,
+    places,
     summarise,
     write_tables,
 )
@@ -90,17 +94,23 @@ JUDGED_ON = "held_out"
 BATCH = 8
 
 
-def make_data(lessons: Lessons, simulator: Simulator, out: Path) -> dict[str, Demonstrations]:
-    """The trajectories as recorded, generated, and generated under shuffled actions; made once, kept in `out`."""
-    sets, given = {kind: out / f"{kind}.npz" for kind in (*KINDS, JUDGED_ON)}, lessons.settings.given
+def make_data(
+    lessons: Lessons, simulator: Simulator, out: Path, blind: Simulator | None = None
+) -> dict[str, Demonstrations]:
+    """The trajectories as recorded, generated, and generated under shuffled actions, and by a `blind` model if there is
+    one; made once, kept in `out`."""
+    kinds = (*KINDS, BLIND_KIND) if blind else KINDS
+    sets, given = {kind: out / f"{kind}.npz" for kind in (*kinds, JUDGED_ON)}, lessons.settings.given
     if not sets["recorded"].exists():
         with step(f"record {lessons.settings.trajectories} trajectories"):
             save_demonstrations(lessons.record(), sets["recorded"])
     recorded = load_demonstrations(sets["recorded"])
-    for kind, actions in (("generated", recorded.actions), ("shuffled", others_actions(recorded))):
+    acted = {kind: recorded.actions for kind in kinds} | {"shuffled": others_actions(recorded)}
+    for kind in kinds[1:]:
         if not sets[kind].exists():
+            made_by = blind if kind == BLIND_KIND else simulator
             with step(f"replay actions: {kind}") as update:
-                images = imagine(simulator, lessons.robot, replace(recorded, actions=actions), given, update)
+                images = imagine(made_by, lessons.robot, replace(recorded, actions=acted[kind]), given, update)
             save_demonstrations(replace(recorded, images=images), sets[kind])
     if not sets[JUDGED_ON].exists():
         save_demonstrations(lessons.record_held_out(), sets[JUDGED_ON])
@@ -171,17 +181,17 @@ def write_results(seeds: tuple[int, ...], trials: Trials, quality: dict, out: Pa
     summary, table, figure = out / "summary.csv", out / "table.md", out / "synthetic.png"
     write_table(summary, ["what", "mean", "low", "high"], lines)
     write_file(table, markdown(found))
-    places = range(len(CONDITIONS))
-    each = [[float(np.mean(trials[i, s][shown])) for s in seeds if (i, s) in trials] for i in places]
-    named = {one.name: one.measured[shown] for one in found[: len(CONDITIONS)]}
-    draw_conditions(named, each, {CONTROL}, {FEW, ALL}, figure, shown)
+    tried = places(trials)
+    each = [[float(np.mean(trials[i, s][shown])) for s in seeds if (i, s) in trials] for i in tried]
+    named = {one.name: one.measured[shown] for one in found[: len(tried)]}
+    draw_conditions(named, each, {CONTROL, BLIND}, {FEW, ALL}, figure, shown)
     return [*tables, summary, table, figure]
 
 
 def quality_of(data: Mapping[str, Demonstrations], given: int) -> dict[str, tuple[float, float, float]]:
     """PSNR in dB against the recording, of the frames after the given ones: mean, low and high over trajectories."""
     found, recorded = {}, data["recorded"]
-    for kind in ("generated", "shuffled"):
+    for kind in (kind for kind in ("generated", "shuffled", BLIND_KIND) if kind in data):
         each = psnr(data[kind].images, recorded.images)
         means = np.array([row[given:length].mean() for row, length in zip(each, recorded.lengths, strict=True)])
         names, numbers = np.full(len(means), kind), np.arange(len(means))
@@ -212,6 +222,15 @@ def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
     return RecordedLessons(training, driven, trained_on, held_out)
 
 
+def find_blind(run: Path, robot: Robot) -> Simulator:
+    """The simulator of a model that was trained without actions. Raises ConfigError for another one."""
+    blind = load_simulator(run, episodes=BATCH, history=1)
+    setting = blind.model.run.train.masking.setting
+    require(setting == "passive", f"{run} was trained with train.masking.setting={setting}, not without actions (passive)")
+    blind.describe([robot])
+    return blind
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
@@ -228,17 +247,23 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=Training.steps, help="of training, of every policy")
     parser.add_argument("--given", type=int, default=Training.given, help="recorded frames that others begin with")
     parser.add_argument("--with-given", action="store_true", help="train on these, too")
+    parser.add_argument(
+        "--without-actions", type=Path, metavar="RUN", help="second control: of the same video, trained without actions"
+    )
     asked = parser.parse_args()
     run, out = asked.run, asked.out
     simulator = load_simulator(run, episodes=BATCH, history=1)
     lessons = find_lessons(asked, simulator)  # a mistyped name claims nothing
-    settings = lessons.settings
+    settings, blind = lessons.settings, asked.without_actions and find_blind(asked.without_actions, lessons.robot)
     claim(out, run, simulator.model.params, asdict(settings), grows=("seeds",))
+    if blind:
+        claim(out, asked.without_actions, blind.model.params, {}, file="without_actions.json")
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
-    data = make_data(lessons, simulator, out)
+    data = make_data(lessons, simulator, out, blind)
     trials: Trials = {}
-    first = sorted(range(len(CONDITIONS)), key=lambda i: i not in (FEW, ALL, MOST, CONTROL))  # what counts most
+    asked_for = range(len(CONDITIONS) if blind else BLIND)
+    first = sorted(asked_for, key=lambda i: i not in (FEW, ALL, MOST, CONTROL, BLIND))  # what counts most
     jobs, pace = [(i, s) for i in first for s in settings.seeds], Pace()
     with step(f"train and judge {len(jobs)} policies") as update:
         for n, (i, seed) in enumerate(jobs):
@@ -251,7 +276,8 @@ def main() -> None:
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
     write_settings(out, run, simulator.model.params, asdict(settings))
     shortest = data["recorded"].lengths[:2].min()
-    draw_strips([data[kind].images[:2, :shortest] for kind in KINDS], KINDS, out / "frames.png")
+    kinds = [kind for kind in data if kind != JUDGED_ON]
+    draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")
     wrote(*written, out / "frames.png")
 
 

@@ -34,20 +34,27 @@ CONDITIONS = (
     Condition("10 + 90 generated", 10, 90),
     Condition("10 + 90, other actions", 10, 90, "shuffled"),
     Condition("100 recorded", 100),
+    Condition("10 + 90, a model without actions", 10, 90, "blind"),  # where there is such a model
 )
 
 TRIALS, STARTS = "trials.csv", ["condition", "seed", "start", "success", "distance"]
 ERRORS, HELD_OUT = "errors.csv", ["condition", "seed", "trajectory", "error"]
 
 KINDS = ("recorded", "generated", "shuffled")
+BLIND_KIND = "blind"
 
-FEW, MOST, CONTROL, ALL = 0, 3, 4, 5
-"""Places in `CONDITIONS` that the share of the gap is made of."""
+FEW, MOST, CONTROL, ALL, BLIND = 0, 3, 4, 5, 6
+"""Places in `CONDITIONS` that shares of the gap are made of."""
+
+
+def places(trials: Trials) -> list[int]:
+    """Of the conditions that were tried: all, or all but the last."""
+    return [i for i in range(len(CONDITIONS)) if i != BLIND or any(place == BLIND for place, _ in trials)]
 
 
 def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") -> Panel:
     """Success of every condition, seed and start, or the error by held-out trajectory."""
-    own = [tuple(s for s in seeds if (i, s) in trials) for i in range(len(CONDITIONS))]  # a run may be under way
+    own = [tuple(s for s in seeds if (i, s) in trials) for i in places(trials)]  # a run may be under way
     points = [np.array([trials[i, s][what] for s in found], float) for i, found in enumerate(own)]
     each = np.arange(points[0].shape[1])
     return Panel(np.full(len(each), "robot"), each, tuple(points), tuple(own))
@@ -75,12 +82,15 @@ class Summary(NamedTuple):
 
 
 def summarise(trials: Trials, seeds: tuple[int, ...]) -> list[Summary]:
-    """Every condition; then which share of the gap 90 generated trajectories close, and 90 of the control."""
+    """Every condition; then which share of the gap 90 generated trajectories close, and 90 of each control."""
     panels = {what: make_panel(trials, seeds, what) for what in ("success", "error") if what in trials[FEW, seeds[0]]}
     found = {what: bootstrap_intervals(panel) for what, panel in panels.items()}
-    summaries = [Summary(c.name, {what: each[i] for what, each in found.items()}) for i, c in enumerate(CONDITIONS)]
-    for name, at in (("share of the gap: 10 + 90 generated", MOST), ("share of the gap: other actions", CONTROL)):
-        summaries.append(Summary(name, {what: share_closed(panel, at) for what, panel in panels.items()}))
+    tried = places(trials)
+    summaries = [Summary(CONDITIONS[i].name, {what: each[i] for what, each in found.items()}) for i in tried]
+    shares = ("10 + 90 generated", MOST), ("other actions", CONTROL), ("a model without actions", BLIND)
+    for name, at in shares[: 2 + (BLIND in tried)]:
+        closed = {what: share_closed(panel, at) for what, panel in panels.items()}
+        summaries.append(Summary(f"share of the gap: {name}", closed))
     return summaries
 
 

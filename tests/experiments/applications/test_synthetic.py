@@ -16,6 +16,7 @@ from experiments.applications import SHIPPED, plan_actions, synthetic
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import (
     ALL,
+    BLIND,
     CONDITIONS,
     CONTROL,
     FEW,
@@ -34,7 +35,7 @@ from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.tasks import find_task
 from experiments.applications.simulators import load_simulator
 from experiments.applications.synthetic import choose, make_data, run_trial
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.config.json import from_dict
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import load_model
@@ -52,21 +53,22 @@ def demonstrations(kind: int, count: int = 100) -> Demonstrations:
     return Demonstrations(images, actions, 3 * ones, np.ones((count, 3), bool), ones > 0, ones)
 
 
-DATA = {"recorded": demonstrations(0), "generated": demonstrations(1), "shuffled": demonstrations(2)}
+DATA = {kind: demonstrations(i) for i, kind in enumerate(("recorded", "generated", "shuffled", "blind"))}
 
 
 def test_conditions_are_nested_and_no_recording_is_also_generated():
     chosen = [choose(c, DATA, 3, 1) for c in CONDITIONS]
     which = [d.actions[:, 0, 0].astype(int).tolist() for d in chosen]
-    kinds = [np.bincount(d.images[:, 0, 0, 0, 0], minlength=3).tolist() for d in chosen]
-    assert kinds == [[10, 0, 0], [10, 10, 0], [10, 50, 0], [10, 90, 0], [10, 0, 90], [100, 0, 0]]
+    kinds = [np.bincount(d.images[:, 0, 0, 0, 0], minlength=4).tolist() for d in chosen]
+    assert kinds[:4] == [[10, 0, 0, 0], [10, 10, 0, 0], [10, 50, 0, 0], [10, 90, 0, 0]]
+    assert kinds[4:] == [[10, 0, 90, 0], [100, 0, 0, 0], [10, 0, 0, 90]]
     assert all(len(set(w)) == len(w) for w in which)
     for d, c in zip(chosen, CONDITIONS, strict=True):  # of a generated trajectory two frames, none of them recorded
         assert d.lengths.tolist() == [3] * c.recorded + [2] * c.generated
         assert (d.images[c.recorded :, :2] > 0).all()
     for fewer, more in zip(which[:3], which[1:4], strict=True):
         assert more[: len(fewer)] == fewer
-    assert which[MOST] == which[CONTROL] and sorted(which[ALL]) == sorted(which[MOST])
+    assert which[MOST] == which[CONTROL] == which[BLIND] and sorted(which[ALL]) == sorted(which[MOST])
     assert set(which[FEW]) != set(choose(CONDITIONS[FEW], DATA, 4, 1).actions[:, 0, 0].astype(int).tolist())
 
 
@@ -118,10 +120,26 @@ def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordin
 
     found = run_trial(lessons, Condition("", 2, 3), data, 0, lambda *_: None)
     assert set(found) == {"error"} and len(found["error"]) == 4
-    trials = {(i, 0): {"error": [round((6 - i) * e, 5) for e in found["error"]]} for i in range(len(CONDITIONS))}
+    trials = {(i, 0): {"error": [round((6 - i) * e, 5) for e in found["error"]]} for i in range(BLIND)}
     synthetic.write_results((0,), trials, synthetic.quality_of(data, 2), tmp_path)
     assert conditions.read_trials(tmp_path) == trials and not (tmp_path / conditions.TRIALS).exists()
     assert "success" not in (tmp_path / "table.md").read_text()
+
+
+def test_the_second_control_is_a_model_without_actions_which_shows_the_same_under_all(tmp_path):
+    run = make_run(tmp_path / "study")
+    robot = load_simulator(run, history=1).robot("pusher_sand")
+    with pytest.raises(ConfigError, match="setting=forward, not without actions"):
+        synthetic.find_blind(run, robot)
+    passive = make_run(tmp_path / "passive", TrainConfig(masking=MaskingConfig(setting="passive")))
+    blind, rng, ones = synthetic.find_blind(passive, robot), np.random.default_rng(0), np.ones(2, int)
+    images, acted = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8), rng.uniform(-1, 1, (2, 4, 2)).astype(np.float32)
+    demos = Demonstrations(images, acted, 4 * ones, np.ones((2, 4), bool), ones > 0, ones)
+    shown = [
+        synthetic.imagine(blind, robot, replace(demos, actions=a), 1, lambda *_: None) for a in (acted, others_actions(demos))
+    ]
+    np.testing.assert_array_equal(*shown)
+    assert (shown[0][:, 1:] != images[:, 1:]).any()
 
 
 def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(recordings, tmp_path, monkeypatch):
@@ -190,7 +208,7 @@ def from_settings(kind: type, path: Path):
 def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
     place = RESULTS / name
     settings, trials = from_settings(Settings, place / "settings.json"), conditions.read_trials(place)
-    assert set(trials) == {(i, s) for i in range(len(CONDITIONS)) for s in settings.seeds}
+    assert set(trials) == {(i, s) for i in conditions.places(trials) for s in settings.seeds}
     assert settings.starts >= 50 and len(settings.seeds) >= 3
     table = conditions.markdown(conditions.summarise(trials, settings.seeds))
     assert table == (place / "table.md").read_text() and table in (ROOT / "docs" / "generating.md").read_text()
