@@ -135,6 +135,10 @@ class TrueSimulator(ABC, Generic[W]):
         """bool [B]: the task's goal is reached now."""
         return np.array([world is not None and world[0].success() for world in self._worlds])
 
+    def close(self) -> None:
+        """Ends all episodes, and gives back what draws them."""
+        self._worlds = [None] * len(self)
+
     def _begun(self, b: int) -> tuple[W, Robot]:
         world = self._worlds[b]
         require(world is not None, f"episode {b} has not begun; reset it first")

@@ -79,9 +79,10 @@ class PhysicsSimulator(TrueSimulator[PhysicsWorld]):
         return self._opened[-1]
 
     def close(self) -> None:
+        super().close()
         for world in self._opened:
             world.close()
-        self._opened, self._worlds = [], [None] * len(self)
+        self._opened = []
 
 
 def new_seeds(name: str, count: int, seed: int, split: str) -> np.ndarray:

@@ -9,8 +9,9 @@ OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -98,11 +99,10 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
         train_ladder(out / "policies", demonstrations, config.ladder, config.seed, about, lambda kind: report)
     head = _find_head(out / "head", config, simulator, stride, step)
     starts = make_starts(task, config.starts, size, stride)
-    true = true_simulator(simulator, [robot], config.batch)
     seeds = [config.seed + i for i in range(len(starts))]
     acting: dict[str, Policy] = {}  # what was compiled for one world serves the next
-    for world in WORLDS:
-        for name in policies:
+    with closing(true_simulator(simulator, [robot], config.batch)) as true:
+        for world, name in itertools.product(WORLDS, policies):
             path = _place(out, name, world)
             if not path.exists():
                 path.parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,7 @@ import io
 import time
 import zipfile
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -44,13 +45,14 @@ def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
     """`count` beginnings of held-out episodes of the task's robot at which its goal is not reached yet."""
     dim = task.spec.action_dim if task.in_suite else task.physics.action_dim
     robot = Robot(task.robot, stride, (-1.0,) * dim, (1.0,) * dim, (0.0,) * dim)
-    for times in (2, 4, 8, 16, 32):
-        chosen, simulator = [], true_worlds([robot], image_size=size)
-        for start in true_starts(robot, times * count, START_FRAMES, size, seed=STARTS_SEED):
-            simulator.reset(start)
-            chosen += [start] * (not _reached(simulator, task)[0])
-            if len(chosen) == count:
-                return chosen
+    with closing(true_worlds([robot], image_size=size)) as simulator:
+        for times in (1, 2, 4, 8, 16, 32):
+            chosen = []
+            for start in true_starts(robot, times * count, START_FRAMES, size, seed=STARTS_SEED):
+                simulator.reset(start)
+                chosen += [start] * (not _reached(simulator, task)[0])
+                if len(chosen) == count:
+                    return chosen
     raise ConfigError(f"{task.robot}: hardly a held-out episode begins without its goal reached")
 
 

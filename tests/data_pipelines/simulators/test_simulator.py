@@ -1,0 +1,59 @@
+"""Robots of physics simulators as true simulators. The physics is a stand-in: that of packages is in test_simulators."""
+
+import numpy as np
+import pytest
+
+from data_pipelines.simulators.simulator import PHYSICS, PhysicsSimulator, new_seeds, physics_starts
+from hma_jax.config import ConfigError
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import Start
+from tests.data_pipelines.simulators.points import use_points
+
+DRAWER = Robot("metaworld_drawer", 5, (-1.0,) * 4, (1.0,) * 4, (0.0,) * 4)
+AHEAD, BACK = np.array([1.0, 0, 0, 0], np.float32), np.array([-1.0, 0, 0, 0], np.float32)
+
+
+@pytest.fixture(autouse=True)
+def points(monkeypatch):
+    use_points(monkeypatch)
+
+
+def starts(count: int = 2) -> list[Start]:
+    return physics_starts(DRAWER.name, count, 3, stride=DRAWER.stride, image_size=8)
+
+
+def test_an_episode_is_begun_again_where_its_start_ends():
+    found, sim = starts(), PhysicsSimulator([DRAWER], episodes=2, image_size=8)
+    assert [s.images.shape for s in found] == [(3, 8, 8, 3)] * 2 and found[0].actions.shape == (10, 4)
+    np.testing.assert_array_equal(sim.reset(found), [s.images[-1] for s in found])
+    assert [s.seed for s in found] == new_seeds(DRAWER.name, 2, 0, "starts").tolist()
+    assert [s.seed for s in starts(1)] == [found[0].seed]
+
+
+def test_episodes_go_their_own_ways_wait_and_are_taken_back():
+    sim = PhysicsSimulator([DRAWER], episodes=2, image_size=8)
+    first = sim.reset(starts())
+    seen = sim.step([AHEAD, None])
+    np.testing.assert_array_equal(seen[1], first[1])
+    assert seen[0, 0, 0, 0] == first[0, 0, 0, 0] + 10  # five native steps of 0.01, 200 shades each
+    while not sim.success()[0]:
+        sim.step([AHEAD, BACK])
+    assert sim.success().tolist() == [True, False]
+    np.testing.assert_array_equal(sim.rewind(sim.reach(0) - 1, [0])[0], seen[0])
+    assert not sim.success()[0]
+    sim.step([np.full(4, 3.0), None])
+    assert sim.clipped == [DRAWER.dimensions, ()]
+    sim.close()
+    with pytest.raises(ConfigError, match="episode 0 has not begun"):
+        sim.step([AHEAD, None])
+
+
+def test_what_cannot_be_simulated_is_said():
+    assert "metaworld_sawyer" not in PHYSICS  # fifty tasks: a seed does not say which
+    with pytest.raises(ConfigError, match="no robot 'metaworld_sawyer'"):
+        PhysicsSimulator([Robot("metaworld_sawyer", 1, (0.0,), (1.0,), (0.0,))])
+    with pytest.raises(ConfigError, match="4 action values in truth, not 1"):
+        PhysicsSimulator([Robot("metaworld_drawer", 1, (0.0,), (1.0,), (0.0,))])
+    (start,) = starts(1)
+    with pytest.raises(ConfigError, match="with which seed"):
+        PhysicsSimulator([DRAWER], image_size=8).reset(Start(start.robot, start.images, start.actions))
