@@ -35,9 +35,11 @@ def table(header: str) -> dict[str, list[str]]:
 def test_the_page_shows_what_was_measured():
     ten, unlike = (read_rows(RESULTS / name) for name in ("endurance.csv", "unlike.csv"))
     tried = [row for name in ("variants.csv", "own_past.csv") for row in read_rows(RESULTS / name)]
+    trained = read_rows(RESULTS / "chained.csv")
     shown = {
         "| minute |": lambda label: [row for row in ten if row["part"] == float(label)],
         "| variant, seconds |": lambda label: [row for row in tried if f"{row['variant']}, {_seconds(row)}" == label],
+        "| trained, seconds |": lambda label: [row for row in trained if f"{row['variant']}, {_seconds(row)}" == label],
         "| drive |": lambda label: [row for row in unlike if row["drive"] == label and row["part"] == 3],
     }
     for header, rows_of in shown.items():
@@ -47,6 +49,24 @@ def test_the_page_shows_what_was_measured():
             for (measure, digits), cell in zip(SHOWN.items(), cells, strict=True):
                 mean, half, robots = over_robots(mine, measure)
                 assert cell == ("" if robots < 2 else f"{mean:.{digits}f} ± {half:.{digits}f}"), (label, measure)
+
+
+def test_chained_factors_keep_bodies_and_cost_decibels():
+    rows, page = read_rows(RESULTS / "chained.csv"), " ".join(PAGE.read_text().split())
+    cells = {(row["variant"], row["robot"], row["start"], row["part"]): row for row in rows if row["part"] > 1}
+    assert len(cells) == 2 * 8 * 4 * 2
+    for measure, digits, words in (
+        ("tool_found", 2, "in {} more of the frames"), ("variance", 2, "nearer to the truth's by {}"),
+        ("tool_close", 2, "better in place ({})"), ("psnr", 1, "at wrong places cost {} dB"),
+    ):  # fmt: skip
+        apart = [
+            {**row, measure: row[measure] - cells["shipped", *place][measure]}
+            for (variant, *place), row in cells.items()
+            if variant == "chained"
+        ]
+        mean, half, robots = over_robots(apart, measure)
+        said = f"{abs(mean) if measure == 'psnr' else mean:.{digits}f} ± {half:.{digits}f}"
+        assert robots == 8 and words.format(said) in page, (measure, said)
 
 
 def test_what_was_hidden_for_long_does_not_come_back():
