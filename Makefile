@@ -43,8 +43,9 @@ test-slow: $(VENV)/installed-test
 	XLA_FLAGS= $(PYTEST) -m exact $(EXACT)
 	$(PYTEST) -m "not exact"
 
-# constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves.
-INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check \
+# constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves. Modules are compiled when they
+# are imported: most never are, and compiling all of them is 40 % of the installation.
+INSTALL = $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check \
 	$$($(BIN)/python -c 'import sys; print("-c constraints.txt" if sys.version_info[:2] == (3, 11) else "")')
 
 $(VENV)/installed: pyproject.toml constraints.txt | $(BIN)/python

@@ -48,15 +48,40 @@ KEPT = {
 """What a process remembers: declarations, and steps that it has traced."""
 
 
-@pytest.fixture(autouse=True)
-def programs_without_replaced_parts(request: pytest.FixtureRequest):
-    """A test that replaces parts of the program gets no step that was traced before, and leaves none to others."""
-    replaces = "monkeypatch" in request.fixturenames
-    if replaces:
-        forget_programs()
-    yield
-    if replaces:
-        forget_programs()
+PROGRAM = ("hma_jax", "jax", "jaxlib", "flax", "optax", "numpy")
+"""Packages whose parts are in a traced step."""
+
+
+class Replacing(pytest.MonkeyPatch):
+    """Where a part of the program is replaced, no step that was traced before is used, and none is left to other tests."""
+
+    replaced = False
+
+    def setattr(self, target, *args, **kwargs) -> None:
+        name = target if isinstance(target, str) else getattr(target, "__module__", None) or getattr(target, "__name__", "")
+        self._replacing(name.split(".")[0] in PROGRAM)
+        super().setattr(target, *args, **kwargs)
+
+    def setitem(self, dic, name, value) -> None:
+        self._replacing(dic is not sys.modules)  # a dictionary does not say whose it is
+        super().setitem(dic, name, value)
+
+    def undo(self) -> None:
+        super().undo()
+        if self.replaced:
+            self.replaced = False
+            forget_programs()
+
+    def _replacing(self, part: bool) -> None:
+        if part and not self.replaced:
+            self.replaced = True
+            forget_programs()
+
+
+@pytest.fixture
+def monkeypatch():
+    with Replacing.context() as patch:
+        yield patch
 
 
 def forget_programs() -> None:

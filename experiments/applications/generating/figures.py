@@ -36,10 +36,16 @@ def draw_conditions(
         panel.errorbar(places, mean, [mean - low, high - mean], fmt="none", color=INK, capsize=3)
         for i, means in zip(places, seeds, strict=True):
             panel.plot(np.full(len(means), i + 0.2), means, "o", color=INK, markersize=3)
-        panel.set_xticks(places, [name.replace(" generated", "\ngenerated").replace(", ", ",\n") for name in found])
+        panel.set_xticks(places, [wrapped(name) for name in found])
         panel.set(ylim=(0, most), ylabel=label)
         panel.grid(False, axis="x")
         save(figure, path)
+
+
+def wrapped(name: str) -> str:
+    for words in (" generated", " without"):
+        name = name.replace(words, "\n" + words[1:])
+    return name.replace(", ", ",\n")
 
 
 def draw_strips(images: Sequence[np.ndarray], names: Sequence[str], path: Path) -> None:
