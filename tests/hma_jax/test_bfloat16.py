@@ -4,6 +4,7 @@ Sums over many equal terms are where bfloat16 fails: with eight bits a running s
 """
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -17,10 +18,13 @@ ROWS = 48
 LATENTS = DiffusionConfig(channels=2, patch=1, width=32, depth=2, steps=20)
 
 
-def gradients(dtype: str, diffusion: DiffusionConfig | None) -> dict[str, np.ndarray]:
+def gradients(dtype: str, diffusion: DiffusionConfig | None, rounded: bool = False) -> dict[str, np.ndarray]:
+    """`rounded`: of parameters in bfloat16, whatever computes."""
     config = model_config(diffusion=diffusion)
     declared = declare_model(config, TABLE, ExecutionConfig(dtype))
     _, params = lively_params(config, scale=0.05)
+    if rounded:
+        params = jax.tree.map(lambda x: x.astype(jnp.bfloat16).astype(x.dtype), params)
     batch = random_batch(0, config, ROWS)
     if diffusion is None:
         rare = np.random.default_rng(1).random(batch["tokens"].shape) < 0.03
@@ -46,8 +50,14 @@ def gradients(dtype: str, diffusion: DiffusionConfig | None) -> dict[str, np.nda
     "diffusion", [None, pytest.param(LATENTS, marks=pytest.mark.slow)], ids=["ids", "latents"]
 )
 def test_gradients_in_bfloat16_are_those_in_float32_within_its_rounding(diffusion):
-    exact, rounded = gradients("float32", diffusion), gradients("bfloat16", diffusion)
-    for name, g in exact.items():
-        assert rounded[name].dtype == np.float32
-        error = np.linalg.norm(rounded[name] - g) / np.linalg.norm(g)
-        assert error < 0.02, name  # one rounding is 0.004 at most
+    exact, computed = gradients("float32", diffusion), gradients("bfloat16", diffusion)
+    assert all(g.dtype == np.float32 for g in computed.values())
+    off = {name: error for name in exact if (error := apart(computed[name], exact[name])) >= 0.02}
+    if off:  # one rounding is 0.004 at most; some gradients change by more when the parameters alone are rounded
+        alone = gradients("float32", diffusion, rounded=True)
+        off = {name: error for name, error in off.items() if error >= apart(alone[name], exact[name])}
+    assert not off
+
+
+def apart(g: np.ndarray, exact: np.ndarray) -> float:
+    return float(np.linalg.norm(g - exact) / np.linalg.norm(exact))

@@ -24,9 +24,10 @@ Measure = Callable[[np.ndarray, np.ndarray], float]
 
 def pearson(true: np.ndarray, learned: np.ndarray) -> float:
     """nan where one of them does not vary."""
+    if np.ptp(true) == 0 or np.ptp(learned) == 0:  # the mean of equal rates need not be one of them to the last bit
+        return math.nan
     a, b = true - true.mean(), learned - learned.mean()
-    scale = math.sqrt(float((a * a).sum() * (b * b).sum()))
-    return float((a * b).sum() / scale) if scale > 0 else math.nan
+    return float((a * b).sum() / math.sqrt(float((a * a).sum() * (b * b).sum())))
 
 
 def spearman(true: np.ndarray, learned: np.ndarray) -> float:

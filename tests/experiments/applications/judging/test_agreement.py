@@ -15,6 +15,8 @@ def test_measures_of_known_cases():
     assert rank_violation(np.array([0.1, 0.5, 0.6]), np.array([0.0, 0.9, 0.8])) == pytest.approx(0.2 / 3)
     assert rank_violation(np.array([0.8, 0.2]), np.array([0.5, 0.5])) == pytest.approx(0.6)
     assert np.isnan(pearson(true, np.ones(4)))
+    alike = np.full(11, 0.86)
+    assert (alike - alike.mean()).any() and np.isnan(pearson(np.arange(11.0), alike))
 
 
 def test_a_faithful_world_has_a_high_interval_and_one_without_relation_has_none():
