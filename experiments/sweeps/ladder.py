@@ -4,12 +4,13 @@ Question: held-out nats, PSNR and what actions decide, of the reference and with
     there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
     change alone, and the study's long runs with both, are of the first seed. The rungs have `designs.ablation_steps`;
     for the study's own number of steps all are trained too, and both changes with factors that are chained
-    (`model.chain_factors`).
+    (`model.chain_factors`) and with tokens that count thrice where they change (`train.masking.change_weight`).
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
 Cost: three training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
     and the long ones; `--dry-run` prints it.
-Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of more nats, not of more dB.
+Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of more nats, not of more dB;
+    changes that count more of neither.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, make_ablation, reference_trial
 
 REFERENCE, RECALL, MUON, BEST = "reference", "recall", "Muon", "recall, Muon"
-CHAINED = f"{BEST}, chained"
+CHAINED, WEIGHED = f"{BEST}, chained", f"{BEST}, changes thrice"
 
 
 def recalling(trial: Trial) -> Trial:
@@ -43,6 +44,11 @@ def chained(trial: Trial) -> Trial:
     return replace(trial, model=replace(trial.model, chain_factors=True))
 
 
+def with_changes_weighed(trial: Trial) -> Trial:
+    masking = replace(trial.train.masking, change_weight=3.0)
+    return replace(trial, train=replace(trial.train, masking=masking))
+
+
 RUNGS: dict[str, Callable[[Trial], Trial]] = {
     REFERENCE: lambda trial: trial,
     RECALL: recalling,
@@ -50,7 +56,10 @@ RUNGS: dict[str, Callable[[Trial], Trial]] = {
     BEST: with_both,
 }
 
-LONGER = RUNGS | {CHAINED: lambda trial: chained(with_both(trial))}
+LONGER = RUNGS | {
+    CHAINED: lambda trial: chained(with_both(trial)),
+    WEIGHED: lambda trial: with_changes_weighed(with_both(trial)),
+}
 
 
 def plan(study: Study) -> Sweep:
@@ -70,7 +79,7 @@ def plan(study: Study) -> Sweep:
     points = [point for point in sweep.points if point.x in several or point.trial.train.seed == first]
     labels = list(sweep.labels)
     longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED)]
-    longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON)]
+    longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, WEIGHED)]
     longer += [(BEST, steps, (first,)) for steps in study.designs.long]
     for name, steps, chosen in longer:
         for seed in chosen:

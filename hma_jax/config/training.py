@@ -50,6 +50,9 @@ class MaskingConfig:
     # (`objective.own_past`). DIFFERS: the release corrupts the past with random tokens alone (`max_corrupt_rate`, which
     # does so here too). A step passes over every frame three times.
     own_past: float = 0.0
+    # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
+    # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
+    change_weight: float = 1.0
     max_corrupt_rate: float = 0.2
     clean_rate_min: float = 0.2
     label_smoothing: float = 0.01
@@ -63,6 +66,7 @@ class MaskingConfig:
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
+        require(self.change_weight > 0, f"masking.change_weight must be positive, got {self.change_weight}")
         require(
             not (self.teacher_forcing and self.predicts_actions),
             f"masking.teacher_forcing is of settings that predict frames alone, and {self.setting!r} predicts actions",

@@ -28,12 +28,12 @@ class LossSums(NamedTuple):
     """Sums over a batch's targets; divide by their number in the whole batch."""
 
     tokens: jax.Array
-    correct: jax.Array  # targets whose likeliest id is right; 0 in the continuous variant
+    correct: jax.Array  # targets whose likeliest id is right, weighted alike; 0 in the continuous variant
     actions: jax.Array
 
 
 class TargetCounts(NamedTuple):
-    """How many targets a batch has. A mean over none is 0."""
+    """How many targets a batch has, tokens weighted (`weigh_tokens`). A mean over none is 0."""
 
     tokens: jax.Array
     actions: jax.Array
@@ -56,8 +56,19 @@ def noise_keys(key: jax.Array, rows: int) -> jax.Array:
     return jax.vmap(lambda row: jax.random.fold_in(noise_key, row))(jnp.arange(rows))
 
 
-def count_targets(masked: Masked) -> TargetCounts:
-    return TargetCounts(*(jnp.maximum(jnp.sum(x), 1) for x in (masked.targets_TS, masked.action_targets_T)))
+def weigh_tokens(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> jax.Array:
+    """float32 [B, T, S]: how much each of `tokens`, as recorded, counts in the loss: 0 where it is no target, else 1, or
+    `masking.change_weight` where it is another than a frame earlier. Accuracy is weighted alike."""
+    weight = masked.targets_TS.astype(jnp.float32)
+    if masking.change_weight == 1:
+        return weight
+    changed = tokens[:, SAID_FROM:] != tokens[:, :-SAID_FROM]
+    return weight.at[:, SAID_FROM:].multiply(jnp.where(changed, masking.change_weight, 1.0))
+
+
+def count_targets(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> TargetCounts:
+    tokens_counted = jnp.sum(weigh_tokens(masked, tokens, masking))
+    return TargetCounts(*(jnp.maximum(n, 1) for n in (tokens_counted, jnp.sum(masked.action_targets_T))))
 
 
 def smoothed_cross_entropy(
@@ -119,7 +130,7 @@ def masked_loss(
     zero = jnp.zeros(())
     loss = correct = action_loss = zero
     if masking.predicts_frames:
-        weight, tokens = masked.targets_TS[:, SAID_FROM:].astype(jnp.float32), tokens[:, SAID_FROM:]
+        weight, tokens = weigh_tokens(masked, tokens, masking)[:, SAID_FROM:], tokens[:, SAID_FROM:]
         if model.config.diffusion:
             per_token = frame_diffusion_loss(model, out.said, tokens, key_B, training=True)
         else:

@@ -61,6 +61,10 @@ def make_train_step(
         f"model.conditioning {model.conditioning!r} has none; choose one with concat",
     )
     require(not (masking.own_past and model.diffusion), "train.masking.own_past draws ids; continuous tokens have none")
+    require(
+        masking.change_weight == 1 or not model.diffusion,
+        "train.masking.change_weight tells ids that changed; of continuous tokens all change",
+    )
     multipliers = jax.tree.map(
         lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
     )
@@ -108,7 +112,7 @@ def make_train_step(
         key = jax.random.fold_in(key, state.step)
         real_BT = batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
-        counts = count_targets(masked)
+        counts = count_targets(masked, batch["tokens"], masking)
         active = robots.choose(batch["embodiment"], table.size)
         own = robots.take(state.params, specs, active)
         rows = batch | {"masked": masked, "key": noise_keys(key, config.batch), "slice": active.slice_B}

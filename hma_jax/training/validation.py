@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -73,7 +73,10 @@ def make_watch(
 def make_sums(
     declared: Declared, table: EmbodimentTable, model: ModelConfig, masking: MaskingConfig
 ) -> Callable[[Params, Mapping[str, jax.Array], jax.Array], tuple[LossSums, TargetCounts]]:
-    """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function."""
+    """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function.
+
+    Tokens count alike whatever `masking.change_weight` is: runs that weigh them differently compare."""
+    masking = replace(masking, change_weight=1.0)
 
     def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:
         key = jax.random.fold_in(jax.random.key(SEED), number)

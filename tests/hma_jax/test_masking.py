@@ -9,7 +9,7 @@ import pytest
 from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
-from hma_jax.objective.losses import masked_loss
+from hma_jax.objective.losses import count_targets, masked_loss
 from hma_jax.objective.masking import mask_batch, mask_tokens
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
@@ -141,6 +141,40 @@ def losses(config, masking, changes=None, table=TABLE):
         )
     )
     return np.array(run(params))
+
+
+def test_tokens_that_change_may_count_more():
+    """The loss is the mean in which they do, and the gradient its: one step of a run has that loss."""
+    config = shallow_config()
+    declared, params = lively_params(config, TABLE, scale=0.1)
+    data, masked = masked_batch(config, MaskingConfig(), batch=8)
+    # Half of the tokens stand still.
+    still = jax.random.bernoulli(jax.random.key(2), shape=data["tokens"].shape)
+    tokens = np.where(still, data["tokens"][:, :1], data["tokens"])
+    changed = np.zeros(tokens.shape, bool)
+    changed[:, 1:] = tokens[:, 1:] != tokens[:, :-1]
+
+    def found(weight, among=None):
+        masking = MaskingConfig(change_weight=weight)
+        counted = masked if among is None else masked._replace(targets_TS=masked.targets_TS & among)
+        sums = masked_loss(
+            declared.merge(params), counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8)
+        )
+        counts = count_targets(counted, tokens, masking)
+        return [float(x) for x in (sums.tokens, sums.correct, counts.tokens)]
+
+    moving, standing = found(1.0, changed), found(1.0, ~changed)
+    assert moving[2] > 20 and standing[2] > 20
+    np.testing.assert_allclose(found(1.0), np.add(moving, standing), rtol=1e-5)
+    np.testing.assert_allclose(found(3.0), 3 * np.array(moving) + standing, rtol=1e-5)
+    with pytest.raises(ConfigError, match="masking.change_weight must be positive, got 0"):
+        MaskingConfig(change_weight=0)
+
+
+def test_weights_of_change_are_of_ids():
+    config, train = shallow_config(diffusion=DIFFUSION), train_config(masking=MaskingConfig(change_weight=2.0))
+    with pytest.raises(ConfigError, match="change_weight tells ids that changed; of continuous tokens all change"):
+        make_train_step(declare_model(config, TABLE), TABLE, config, train)
 
 
 def poison_hidden(data, masked):
