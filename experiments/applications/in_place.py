@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.suite.simulator import SPECS
-from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector, enlarged, known_robots, make_detector
+from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector, enlarged, known_robots, make_detector, shown_by
 from experiments.applications.endurance.tables import Row, over_robots
 from experiments.applications.made_with import claim
 from experiments.applications.scenes import Points, point_names, points_of
@@ -34,9 +34,10 @@ from hma_jax.simulator.simulator import Simulator
 
 EPISODES = 8
 TABLE = "in_place.csv"
-VIEWS = ("model", "true", "still")
-"""Whose last frame the detector looks at: the model's, the true one (what it misses there is its own error), and the
-last one of the prompt, which is what copying shows."""
+VIEWS = ("model", "true", "tokens", "still")
+"""Whose last frame the detector looks at: the model's, the true one (what it misses there is its own error), the true
+one as the tokenizer shows it (no model of its tokens shows more), and the last one of the prompt, which is what copying
+shows."""
 
 
 def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[Row]:
@@ -57,7 +58,8 @@ def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[R
         for one in (simulator, true):
             one.step([chunks[i, t] for i in filled])
     after = _points(true, robot, len(starts))
-    seen = {"model": simulator.images, "true": true.images, "still": still}
+    as_tokens = shown_by(simulator.tokenizer, true.images)
+    seen = {"model": simulator.images, "true": true.images, "tokens": as_tokens, "still": still}
     found = {view: detector.watch(robot.name, enlarged(images[: len(starts)])) for view, images in seen.items()}
     rows = []
     for episode, point in zip(*np.nonzero(after.there), strict=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -83,6 +84,8 @@ def test_points_are_comparable_and_rows_that_fill_up_do_not_count(changes, maski
     for a, b in zip(padded[0], cut[0], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6)
     assert int(cut[1].tokens) < int(first[1].tokens)
+    weighed = jax.jit(make_sums(declared, TABLE, model, replace(masking, change_weight=3.0)))
+    assert weighed.lower(params, whole, 0).as_text() == sums.lower(params, whole, 0).as_text()
 
 
 def test_a_validation_without_windows_is_refused_by_words(tmp_path: Path):

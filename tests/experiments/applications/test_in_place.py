@@ -6,7 +6,7 @@ import pytest
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications import detector as detector_module
-from experiments.applications.detector import Detector, as_given, as_shown, enlarged, make_detector
+from experiments.applications.detector import Detector, as_given, as_shown, enlarged, make_detector, shown_by
 from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, chosen, in_place, watch_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
@@ -40,12 +40,15 @@ def test_places_at_the_end_are_those_of_the_true_simulator(simulator):
     oracle = Oracle([nowhere] * len(VIEWS))
     rows = watch_ends(simulator, oracle, robot)
     assert [film.shape for film in oracle.films] == [(EPISODES, 64, 64, 3)] * len(VIEWS)
-    assert (oracle.films[1] != oracle.films[2]).any(), "the true last frame, and the prompt's"
+    model, true, tokens, still = oracle.films
+    assert (true != still).any(), "the true last frame, and the prompt's"
+    larger = 64 // simulator.tokenizer.image_size
+    np.testing.assert_array_equal(tokens, shown_by(simulator.tokenizer, true[:, ::larger, ::larger]))
     assert {row["what"] for row in rows} <= set(point_names(SPECS[robot.name]))
     tools = [row for row in rows if row["what"] == "tool_0"]
     assert len(tools) == EPISODES and np.mean([row["moved_px"] > CLOSE for row in tools]) > 0.3
     # From the corner it is as far as the tool is.
-    assert all(row["true_px"] == row["model_px"] == row["still_px"] > 0 for row in tools)
+    assert all(len({row[f"{view}_px"] for view in VIEWS}) == 1 and row["true_px"] > 0 for row in tools)
 
 
 def test_a_part_of_the_robots_is_watched_by_name():
