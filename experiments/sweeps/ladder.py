@@ -10,7 +10,7 @@ Command: python -m experiments.sweeps.ladder --preset cpu-full
 Cost: three training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
     and the long ones; `--dry-run` prints it.
 Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of more nats, not of more dB;
-    changes that count more of neither.
+    changes that count more of more dB, not of more nats.
 """
 
 from __future__ import annotations

@@ -318,7 +318,7 @@ def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
 def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
     """Bold where it did not hold."""
     page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
-    assert len(expected) == 12
+    assert len(expected) == 14
     for e in expected:
         points = {p.label: p for p in curve(rows_of("ladder"), "ladder", e.metric)}
         mean = difference(points[e.x], points[e.against])[0] if e.against else points[e.x].mean
@@ -326,6 +326,18 @@ def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
         came = came if e.low <= mean <= e.high else f"**{came}**"
         against = f" beside {e.against}" if e.against else ""
         assert f"| {e.x}{against} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
+
+
+def test_what_counting_changes_thrice_gives_is_as_findings_of_the_ladder_say():
+    page, plain, gains, spread = " ".join(findings("ladder").split()), "recall, Muon, 4,000 steps", {}, {}
+    for metric in ("cross_entropy", "psnr", "action_nats", "delta_psnr"):
+        points = {p.label: p for p in curve(rows_of("ladder"), "ladder", metric)}
+        gains[metric], _ = difference(points[plain.replace(", 4,000", ", changes thrice, 4,000")], points[plain])
+        spread[metric] = np.ptp(list(points[plain].seeds.values()))
+    said = "{cross_entropy:.2f} nats are lost and {psnr:.2f} dB, {action_nats:.2f} action-nats and {delta_psnr:.2f} dB of ΔPSNR gained"
+    assert said.format(**gains) in page
+    said = "within {psnr:.2f} dB of each other in PSNR and {delta_psnr:.2f} dB in ΔPSNR"
+    assert said.format(**spread) in page
 
 
 def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():

@@ -42,7 +42,7 @@ def start():
 @pytest.mark.slow
 def test_a_death_at_any_step_of_a_save_leaves_no_trace(tmp_path, start):
     write_rlds(tmp_path / "suite", get_spec(NAME), [8, 9, 10, 11], shards=2)
-    work = Work(tmp_path / "suite", (NAME,), tmp_path / "undisturbed", tmp_path / "log", part_size=1500, pause=0)
+    work = Work(tmp_path / "suite", (NAME,), tmp_path / "undisturbed", tmp_path / "log", 1500, pause=0, one_split=True)
     assert start(work) == 0
     expected, deaths = contents(work.store), 0
     assert sum("parts/" in name for name in expected) == 2
