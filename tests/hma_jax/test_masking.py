@@ -144,7 +144,7 @@ def losses(config, masking, changes=None, table=TABLE):
 
 
 def test_tokens_that_change_may_count_more():
-    """The loss is the mean in which they do, and the gradient its: one step of a run has that loss."""
+    """The sums, and what they are divided by, are those of tokens that change, three times, and of the others."""
     config = shallow_config()
     declared, params = lively_params(config, TABLE, scale=0.1)
     data, masked = masked_batch(config, MaskingConfig(), batch=8)
