@@ -4,7 +4,7 @@ Question: held-out nats, PSNR and what actions decide, of the reference and with
     there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
     change alone, and the study's long runs with both, are of the first seed. The rungs have `designs.ablation_steps`;
     for the study's own number of steps all are trained too, and both changes with factors that are chained
-    (`model.chain_factors`) and with tokens that count thrice where they change (`train.masking.change_weight`).
+    (`model.chain_factors`) and with tokens that count thrice, or tenfold, where they change (`train.masking.change_weight`).
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
 Cost: three training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
@@ -24,7 +24,7 @@ from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, make_ablation, reference_trial
 
 REFERENCE, RECALL, MUON, BEST = "reference", "recall", "Muon", "recall, Muon"
-CHAINED, WEIGHED = f"{BEST}, chained", f"{BEST}, changes thrice"
+CHAINED, WEIGHED, TENFOLD = f"{BEST}, chained", f"{BEST}, changes thrice", f"{BEST}, changes tenfold"
 
 
 def recalling(trial: Trial) -> Trial:
@@ -44,8 +44,8 @@ def chained(trial: Trial) -> Trial:
     return replace(trial, model=replace(trial.model, chain_factors=True))
 
 
-def with_changes_weighed(trial: Trial) -> Trial:
-    masking = replace(trial.train.masking, change_weight=3.0)
+def with_changes_weighed(trial: Trial, weight: float) -> Trial:
+    masking = replace(trial.train.masking, change_weight=weight)
     return replace(trial, train=replace(trial.train, masking=masking))
 
 
@@ -58,7 +58,8 @@ RUNGS: dict[str, Callable[[Trial], Trial]] = {
 
 LONGER = RUNGS | {
     CHAINED: lambda trial: chained(with_both(trial)),
-    WEIGHED: lambda trial: with_changes_weighed(with_both(trial)),
+    WEIGHED: lambda trial: with_changes_weighed(with_both(trial), 3.0),
+    TENFOLD: lambda trial: with_changes_weighed(with_both(trial), 10.0),
 }
 
 
@@ -78,8 +79,8 @@ def plan(study: Study) -> Sweep:
     several = {sweep.labels.index(name) for name in (REFERENCE, BEST)}
     points = [point for point in sweep.points if point.x in several or point.trial.train.seed == first]
     labels = list(sweep.labels)
-    longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED)]
-    longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, WEIGHED)]
+    longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED, WEIGHED)]
+    longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, TENFOLD)]
     longer += [(BEST, steps, (first,)) for steps in study.designs.long]
     for name, steps, chosen in longer:
         for seed in chosen:
