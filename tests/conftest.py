@@ -6,6 +6,7 @@ import atexit
 import gc
 import os
 import shutil
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -29,6 +30,8 @@ FAST_COMPILATION = (
 os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
 # Tracing makes millions of objects that live on: looking through them again and again took an eighth of all time.
 gc.set_threshold(100_000, 20, 20)
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would not hear Ctrl-C
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 if "HMA_CACHE_DIR" not in os.environ:  # not the user's
     os.environ["HMA_CACHE_DIR"] = tempfile.mkdtemp(prefix="hma-cache-")
     atexit.register(shutil.rmtree, os.environ["HMA_CACHE_DIR"], ignore_errors=True)

@@ -48,11 +48,7 @@ def wait_for(condition, seconds: float = 20.0):
 
 
 def start_sweep(root: Path) -> subprocess.Popen:
-    def listen() -> None:  # tests run in a shell's background inherit that SIGINT is ignored
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-    command = [sys.executable, fake_trial.__file__, "--sweep", str(root)]
-    return subprocess.Popen(command, preexec_fn=listen)
+    return subprocess.Popen([sys.executable, fake_trial.__file__, "--sweep", str(root)])
 
 
 def test_second_run_starts_nothing(tmp_path):
