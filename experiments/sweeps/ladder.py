@@ -2,9 +2,10 @@
 
 Question: held-out nats, PSNR and what actions decide, of the reference and with masked tokens that also hold what stood
     there a frame earlier (`model.recall`), with matrices moved by Muon (`train.optimizer.matrices`), and with both. One
-    change alone, and the study's long runs with both, are of the first seed. The rungs have `designs.ablation_steps`;
+    change alone, and the study's long runs, are of the first seed. The rungs have `designs.ablation_steps`;
     for the study's own number of steps all are trained too, and both changes with factors that are chained
-    (`model.chain_factors`) and with tokens that count thrice, or tenfold, where they change (`train.masking.change_weight`).
+    (`model.chain_factors`) and with tokens that count thrice, or tenfold, where they change
+    (`train.masking.change_weight`); long runs have both, and both with changes thrice.
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
 Cost: three training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
@@ -81,7 +82,7 @@ def plan(study: Study) -> Sweep:
     labels = list(sweep.labels)
     longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED, WEIGHED)]
     longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, TENFOLD)]
-    longer += [(BEST, steps, (first,)) for steps in study.designs.long]
+    longer += [(name, steps, (first,)) for name in (BEST, WEIGHED) for steps in study.designs.long]
     for name, steps, chosen in longer:
         for seed in chosen:
             trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
