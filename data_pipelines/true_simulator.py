@@ -67,6 +67,9 @@ class TrueSimulator(ABC, Generic[W]):
     def open_world(self, name: str) -> W:
         """A world of this robot; it is reset before anything else."""
 
+    def close_world(self, world: W) -> None:
+        """It is not used again: another robot's takes its place."""
+
     def __len__(self) -> int:
         return len(self._worlds)
 
@@ -87,6 +90,9 @@ class TrueSimulator(ABC, Generic[W]):
             require(start.seed is not None, f"the start of {start.robot} does not say with which seed the truth begins")
             now = self._worlds[b]
             again = now is not None and now[1].name == start.robot
+            if now is not None and not again:
+                self._worlds[b] = None
+                self.close_world(now[0])
             world = now[0] if again else self.open_world(start.robot)
             world.reset(start.seed)
             for action in start.actions:

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterable
 
 from data_pipelines.simulators.spec import SimSpec
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 MODULES = {
     "metaworld": "metaworld",
@@ -80,20 +80,28 @@ def _version(package: str) -> str:
         return ""
 
 
-def require_packages(specs: Iterable[SimSpec]) -> None:
-    """Raises ConfigError, with what to install, unless these embodiments can be simulated here."""
+def find_obstacle(specs: Iterable[SimSpec]) -> str:
+    """Why these embodiments cannot be simulated on this machine, with what to install; "" where they can."""
     missing = missing_packages(specs)
     if missing:
-        raise ConfigError(
-            f"simulators not installed ({', '.join(missing)}): {EXTRA} "
-            f"and, to draw without a screen, {APT}"
-        )
+        return f"simulators not installed ({', '.join(missing)}): {EXTRA} and, to draw without a screen, {APT}"
     backend = gl_backend()
     if ctypes.util.find_library(GL[backend]) is None:
-        raise ConfigError(
-            f"the simulators cannot draw: no {GL[backend]} library on this machine; "
-            f"{APT} (or set MUJOCO_GL to the other of {' and '.join(GL)})"
-        )
+        other = f"(or set MUJOCO_GL to the other of {' and '.join(GL)})"
+        return f"the simulators cannot draw: no {GL[backend]} library on this machine; {APT} {other}"
+    return ""
+
+
+def require_packages(specs: Iterable[SimSpec]) -> None:
+    """Raises ConfigError, with what to install, unless these embodiments can be simulated here."""
+    obstacle = find_obstacle(specs)
+    require(not obstacle, obstacle)
+
+
+def may_draw() -> bool:
+    """Whether a simulator can draw in this process: with Mesa's software renderer beside TensorFlow, the first picture
+    ends it with a segmentation fault."""
+    return "tensorflow" not in sys.modules
 
 
 def gl_backend() -> str:
@@ -107,13 +115,12 @@ def gl_backend() -> str:
 def prepare_process() -> None:
     """Settles, before any simulator is imported, how this process draws.
 
-    Raises ConfigError where TensorFlow is loaded: with Mesa's software renderer in the same
-    process, the first picture ends it with a segmentation fault.
+    Raises ConfigError where TensorFlow is loaded (`may_draw`).
     """
-    if "tensorflow" in sys.modules:
-        raise ConfigError(
-            "TensorFlow is loaded in this process, which ends with a segmentation fault when a simulator "
-            "draws; simulate in a process of its own, without `import tensorflow`"
-        )
+    require(
+        may_draw(),
+        "TensorFlow is loaded in this process, which ends with a segmentation fault when a simulator draws; "
+        "simulate in a process of its own, without `import tensorflow`",
+    )
     backend = gl_backend()
     os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend

@@ -10,7 +10,7 @@ import numpy as np
 from data_pipelines.simulators.behaviour import Behaviour
 from data_pipelines.simulators.embodiments import EMBODIMENTS
 from data_pipelines.simulators.episode import Simulator
-from data_pipelines.simulators.packages import missing_packages, prepare_process, require_packages
+from data_pipelines.simulators.packages import find_obstacle, may_draw, prepare_process, require_packages
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.true_simulator import TrueSimulator
 from hma_jax.simulator.robots import Outside, Robot
@@ -20,9 +20,9 @@ PHYSICS = {spec.name: spec for spec in EMBODIMENTS if len(spec.envs) == 1}
 
 
 def can_simulate(robot: Robot) -> bool:
-    """Whether this robot has a true simulator here, its packages installed."""
+    """Whether this robot has a true simulator that can run in this process."""
     spec = PHYSICS.get(robot.name)
-    return spec is not None and spec.action_dim == robot.action_dim and not missing_packages([spec])
+    return spec is not None and spec.action_dim == robot.action_dim and not find_obstacle([spec]) and may_draw()
 
 
 class PhysicsWorld:
@@ -77,6 +77,10 @@ class PhysicsSimulator(TrueSimulator[PhysicsWorld]):
     def open_world(self, name: str) -> PhysicsWorld:
         self._opened.append(PhysicsWorld(PHYSICS[name], self.image_size))
         return self._opened[-1]
+
+    def close_world(self, world: PhysicsWorld) -> None:
+        self._opened.remove(world)
+        world.close()
 
     def close(self) -> None:
         super().close()

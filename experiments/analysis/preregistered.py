@@ -35,6 +35,7 @@ class Expected:
     low: float
     high: float
     commit: str
+    seeds: tuple[int, ...] = ()  # of these alone; (): of all. The column may be left out.
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,16 @@ def read_expected(path: Path) -> list[Expected]:
     columns, numbers = [f.name for f in fields(Expected)], ("mean", "low", "high")
     with open(path, newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        require(reader.fieldnames == columns, f"{path}: its columns have to be {','.join(columns)}")
+        known = (columns, columns[:-1])
+        require(reader.fieldnames in known, f"{path}: its columns have to be {','.join(known[1])}, and may be seeds")
         found = []
         for record in reader:
             number = reader.line_num
             try:
                 if None in record.values():
                     raise ValueError("it has too few columns")
-                found.append(Expected(**record | {name: float(record[name]) for name in numbers}))
+                seeds = tuple(int(seed) for seed in record.pop("seeds", "").split())
+                found.append(Expected(**record | {name: float(record[name]) for name in numbers}, seeds=seeds))
             except (TypeError, ValueError) as error:
                 raise ConfigError(f"{path}, line {number}: no prediction ({error})") from error
             e = found[-1]
@@ -89,8 +92,11 @@ def what_came(expected: Sequence[Expected], rows: Sequence[Row]) -> list[Came]:
 
 def _came(e: Expected, rows: Sequence[Row]) -> Came:
     """`rows`: of the axis, without its controls."""
-    places = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
     where = f"{FILE}: {e.sweep}, {e.series}" if e.series else f"{FILE}: {e.sweep}"
+    absent = set(e.seeds) - {r.seed for r in rows}
+    require(not absent, f"{where} has no seed {', '.join(map(str, sorted(absent)))}")
+    rows = [r for r in rows if not e.seeds or r.seed in e.seeds]
+    places = {(r.x, r.label, r.seed) for r in rows if r.series == e.series}
     for x in filter(None, (e.x, e.against)):
         there = sorted({label or f"{place:g}" for place, label, _ in places})
         known = any(_names(x, place, label) for place, label, _ in places)

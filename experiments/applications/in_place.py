@@ -36,8 +36,8 @@ EPISODES = 8
 TABLE = "in_place.csv"
 VIEWS = ("model", "true", "tokens", "still")
 """Whose last frame the detector looks at: the model's, the true one (what it misses there is its own error), the true
-one as the tokenizer shows it (no model of its tokens shows more), and the last one of the prompt, which is what copying
-shows."""
+one as the tokenizer shows it (which a model of its tokens can hardly exceed), and the last one of the prompt, which is
+what copying shows."""
 
 
 def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[Row]:

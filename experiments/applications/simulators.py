@@ -58,7 +58,7 @@ def load_simulator(run: Path, **options: Any) -> Simulator:
 def make_simulator(run: Path, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
     """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
 
-    Raises ConfigError; for "true" if a robot has no true simulator.
+    Raises ConfigError; for "true" if a robot has no true simulator, or robots are of different ones.
     """
     learned = load_simulator(run, episodes=episodes, **options)
     return learned if world == "learned" else true_simulator(learned, tuple(learned.robots.values()), episodes)
@@ -75,6 +75,8 @@ def true_simulator(learned: Simulator, robots: Sequence[Robot], episodes: int = 
 def true_worlds(robots: Sequence[Robot], **options: Any) -> TrueSimulator:
     """Of robots that are all of the suite, or all of physics simulators. Raises ConfigError for others."""
     physics = bool(robots) and all(robot.name in PHYSICS for robot in robots)
+    mixed = not physics and any(robot.name in PHYSICS for robot in robots)
+    require(not mixed, f"robots of the suite and of physics simulators have no common one: {', '.join(r.name for r in robots)}")
     return (PhysicsSimulator if physics else SuiteSimulator)(robots, **options)
 
 

@@ -10,8 +10,8 @@ The 100 trajectories are an expert's, from starts that the world model never saw
 recorded; of the others the actions are kept, and replayed from their own first frame in the learned simulator. Policies
 are trained on what it shows, not on that frame. Control: the same simulator under another trajectory's actions, so that
 pictures and actions do not belong together. With --without-actions RUN there is a second control, what a model generates
-that was trained on the same video without actions (`--set train.masking.setting=passive`). All policies are trained alike (behaviour cloning, as many steps), and
-judged from the same starts in the true simulator.
+that was trained on the same video without actions (`--set train.masking.setting=passive`). All policies are trained
+alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
 
 The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations. With --actions
 DATASET the trajectories are recordings of a robot that no simulator judges (the paper's Language Table): policies are
@@ -89,6 +89,8 @@ from hma_jax.simulator.simulator import Simulator
 OUT = Path("runs/synthetic")
 
 JUDGED_ON = "held_out"
+SECOND = "without_actions.json"
+"""What names the second control's model, in OUT."""
 """The name of the recordings that nobody is trained on, beside those of `KINDS`."""
 
 BATCH = 8
@@ -254,10 +256,15 @@ def main() -> None:
     run, out = asked.run, asked.out
     simulator = load_simulator(run, episodes=BATCH, history=1)
     lessons = find_lessons(asked, simulator)  # a mistyped name claims nothing
+    second = out / SECOND
+    require(
+        bool(asked.without_actions) or not second.exists(),
+        f"{second} says that policies of a model without actions are here: give --without-actions again, or another --out",
+    )
     settings, blind = lessons.settings, asked.without_actions and find_blind(asked.without_actions, lessons.robot)
     claim(out, run, simulator.model.params, asdict(settings), grows=("seeds",))
     if blind:
-        claim(out, asked.without_actions, blind.model.params, {}, file="without_actions.json")
+        claim(out, asked.without_actions, blind.model.params, {}, file=SECOND)
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
     data = make_data(lessons, simulator, out, blind)

@@ -62,6 +62,7 @@ def describe_expected(sweep: Sweep, came: Sequence[Came]) -> str:
     for c in own:
         e = c.expected
         where = f"{e.x} beside {e.against}" if e.against else e.x
+        where += f", seed {', '.join(map(str, e.seeds))}" if e.seeds else ""
         said = f"{e.mean:g} <span class=sem>[{e.low:g}, {e.high:g}]</span>".replace("-", "\u2212")
         there = "not run yet" if c.observed is None else pm(c.observed, c.seed_sem)
         curve = [html.escape(e.series)] if sweep.several else []

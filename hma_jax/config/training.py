@@ -68,6 +68,10 @@ class MaskingConfig:
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
         require(self.change_weight > 0, f"masking.change_weight must be positive, got {self.change_weight}")
         require(
+            self.change_weight == 1 or self.predicts_frames,
+            f"masking.change_weight is of tokens that are predicted, and {self.setting!r} predicts none",
+        )
+        require(
             not (self.teacher_forcing and self.predicts_actions),
             f"masking.teacher_forcing is of settings that predict frames alone, and {self.setting!r} predicts actions",
         )

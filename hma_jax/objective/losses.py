@@ -62,8 +62,8 @@ def weigh_tokens(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> j
     weight = masked.targets_TS.astype(jnp.float32)
     if masking.change_weight == 1:
         return weight
-    changed = tokens[:, SAID_FROM:] != tokens[:, :-SAID_FROM]
-    return weight.at[:, SAID_FROM:].multiply(jnp.where(changed, masking.change_weight, 1.0))
+    changed = tokens[:, 1:] != tokens[:, :-1]
+    return weight.at[:, 1:].multiply(jnp.where(changed, masking.change_weight, 1.0))
 
 
 def count_targets(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> TargetCounts:

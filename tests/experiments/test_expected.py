@@ -60,6 +60,15 @@ def test_seeds_are_counted(rows):
     assert (came.seeds, came.planned) == (1, 3)
 
 
+def test_some_seeds_alone_may_be_meant(rows, tmp_path):
+    (tmp_path / FILE).write_text(f"{COLUMNS},seeds\nwidth,,8,,cross_entropy,5,4,6,abc1234,0 2\nwidth,,8,,cross_entropy,5,4,6,abc1234,\n")
+    some, every = read_expected(tmp_path / FILE)
+    assert some == replace(WIDTH, seeds=(0, 2)) and every == WIDTH
+    [came] = what_came([some], rows)
+    seeds = curve(rows, "width", "cross_entropy")[0].seeds
+    assert came.observed == pytest.approx((seeds[0] + seeds[2]) / 2) and (came.seeds, came.planned) == (2, 2)
+
+
 def test_a_point_that_is_not_there_is_refused(rows):
     for wrong, message in (
         (replace(WIDTH, x="12"), "width has no point '12', but 16, 8"),
@@ -67,6 +76,7 @@ def test_a_point_that_is_not_there_is_refused(rows):
         (replace(WIDTH, series="8,000 steps"), "nor such a curve"),
         (replace(WIDTH, metric="cross-entropy"), "has no metric 'cross-entropy', but .*cross_entropy"),
         (replace(WIDTH, sweep="widht"), "no axis 'widht'"),
+        (replace(WIDTH, seeds=(1, 7)), "width has no seed 7"),
     ):
         with pytest.raises(ConfigError, match=message):
             what_came([wrong], rows)

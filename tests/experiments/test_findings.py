@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.embodiments import TRAINED
-from experiments.analysis.preregistered import FILE, Expected, read_expected
+from experiments.analysis.preregistered import FILE, Expected, read_expected, what_came
 from experiments.applications.detector import CLOSE
 from experiments.applications.in_place import in_place
 from experiments.report.robots import Robot, robots_of
@@ -319,13 +319,13 @@ def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
     """Bold where it did not hold."""
     page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
     assert len(expected) == 14
-    for e in expected:
-        points = {p.label: p for p in curve(rows_of("ladder"), "ladder", e.metric)}
-        mean = difference(points[e.x], points[e.against])[0] if e.against else points[e.x].mean
-        came = f"{mean:+.2f}" if e.against else f"{mean:.2f}"
-        came = came if e.low <= mean <= e.high else f"**{came}**"
-        against = f" beside {e.against}" if e.against else ""
-        assert f"| {e.x}{against} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
+    for c in what_came(expected, rows_of("ladder")):
+        e, came = c.expected, "not run"
+        if c.observed is not None:
+            came = f"{c.observed:+.2f}" if e.against else f"{c.observed:.2f}"
+            came = came if c.inside else f"**{came}**"
+        about = f" beside {e.against}" * bool(e.against) + f", seed {e.seeds[0]}" * bool(e.seeds)
+        assert f"| {e.x}{about} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
 
 
 def test_what_counting_changes_thrice_gives_is_as_findings_of_the_ladder_say():

@@ -55,7 +55,7 @@ def test_gradients_in_bfloat16_are_those_in_float32_within_its_rounding(diffusio
     off = {name: error for name in exact if (error := apart(computed[name], exact[name])) >= 0.02}
     if off:  # one rounding is 0.004 at most; some gradients change by more when the parameters alone are rounded
         alone = gradients("float32", diffusion, rounded=True)
-        off = {name: error for name, error in off.items() if error >= apart(alone[name], exact[name])}
+        off = {name: error for name, error in off.items() if error >= min(apart(alone[name], exact[name]), 0.1)}
     assert not off
 
 

@@ -169,6 +169,8 @@ def test_tokens_that_change_may_count_more():
     np.testing.assert_allclose(found(3.0), 3 * np.array(moving) + standing, rtol=1e-5)
     with pytest.raises(ConfigError, match="masking.change_weight must be positive, got 0"):
         MaskingConfig(change_weight=0)
+    with pytest.raises(ConfigError, match="tokens that are predicted, and 'policy' predicts none"):
+        MaskingConfig(setting="policy", change_weight=2.0)
 
 
 def test_weights_of_change_are_of_ids():

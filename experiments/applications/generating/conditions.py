@@ -27,6 +27,10 @@ class Condition(NamedTuple):
     more: str = "generated"
 
 
+KINDS = ("recorded", "generated", "shuffled")
+BLIND_KIND = "blind"
+"""Whose trajectories come with the recorded ones; the last are of a model without actions, where there is one."""
+
 CONDITIONS = (
     Condition("10 recorded", 10),
     Condition("10 + 10 generated", 10, 10),
@@ -34,14 +38,11 @@ CONDITIONS = (
     Condition("10 + 90 generated", 10, 90),
     Condition("10 + 90, other actions", 10, 90, "shuffled"),
     Condition("100 recorded", 100),
-    Condition("10 + 90, a model without actions", 10, 90, "blind"),  # where there is such a model
+    Condition("10 + 90, a model without actions", 10, 90, BLIND_KIND),  # where there is such a model
 )
 
 TRIALS, STARTS = "trials.csv", ["condition", "seed", "start", "success", "distance"]
 ERRORS, HELD_OUT = "errors.csv", ["condition", "seed", "trajectory", "error"]
-
-KINDS = ("recorded", "generated", "shuffled")
-BLIND_KIND = "blind"
 
 FEW, MOST, CONTROL, ALL, BLIND = 0, 3, 4, 5, 6
 """Places in `CONDITIONS` that shares of the gap are made of."""
@@ -133,13 +134,13 @@ def markdown(found: Sequence[Summary]) -> str:
 def read_trials(directory: Path) -> Trials:
     """What the tables say: {(place of the condition, seed): {success, distance, error}}; without the first two where
     no simulator judged."""
-    places, trials = {c.name: i for i, c in enumerate(CONDITIONS)}, {}
+    place_of, trials = {c.name: i for i, c in enumerate(CONDITIONS)}, {}
     for path, what in ((TRIALS, ("success", "distance")), (ERRORS, ("error",))):
         if not (directory / path).exists():
             continue
         with open(directory / path, newline="") as file:
             for row in csv.DictReader(file):
-                one = trials.setdefault((places[row["condition"]], int(row["seed"])), {})
+                one = trials.setdefault((place_of[row["condition"]], int(row["seed"])), {})
                 for name in what:
                     one.setdefault(name, []).append(float(row[name]))
     return trials

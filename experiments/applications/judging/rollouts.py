@@ -50,7 +50,8 @@ def make_starts(task: Task, count: int, size: int, stride: int) -> list[Start]:
             chosen = []
             for start in true_starts(robot, times * count, START_FRAMES, size, seed=STARTS_SEED):
                 simulator.reset(start)
-                chosen += [start] * (not _reached(simulator, task)[0])
+                if not _reached(simulator, task)[0]:
+                    chosen.append(start)
                 if len(chosen) == count:
                     return chosen
     raise ConfigError(f"{task.robot}: hardly a held-out episode begins without its goal reached")

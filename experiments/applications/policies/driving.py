@@ -63,7 +63,8 @@ def _drive_suite(task: Task, seeds: np.ndarray, stride: int, image_size: int, no
 
 
 def _drive_physics(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool) -> Driven:
-    """Expert and noise as in the data of `hma data sim`, at the frames' rate; `play` wanders."""
+    """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its hand forgets by what it misses over
+    `JITTER` frames, where that of the data forgets over 0.1 s; `play` wanders."""
     spec, world = task.physics, PhysicsWorld(task.physics, image_size)
     shape = len(seeds), task.frames
     images = np.zeros((*shape, image_size, image_size, 3), np.uint8)

@@ -23,7 +23,8 @@ EXPERTS = {name: spec for name, spec in PHYSICS.items() if spec.success and spec
 """Robots of physics simulators that say when their one task is done, and of which there is an expert."""
 
 PHYSICS_FRAMES = 24
-"""Half as many again as an undisturbed expert takes to open the drawer, at 4 frames a second."""
+"""Half as many again as an undisturbed expert takes to open the drawer, at 4 frames a second. Of other robots and rates
+nothing was measured: give `frames`."""
 
 RADIUS = 0.22
 """Within which a tool has reached the mark, in halves of the floor's side: a little less than the mark's own."""

@@ -48,6 +48,19 @@ def test_episodes_go_their_own_ways_wait_and_are_taken_back():
         sim.step([AHEAD, None])
 
 
+def test_a_world_that_gives_way_to_another_robot_is_closed():
+    name, dim = next((name, spec.action_dim) for name, spec in PHYSICS.items() if name != DRAWER.name)
+    sim = PhysicsSimulator([DRAWER, Robot(name, 5, (-1.0,) * dim, (1.0,) * dim, (0.0,) * dim)], image_size=8)
+    (other,) = physics_starts(name, 1, 3, stride=5, image_size=8)
+    opened = []
+    for start in (*starts(1), other, *starts(1)):
+        sim.reset(start)
+        opened.append(sim._worlds[0][0].simulator)
+    assert [one.size for one in opened] == [0, 0, 8]
+    sim.close()
+    assert opened[-1].size == 0
+
+
 def test_what_cannot_be_simulated_is_said():
     assert "metaworld_sawyer" not in PHYSICS  # fifty tasks: a seed does not say which
     with pytest.raises(ConfigError, match="no robot 'metaworld_sawyer'"):

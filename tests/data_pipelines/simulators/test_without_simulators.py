@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,11 +12,13 @@ from data_pipelines.publishing.claims import claim
 from data_pipelines.simulators import generate, packages, read_start, select
 from data_pipelines.simulators.episode import StartState
 from data_pipelines.simulators.record import encode_episode
+from data_pipelines.simulators.simulator import can_simulate
 from data_pipelines.simulators.stats import stats_table
 from data_pipelines.simulators.worker import Job, episode_seed
 from data_pipelines.simulators.write import write_dataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
+from hma_jax.simulator.robots import Robot
 from tests.data_pipelines.simulators.fakes import EPISODES, SIZE, SPEC, fake_workers, make_episode, write_episode
 
 
@@ -95,6 +99,19 @@ def test_a_machine_that_cannot_draw_is_told_what_to_install(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     with pytest.raises(ConfigError, match="MUJOCO_GL is 'glfw'"):
         packages.require_packages([SPEC])
+
+
+def test_a_robot_can_be_simulated_where_packages_a_library_and_the_process_allow_it(monkeypatch):
+    robot = Robot("metaworld_drawer", 1, (-1.0,) * 4, (1.0,) * 4, (0.0,) * 4)
+    monkeypatch.setattr(packages.importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(packages.ctypes.util, "find_library", lambda name: "lib")
+    monkeypatch.delitem(packages.sys.modules, "tensorflow", raising=False)
+    assert can_simulate(robot) and not can_simulate(replace(robot, name="metaworld_sawyer"))
+    with monkeypatch.context() as beside_tensorflow:
+        beside_tensorflow.setitem(packages.sys.modules, "tensorflow", object())
+        assert not can_simulate(robot)
+    monkeypatch.setattr(packages.ctypes.util, "find_library", lambda name: None)
+    assert not can_simulate(robot)
 
 
 def test_a_process_with_tensorflow_is_refused_before_it_can_crash(monkeypatch):

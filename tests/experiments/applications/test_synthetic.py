@@ -160,6 +160,11 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
     monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(out), "--split", "train", "--held-out", "a"])
     with pytest.raises(ConfigError, match="--split, --held-out: of recordings, which --actions"):
         synthetic.main()
+    out.mkdir()
+    (out / "without_actions.json").write_text("{}")
+    monkeypatch.setattr(sys, "argv", asked[:2] + asked[4:])
+    with pytest.raises(ConfigError, match="policies of a model without actions are here: give --without-actions again"):
+        synthetic.main()
 
 
 def test_a_dimension_that_stood_still_in_training_is_not_judged():
