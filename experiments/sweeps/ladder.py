@@ -8,10 +8,10 @@ Question: held-out nats, PSNR and what actions decide, of the reference and with
     (`train.masking.change_weight`); long runs have both, and both with changes thrice.
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
-Cost: three training runs and their longer branches per seed of `ablation_seeds`, one for each change alone, the control
-    and the long ones; `--dry-run` prints it.
-Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of more nats, not of more dB;
-    changes that count more of more dB, not of more nats.
+Cost: four training runs, two of them with longer branches, per seed of `ablation_seeds`, one for each change alone and
+    for changes tenfold, the control and the long ones; `--dry-run` prints it.
+Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of fewer nats, not of more dB;
+    changes that count more of neither. What came: experiments/results/ladder/findings.md.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def plan(study: Study) -> Sweep:
         axis="change",
         variants=RUNGS,
         default=REFERENCE,
-        question="What makes the model better for as many steps? One change alone, and the longest runs, are of one seed.",
+        question="What makes the model better for as many steps? One change alone, changes tenfold, and the longest runs are of one seed.",
         gain="such changes",
         title="Ladder: what pays",
     )
