@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,13 @@ def can_simulate(robot: Robot) -> bool:
     return spec is not None and spec.action_dim == robot.action_dim and not find_obstacle([spec]) and may_draw()
 
 
+class PhysicsState(NamedTuple):
+    """Where an episode is: the physics, and how many actions led there from the start."""
+
+    physics: np.ndarray  # float64 [P]
+    actions: int
+
+
 class PhysicsWorld:
     """One environment, opened at once: one episode at a time, seen in frames of `size`."""
 
@@ -36,21 +44,27 @@ class PhysicsWorld:
 
         self.spec = spec
         self.simulator: Simulator = open_simulator(spec, size)
-        self._reached = False
+        self._seed, self._reached = 0, False
+        self._actions: list[np.ndarray] = []
 
     def reset(self, seed: int) -> None:
         self.simulator.start(self.spec.envs[0], seed)
-        self._reached = False
+        self._seed, self._reached, self._actions = seed, False, []
 
     def step(self, action: np.ndarray) -> None:
-        self._reached = self.simulator.step(np.asarray(action, np.float64))[1]
+        self._actions.append(np.array(action, np.float64))
+        self._reached = self.simulator.step(self._actions[-1])[1]
 
-    def get_state(self) -> tuple[np.ndarray, bool]:
-        return self.simulator.physics(), self._reached
+    def get_state(self) -> PhysicsState:
+        return PhysicsState(self.simulator.physics(), len(self._actions))
 
-    def set_state(self, state: tuple[np.ndarray, bool]) -> None:
-        physics, self._reached = state
-        self.simulator.set_physics(physics)
+    def set_state(self, state: PhysicsState) -> None:
+        """Of this episode, an earlier one. The episode is begun again and its actions are repeated: the controllers of
+        some robots remember more than is in the physics."""
+        earlier = self._actions[: state.actions]
+        self.reset(self._seed)
+        for action in earlier:
+            self.step(action)
 
     def render(self) -> np.ndarray:
         return self.simulator.frame()

@@ -1,4 +1,5 @@
-"""A physics simulator that anyone has: a hand on a line; its drawer is open once the hand is far enough to the right."""
+"""A physics simulator that anyone has: a hand on a line; its drawer is open once the hand is far enough to the right.
+Like a real one it remembers something that is not in its physics: how many steps it took, which the last colour shows."""
 
 from __future__ import annotations
 
@@ -17,6 +18,7 @@ class Points:
 
     def start(self, env: str, seed: int) -> None:
         self.x = np.random.default_rng([len(env), seed]).uniform(0, 0.1, len(self.low))
+        self.steps = 0
 
     def rest(self) -> np.ndarray:
         return np.zeros_like(self.low)
@@ -26,6 +28,7 @@ class Points:
 
     def step(self, action: np.ndarray) -> tuple[float, bool]:
         self.x = self.x + 0.01 * np.clip(action, self.low, self.high)
+        self.steps += 1
         return 0.0, bool(self.x[0] > OPEN)
 
     def physics(self) -> np.ndarray:
@@ -35,7 +38,9 @@ class Points:
         self.x = values.copy()
 
     def frame(self) -> np.ndarray:
-        return np.full((self.size, self.size, 3), np.clip(128 + 200 * self.x[0], 0, 255), np.uint8)
+        frame = np.full((self.size, self.size, 3), np.clip(128 + 200 * self.x[0], 0, 255), np.uint8)
+        frame[..., 2] = self.steps % 256
+        return frame
 
     def close(self) -> None:
         self.size = 0
