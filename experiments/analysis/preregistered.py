@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -84,10 +85,14 @@ def read_expected(path: Path) -> list[Expected]:
 def what_came(expected: Sequence[Expected], rows: Sequence[Row]) -> list[Came]:
     """Of every expectation of an axis that `rows` have; other axes may come. Raises ConfigError for an axis, a curve, a
     point or a metric that is not there."""
+    points: dict[str, list[Row]] = defaultdict(list)  # once, of a hundred thousand rows
+    for row in rows:
+        if row.role == POINT and not row.of_robot:
+            points[row.sweep].append(row)
     known = {*AXES, *(r.sweep for r in rows)}
     for e in expected:
         require(e.sweep in known, f"{FILE}: no axis {e.sweep!r}; known: {', '.join(sorted(known))}")
-    return [_came(e, own) for e in expected if (own := [r for r in rows if (r.sweep, r.role) == (e.sweep, POINT)])]
+    return [_came(e, points[e.sweep]) for e in expected if e.sweep in points]
 
 
 def _came(e: Expected, rows: Sequence[Row]) -> Came:

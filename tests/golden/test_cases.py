@@ -15,12 +15,14 @@ HERE = Path(__file__).parent
 CASES = sorted(path.name for path in HERE.iterdir() if (path / "README.md").exists())
 
 
-VARIANTS = {"08d_mar_joint_actions", "08e_mar_mup_unit_width"}
-"""Cases that say little beyond others (of 08d: 08c its sampler, 07 its joint actions); `make test-slow` has them."""
+VARIANTS = {
+    "01b_discrete_concat_modulate_mup", "08d_mar_joint_actions", "08e_mar_mup_unit_width", "10b_vae_decoder_32groups",
+}  # fmt: skip
+"""Cases that say little beyond others (of 01b: 01d has loss and gradients of its logits; of 08d: 08c its sampler, 07 its
+joint actions; of 10b: 10a); `make test-slow` has them."""
 LARGE = {
-    "01b_discrete_concat_modulate_mup", "01d_discrete_loss_mup", "05_discrete_generation", "07_discrete_joint_actions",
-    "08b_mar_loss", "08c_mar_generation", "09b_tokenizer_five_levels", "10a_vae", "10b_vae_decoder_32groups",
-    "13_discrete_train_steps",
+    "01d_discrete_loss_mup", "05_discrete_generation", "07_discrete_joint_actions", "08b_mar_loss", "08c_mar_generation",
+    "09b_tokenizer_five_levels", "10a_vae", "13_discrete_train_steps",
 }  # fmt: skip
 """Cases that take three times as long when compiled as users compile; so compiled, `make test-slow` has them."""
 

@@ -55,7 +55,8 @@ def jitted_rollout(declared, batch, actions, keys, decode, prompt, **options):
     )
 
 
-def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None, frames: int | None = None):
+def rolled_out(config, decode: DecodeConfig, prompt: int, hidden=None, frames: int | None = None):
+    """(frames under two sequences of actions, by one rollout with its cache; the same without it, under the k-th)."""
     declared, params = lively_params(config, scale=0.05 if config.diffusion else 0.2)
     longer = replace(config, frames=frames or config.frames)
     batch = random_batch(0, longer, 4)
@@ -68,9 +69,13 @@ def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None, f
     args = (batch["embodiment"], keys, decode)
     cached = jax.jit(lambda p: rollout(declared.merge(p), start, both, *args, hidden_BT=hidden))
     naive = jax.jit(lambda p, a: rollout_naive(declared.merge(p), start, a, *args, hidden_BT=hidden))
-    got = np.asarray(cached(params))
-    for index, actions in enumerate((batch["actions"], other)):
-        want = naive(params, actions)
+    return np.asarray(cached(params)), lambda k: naive(params, both[:, k])
+
+
+def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None, frames: int | None = None):
+    got, naive = rolled_out(config, decode, prompt, hidden, frames)
+    for index in range(2):
+        want = naive(index)
         if config.diffusion:
             np.testing.assert_allclose(got[:, index], want, atol=2e-3)
         else:
@@ -98,13 +103,25 @@ def test_the_cached_rollout_equals_recomputing_the_window(
     assert got.max() < config.vocab_size
 
 
-@pytest.mark.parametrize("conditioning", ["cross_attention", *some(["modulate", "concat", "add"])])
+def test_the_cached_rollout_is_exact_with_everything_that_the_release_lacks_at_once():
+    """Past the window, and drawn with the same random numbers; and each counts."""
+    config = shallow_config(conditioning="cross_attention", recall=True, chain_factors=True, frames=4)
+    decode = DecodeConfig(2, temperature=1.0)
+    got = compare_with_naive(config, decode, 2, frames=6)
+    assert (got[:, 0] != got[:, 1]).any()
+    for change in ({"recall": False}, {"chain_factors": False}):
+        assert (got != rolled_out(replace(config, **change), decode, 2, frames=6)[0]).any(), change
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("conditioning", ["cross_attention", "modulate", "concat", "add"])
 def test_the_cached_rollout_is_exact_under_every_conditioning(conditioning: str):
     got = compare_with_naive(model_config(conditioning=conditioning), DecodeConfig(2), 2)
     assert (got[:, 0] != got[:, 1]).any()
 
 
-@pytest.mark.parametrize("diffusion", [None, *some([DIFFUSION])], ids=["ids", "latents"])
+@pytest.mark.slow
+@pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["ids", "latents"])
 def test_the_cached_rollout_is_exact_where_masked_tokens_recall_the_frame_before(diffusion):
     """Past the window too; and what is recalled counts."""
     config = shallow_config(recall=True, diffusion=diffusion, frames=4)
@@ -114,6 +131,7 @@ def test_the_cached_rollout_is_exact_where_masked_tokens_recall_the_frame_before
     assert (got != forgetful).any()
 
 
+@pytest.mark.slow
 def test_the_cached_rollout_is_exact_where_factors_are_chained():
     """Drawn, not the likeliest: with the same random numbers. And what is chosen of a factor counts for the next."""
     config = shallow_config(chain_factors=True, frames=4)

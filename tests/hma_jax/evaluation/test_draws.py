@@ -32,7 +32,7 @@ def test_random_actions_follow_the_robot_s_statistics():
 
 
 @pytest.mark.exact
-@pytest.mark.parametrize("width", [1, pytest.param(15, marks=pytest.mark.slow), 300])
+@pytest.mark.parametrize("width", [*(pytest.param(n, marks=pytest.mark.slow) for n in (1, 15)), 300])
 def test_random_actions_depend_on_neither_the_table_nor_the_batch(width):
     want = draw(TABLE, BASE, range(8))
     newcomer = Embodiment("newcomer", width, 1, (0.0,) * width, (1.0,) * width)

@@ -12,7 +12,6 @@ from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.generation import rollout
 from hma_jax.simulator import Simulator, Start
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
-from hma_jax.training.runs import Run
 from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, actions, parts, simulator, start
 from tests.tiny import TABLE
 
@@ -251,13 +250,13 @@ def test_a_model_trained_without_actions_goes_on_alike_under_all_of_them():
     first, plans = start(1, 2), (chunks_of(1, FRAMES), chunks_of(1, FRAMES, seed=10))
     other = Start(first.robot, first.images, -first.actions)
 
-    def images(run: Run) -> np.ndarray:
-        sim = Simulator(replace(model, run=run), tokenizer, decode=DECODE, episodes=2)
+    def images(sim: Simulator) -> np.ndarray:
         sim.reset([first, other], seeds=[1, 1])
         for t in range(FRAMES):
             seen = sim.step([plan[t] for plan in plans])
         return seen
 
-    blind, sighted = images(passive), images(model.run)
+    blind = images(Simulator(replace(model, run=passive), tokenizer, decode=DECODE, episodes=2))
+    sighted = images(simulator(episodes=2))
     np.testing.assert_array_equal(blind[0], blind[1])
     assert (sighted[0] != sighted[1]).any()
