@@ -5,7 +5,7 @@ Question: held-out nats, PSNR and what actions decide, of the reference and with
     change alone, and the study's long runs, are of the first seed. The rungs have `designs.ablation_steps`;
     for the study's own number of steps all are trained too, and both changes with factors that are chained
     (`model.chain_factors`) and with tokens that count thrice, or tenfold, where they change
-    (`train.masking.change_weight`); long runs have both, and both with changes thrice.
+    (`train.masking.change_weight`); long runs have both, the shortest of them also with changes thrice.
 Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
 Cost: four training runs, two of them with longer branches, per seed of `ablation_seeds`, one for each change alone and
@@ -82,7 +82,8 @@ def plan(study: Study) -> Sweep:
     labels = list(sweep.labels)
     longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED, WEIGHED)]
     longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, TENFOLD)]
-    longer += [(name, steps, (first,)) for name in (BEST, WEIGHED) for steps in study.designs.long]
+    longer += [(BEST, steps, (first,)) for steps in study.designs.long]
+    longer += [(WEIGHED, steps, (first,)) for steps in study.designs.long[:1]]
     for name, steps, chosen in longer:
         for seed in chosen:
             trial = replace(reference_trial(study, seed, steps), measure_untrained=False)
