@@ -85,7 +85,10 @@ def find_obstacle(specs: Iterable[SimSpec]) -> str:
     missing = missing_packages(specs)
     if missing:
         return f"simulators not installed ({', '.join(missing)}): {EXTRA} and, to draw without a screen, {APT}"
-    backend = gl_backend()
+    try:
+        backend = gl_backend()
+    except ConfigError as error:
+        return str(error)
     if ctypes.util.find_library(GL[backend]) is None:
         other = f"(or set MUJOCO_GL to the other of {' and '.join(GL)})"
         return f"the simulators cannot draw: no {GL[backend]} library on this machine; {APT} {other}"

@@ -110,6 +110,9 @@ def test_a_robot_can_be_simulated_where_packages_a_library_and_the_process_allow
     with monkeypatch.context() as beside_tensorflow:
         beside_tensorflow.setitem(packages.sys.modules, "tensorflow", object())
         assert not can_simulate(robot)
+    with monkeypatch.context() as with_a_screen:
+        with_a_screen.setenv("MUJOCO_GL", "glfw")
+        assert not can_simulate(robot)
     monkeypatch.setattr(packages.ctypes.util, "find_library", lambda name: None)
     assert not can_simulate(robot)
 
