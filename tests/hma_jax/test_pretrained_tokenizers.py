@@ -138,7 +138,7 @@ def test_a_configuration_that_cannot_work_is_refused(make_config, message):
 # --- Images that are not square ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", CONFIGS)
+@pytest.mark.parametrize("kind", [pytest.param(k, marks=[pytest.mark.slow] * (k == "svd-vae")) for k in CONFIGS])
 def test_images_need_not_be_square(kind, tmp_path):
     """Rows and columns are not taken for each other: not going in, not coming out, not on disk."""
     config = replace(CONFIGS[kind], image_size=(12, 20))

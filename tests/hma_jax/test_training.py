@@ -60,6 +60,7 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.mark.exact
+@pytest.mark.slow  # test_kill has the harder end
 def test_a_run_that_broke_and_resumed_is_byte_equal_to_one_that_did_not(tmp_path: Path, unbroken):
     run_dir, whole = unbroken
     with pytest.raises(OSError):

@@ -50,9 +50,8 @@ def test_a_block_keeps_what_its_policy_says(remat: str, widths: float):
     assert widths_kept(remat) == pytest.approx(widths, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    "layers", [pytest.param(2, marks=pytest.mark.slow), 5], ids=["written out", "scanned"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("layers", [2, 5], ids=["written out", "scanned"])
 def test_gradients_are_the_same_under_every_policy_and_the_more_is_kept_the_more_memory(layers: int):
     config = model_config(width=16, layers=layers, tokens=64, action_tokens=4)
     batch = random_batch(0, config, 2)

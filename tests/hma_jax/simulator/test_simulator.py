@@ -125,6 +125,7 @@ def test_what_was_taken_back_comes_again_under_the_same_actions(back: int):
     np.testing.assert_array_equal(sim.images[0], first)
 
 
+@pytest.mark.slow
 def test_streaming_goes_on_in_place_after_it_was_taken_back():
     sim, plan = simulator(decode=STREAMING), chunks_of(0, 14)
     sim.reset(start(0, 1))
