@@ -195,13 +195,13 @@ PLAY = replace(
     tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=24, factors=6, channels=128),
     tokenizer_train=TokenizerTrainConfig(steps=3000, batch=32),
     rate=None,  # 4 to 6 Hz: half as far from frame to frame as at 2 Hz
-    model=replace(CPU.model, width=64, layers=3, heads=4, factors=6, mup=MupConfig(base_width=48)),
+    model=replace(CPU.model, width=64, layers=3, heads=4, factors=6, recall=True, mup=MupConfig(base_width=48)),
     train=replace(
         CPU.train,
-        steps=23_000,
+        steps=16_000,
         ema_decay=0.999,
-        masking=replace(CPU.train.masking, teacher_forcing=True),
-        optimizer=replace(CPU.train.optimizer, warmup_steps=100, decay_fraction=0.25),
+        masking=replace(CPU.train.masking, teacher_forcing=True, change_weight=3.0),
+        optimizer=replace(CPU.train.optimizer, warmup_steps=100, decay_fraction=0.25, matrices="muon"),
     ),
     dataset_counts=(8,),
     widths=(64,),

@@ -31,7 +31,7 @@ from PIL import Image
 
 from data_pipelines.publishing.files import publish, write_file
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
-from experiments.applications import SHIPPED
+from experiments.applications import DRIVEN
 from experiments.applications.simulators import held_out, load_simulator, true_simulator
 from experiments.boundary import guarded
 from experiments.running.machine import describe_machine
@@ -48,7 +48,7 @@ from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import write_list
 from hma_jax.training.runs import describe_run, load_run
 
-OUT = SHIPPED
+OUT = DRIVEN
 REPORT, CLIP = "report.json", "clip.gif"
 LARGEST = 10 * 2**20
 """Bytes of everything that is shipped."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.applications import SHIPPED
+from experiments.applications import DRIVEN
 from experiments.progress import console
 from experiments.setting import UNSET
 from hma_jax.config import ConfigError, ExecutionConfig, require
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hma_jax.simulator.robots import Robot
 
 def play(
-    run: Annotated[Positional[Path], arg(metavar="RUN")] = SHIPPED,
+    run: Annotated[Positional[Path], arg(metavar="RUN")] = DRIVEN,
     host: str = "127.0.0.1",
     port: int = 8765,
     visitors: int = 4,
@@ -34,7 +34,7 @@ def play(
     Needs the extra `play`. Runs until it is interrupted. docs/simulator.md describes the page.
 
     Args:
-        run: Directory of a training run; without it the one in experiments/results/simulator, where it was made.
+        run: Directory of a training run; without it the one in experiments/results/simulator_weighed.
         host: Address to listen at. 127.0.0.1 is this computer alone; 0.0.0.0 lets everybody in who can reach it.
         port: Of the address; 0 takes a free one.
         visitors: Who can drive at once, in one batch.
@@ -56,8 +56,8 @@ def play(
     from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
     require(
-        run != SHIPPED or run.is_dir(),
-        f"there is no model at {SHIPPED}: say which run to serve, or make one with "
+        run != DRIVEN or run.is_dir(),
+        f"there is no model at {DRIVEN}: say which run to serve, or make one with "
         "`hma train --preset play --out runs/play` and `hma play runs/play/model`",
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")

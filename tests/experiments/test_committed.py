@@ -11,10 +11,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
+from experiments.applications import DRIVEN
+from experiments.presets import PRESETS
 from experiments.report.draw import draw_again
 from experiments.rows import read_rows
 from experiments.running.ledger import FINISHED
 from experiments.running.workspace import Workspace
+from hma_jax.training.runs import load_run
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
 STUDIES = sorted(path.parent.name for path in RESULTS.glob("*/study.json"))
@@ -60,3 +63,8 @@ def test_what_is_kept_is_drawn_again(name, tmp_path):
         assert same or path.suffix == ".parquet" and pq.read_table(path).equals(pq.read_table(before)), path.name
     page = workspace.report.read_text()
     assert not kept or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in page, "see its page"
+
+
+def test_the_model_that_is_driven_was_trained_as_its_preset_says():
+    run = load_run(RESULTS.parents[1] / DRIVEN)
+    assert (run.model, run.train) == (PRESETS["play"].model, PRESETS["play"].train)
