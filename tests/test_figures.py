@@ -113,10 +113,27 @@ def test_policies_and_plans_in_its_predecessor_are_as_readme_says():
         r = judged["agreement"]["learned model"]["policies and starts"]["pearson"]
         assert len(judged["policies"]) == policies
         assert f"r = {r['mean']:.2f} ({r['low']:.2f} to {r['high']:.2f})" in text
-    with open(ROOT / "experiments/results/planning/summary.csv") as file:
-        success = {row["way"]: float(row["mean"]) for row in csv.DictReader(file)}
+    success = {way: float(row["mean"]) for way, row in planned("planning").items()}
     plans, shooting = success["CEM in the model"], success["random shooting in the model"]
     assert f"reach {100 * plans:.0f} % of marks, random shooting {100 * shooting:.0f} %" in text
+
+
+def test_plans_in_either_model_are_as_their_page_says():
+    text = " ".join((ROOT / "docs" / "planning.md").read_text().split())
+    assert (ROOT / "experiments/results/planning/table.md").read_text().strip() in (ROOT / "docs/planning.md").read_text()
+    first, served = planned("planning"), planned("planning_weighed")
+    assert all(first[way] == served[way] for way in first if not way.endswith("in the model"))
+    for way in ("CEM", "MPPI", "random shooting"):
+        row = served[f"{way} in the model"]
+        mean, low, high = (float(row[key]) for key in ("mean", "low", "high"))
+        assert f"{mean:.2f} ({low:.2f} to {high:.2f}) for {way}" in text
+
+
+def planned(name: str) -> dict[str, dict[str, str]]:
+    """Rows of a committed summary by way of acting, without how long a plan took."""
+    with (ROOT / "experiments" / "results" / name / "summary.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {row["way"]: {key: row[key] for key in ("mean", "low", "high")} for row in rows}
 
 
 def test_readme_is_read_in_a_few_minutes():
