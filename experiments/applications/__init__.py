@@ -3,7 +3,7 @@
 from pathlib import Path
 
 SHIPPED = Path("experiments/results/simulator")
-"""The model of this repository that was judged, planned in and generated from; used where no other run is named."""
+"""The first model of this repository, used where no other run is named (docs/simulator.md)."""
 
 DRIVEN = Path("experiments/results/simulator_weighed")
 """The one that `hma play` serves, in which bodies and objects hold longer (docs/endurance.md)."""

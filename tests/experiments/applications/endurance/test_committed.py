@@ -130,7 +130,7 @@ def test_ten_minutes_are_as_the_page_says():
     variance = sum(mean("variance", minute) for minute in range(3, 11)) / 8
     assert f"variance ({variance:.2f} of the truth's)" in page
     colours = mean("histogram", 1), mean("histogram", 10)
-    assert "({:.2f} of the histogram differs, then {:.2f})".format(*colours) in page
+    assert "({:.2f} of the histogram differs in the first minute, {:.2f} in the last)".format(*colours) in page
     before = percent("tool_found", 10, first), percent("object_found", 10, first)
     assert f"where it was {before[0]}, objects in {objects[2]}, where it was {before[1]}" in page
     arm = [each["arm_sand", 10]["follows"] for each in (mine, first)]
@@ -141,6 +141,9 @@ def test_ten_minutes_are_as_the_page_says():
     assert f"{places[0]} and {places[1]} % of the last minute of the two grippers" in page
     pusher = mine["pusher_sand", 10]
     assert f"follows by {pusher['follows']:.2f} and stands {pusher['tool_px']:.0f} pixels beside the truth" in page
+    for measure, words in (("psnr", "PSNR {:.1f} ± {:.1f} dB, follows"), ("follows", "follows {:.2f} ± {:.2f})")):
+        apart = [{**row, measure: row[measure] - mine[at[0], 2][measure]} for at, row in mine.items() if at[1] == 10]
+        assert words.format(*over_robots(apart, measure)[:2]) in page, measure
     for measure, words in (("follows", "follows by {:.2f} ± {:.2f} more"), ("psnr", "PSNR is level ({:.1f} ± {:.1f} dB)")):
         apart = [{**row, measure: row[measure] - first[place][measure]} for place, row in mine.items() if place[1] > 1]
         assert words.format(*over_robots(apart, measure)[:2]) in page, measure
