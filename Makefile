@@ -13,6 +13,9 @@ ifneq ($(EXTRA),$(filter cuda tpu,$(EXTRA)))
 $(error EXTRA is '$(EXTRA)': give cuda or tpu, or leave it out for the processor)
 endif
 
+# What is imported is compiled once and kept in .venv: hundreds of processes of the tests would each compile it again.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help study play test test-slow clean
 
 help:
