@@ -13,6 +13,7 @@ import pytest
 
 from experiments.applications import DRIVEN
 from experiments.presets import PRESETS
+from experiments.report import draw, page
 from experiments.report.draw import draw_again
 from experiments.rows import read_rows
 from experiments.running.ledger import FINISHED
@@ -21,6 +22,7 @@ from hma_jax.training.runs import load_run
 
 RESULTS = Path(__file__).parents[2] / "experiments" / "results"
 STUDIES = sorted(path.parent.name for path in RESULTS.glob("*/study.json"))
+LARGEST = "cpu-full"
 SUMS = RESULTS / "SHA256SUMS"
 """Of tables whose trials are not kept; made again, when a study is, by `sha256sum */*.csv` where they lie."""
 
@@ -45,24 +47,38 @@ def test_every_trial_of_a_table_is_finished_and_judged(name):
     assert len({r.manifest for r in rows}) == 1, "judged on different windows"
 
 
-@pytest.mark.parametrize("name", STUDIES)
-def test_what_is_kept_is_drawn_again(name, tmp_path):
-    """Figures from a table; where trials are kept, tables too, byte for byte, and the page's checks of them hold."""
-    shutil.copytree(RESULTS / name, tmp_path / name)
-    workspace = Workspace(tmp_path / name)
-    figures, kept = {p.name for p in workspace.figures.iterdir()}, workspace.trials.exists()
-    tables = [*workspace.root.glob("*.csv"), *workspace.root.glob("*.parquet")]
+def computed_again(name: str, at: Path) -> Workspace:
+    """The study `name`, copied, with nothing that can be computed but what is computed again; its tables are as they were."""
+    shutil.copytree(RESULTS / name, at / name)
+    workspace = Workspace(at / name)
+    tables = [*workspace.root.glob("*.csv"), *workspace.root.glob("*.parquet")] if workspace.trials.exists() else []
     shutil.rmtree(workspace.figures)
-    for path in tables if kept else ():
+    for path in tables:
         path.unlink()
     draw_again(workspace.root)
-    assert {p.name for p in workspace.figures.iterdir()} >= figures
     for path in tables:
         before = RESULTS / name / path.name
         same = path.read_bytes() == before.read_bytes()
         assert same or path.suffix == ".parquet" and pq.read_table(path).equals(pq.read_table(before)), path.name
-    page = workspace.report.read_text()
-    assert not kept or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in page, "see its page"
+    return workspace
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n == LARGEST)) for n in STUDIES])
+def test_what_is_kept_is_drawn_again(name, tmp_path):
+    """Figures from a table; where trials are kept, tables too, byte for byte, and the page's checks of them hold."""
+    workspace = computed_again(name, tmp_path)
+    assert {p.name for p in workspace.figures.iterdir()} >= {p.name for p in Workspace(RESULTS / name).figures.iterdir()}
+    text = workspace.report.read_text()
+    assert not workspace.trials.exists() or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in text, "see it"
+
+
+def test_the_tables_of_the_largest_study_are_computed_again(tmp_path, monkeypatch):
+    """Its figures and its page are drawn by `make test-slow`."""
+    checked = []
+    monkeypatch.setattr(draw, "draw_figures", lambda *_: None)
+    monkeypatch.setattr(page, "write_report", lambda *given: checked.append(given[-1]))
+    computed_again(LARGEST, tmp_path)
+    assert checked[0].verdict != "bad", checked[0].text
 
 
 def test_the_model_that_is_driven_was_trained_as_its_preset_says():
