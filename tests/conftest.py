@@ -41,6 +41,14 @@ def pytest_report_header() -> str:
     return f"XLA_FLAGS: {os.environ['XLA_FLAGS'] or 'none, as users compile'}"
 
 
+LONG = ("tests/integration/test_kill.py", "tests/experiments/test_whole_study.py")
+"""They start processes one after another; begun last, they would be waited for alone."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: not item.nodeid.startswith(LONG))
+
+
 KEPT = {
     "hma_jax.model.hma": "declare_model",
     "hma_jax.tokenizers.autoencoder": "declare_tokenizer",
