@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-SHIPPED = Path("experiments/results/simulator")
+FIRST = Path("experiments/results/simulator")
 """The first model of this repository, used where no other run is named (docs/simulator.md)."""
 
 DRIVEN = Path("experiments/results/simulator_weighed")

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from data_pipelines.publishing.files import write_file
-from experiments.applications import SHIPPED
+from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.made_with import claim
 from experiments.applications.policies.acting import scale_of
@@ -215,7 +215,7 @@ def write_results(trials: Mapping[str, list[tuple[bool, float]]], out: Path) -> 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
+    parser.add_argument("run", type=Path, nargs="?", default=FIRST, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--steps", type=int, default=Settings.steps, help="of training, of every policy")
     parser.add_argument("--starts", type=int, default=Settings.starts)

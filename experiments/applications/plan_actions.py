@@ -35,7 +35,7 @@ from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.spec import EmbodimentSpec
 from data_pipelines.suite.world import World
 from experiments.analysis.intervals import Interval
-from experiments.applications import SHIPPED
+from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.made_with import claim
 from experiments.applications.planning.cem import plan_cem
@@ -217,7 +217,7 @@ def draw(found: Sequence[tuple[str, Interval, float]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
+    parser.add_argument("run", type=Path, nargs="?", default=FIRST, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--robot", default=Settings.robot)
     parser.add_argument("--task", default=Settings.task, help="reach, or own: what the robot's own recordings do")

@@ -34,7 +34,7 @@ import numpy as np
 
 from data_pipelines.publishing.files import write_file
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
-from experiments.applications import SHIPPED
+from experiments.applications import FIRST
 from experiments.applications.generating.conditions import (
     ALL,
     BLIND,
@@ -235,7 +235,7 @@ def find_blind(run: Path, robot: Robot) -> Simulator:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("run", type=Path, nargs="?", default=SHIPPED, help="directory of a training run")
+    parser.add_argument("run", type=Path, nargs="?", default=FIRST, help="directory of a training run")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--actions", metavar="DATASET", help="recordings, as `hma generate` takes them")
     parser.add_argument("--split", help="of DATASET, that policies are trained on (train)")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.generate import generate_suite
-from experiments.applications import SHIPPED, plan_actions, synthetic
+from experiments.applications import FIRST, plan_actions, synthetic
 from experiments.applications.generating import conditions
 from experiments.applications.generating.conditions import (
     ALL,
@@ -203,8 +203,8 @@ def test_an_episode_ends_when_nothing_can_change_its_outcome():
 
 def from_settings(kind: type, path: Path):
     values = json.loads(path.read_text())
-    assert values.pop("run") == SHIPPED.name
-    assert values.pop("weights") == hash_of(load_model(SHIPPED).params)
+    assert values.pop("run") == FIRST.name
+    assert values.pop("weights") == hash_of(load_model(FIRST).params)
     assert set(values) == {f.name for f in fields(kind)}
     return from_dict(kind, values)
 
