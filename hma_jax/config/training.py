@@ -48,8 +48,10 @@ class MaskingConfig:
     teacher_forcing: bool = False
     # With teacher forcing, of discrete tokens: past frames that the model drew itself, up to this share of them
     # (`objective.own_past`). DIFFERS: the release corrupts the past with random tokens alone (`max_corrupt_rate`, which
-    # does so here too). A step passes over every frame three times.
+    # does so here too), and in how many rounds, each after what the one before drew. A step passes over every frame
+    # once more for each.
     own_past: float = 0.0
+    own_past_rounds: int = 1
     # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
     # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
     change_weight: float = 1.0
@@ -66,6 +68,7 @@ class MaskingConfig:
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
+        require(self.own_past_rounds >= 1, f"masking.own_past_rounds must be at least 1, got {self.own_past_rounds}")
         require(self.change_weight > 0, f"masking.change_weight must be positive, got {self.change_weight}")
         require(
             self.change_weight == 1 or self.predicts_frames,

@@ -65,6 +65,7 @@ def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True) -> 
 
 
 def train_flops_per_step(config: ModelConfig, table: EmbodimentTable, train: TrainConfig) -> float:
-    """Forward and backward of the global batch: three times the forward pass, and once more to draw an `own_past`."""
-    passes = 4.0 if train.masking.own_past else 3.0
+    """Forward and backward of the global batch: three times the forward pass, and once more for each round of an
+    `own_past`."""
+    passes = 3.0 + (train.masking.own_past_rounds if train.masking.own_past else 0)
     return passes * train.batch * forward_flops_per_window(config, table, train.masking.teacher_forcing)

@@ -112,7 +112,7 @@ def masked_loss(
     if masking.teacher_forcing:
         past = masked.inputs[:, :-1]
         if masking.own_past:
-            given = actions_BTU, embodiment_B, hidden, masking.own_past, key_B, slice_B
+            given = actions_BTU, embodiment_B, hidden, masking.own_past, masking.own_past_rounds, key_B, slice_B
             past = draw_own_past(model, past, *given)
         inputs = past, masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
         out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)

@@ -1,8 +1,9 @@
 """A past that the model made itself, for training: generated frames follow generated ones, which err.
 
-Some past frames of a teacher-forced window are drawn from what the model says of them after their true past, and the
-true frames that follow are still the targets: what errs is to be mended, not gone on with. One pass more, without
-gradient; errors of a single frame, not those that a long rollout gathers.
+Some past frames of a teacher-forced window are drawn from what the model says of them after the past, and the
+true frames that follow are still the targets: what errs is to be mended, not gone on with. One round draws all of
+them at once after their true past: errors of a single frame. Each further round draws them again after what the round
+before drew, and so gathers the errors of one frame more, as a rollout does. A round is one pass without gradient.
 """
 
 from __future__ import annotations
@@ -23,24 +24,33 @@ def draw_own_past(
     embodiment_B: jax.Array,
     hidden_BT: jax.Array | None,
     greatest_share: float,
+    rounds: int,
     key_B: jax.Array,
     slice_B: jax.Array,
 ) -> jax.Array:
     """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `greatest_share` u, u uniform in
-    [0, 1) of each example, by ids drawn from the model's own distribution at temperature 1.
+    [0, 1) of each example, by ids drawn from the model's own distribution at temperature 1, in so many `rounds`.
 
     Needs the chunks that lead to them alone; for the meaning of the others see `objective.losses.masked_loss`.
     """
-    masked = jnp.ones(before.shape, bool)
-    said = look_beside(model, before, before, masked, actions_BTU, embodiment_B, hidden_BT, slice_B=slice_B).said
-    said, head = jax.lax.stop_gradient(said[:, :-1]), model.frame_head  # of frames 1 .. T-2; nothing follows the last one
+    masked, head = jnp.ones(before.shape, bool), model.frame_head
 
-    def draw(key: jax.Array, said_TS: jax.Array, true_TS: jax.Array) -> jax.Array:
+    def choose_frames(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(a key for the ids, bool [T - 2]: the frames from the second on that are the model's)."""
         ids_key, share_key, frame_key = jax.random.split(key, 3)
-        digits, _ = head.factors_in_turn(said_TS, drawing(ids_key, head.shape(said_TS)))
-        ids = compose(digits, model.config.factor_vocab)
         share = greatest_share * jax.random.uniform(share_key)
-        own_T = jax.random.uniform(frame_key, (len(ids),)) < share
-        return jnp.where(own_T[:, None], ids.astype(true_TS.dtype), true_TS)
+        return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,)) < share
 
-    return jnp.concatenate([before[:, :1], jax.vmap(draw)(key_B, said, before[:, 1:])], axis=1)
+    def draw(key: jax.Array, said_TS: jax.Array) -> jax.Array:
+        digits, _ = head.factors_in_turn(said_TS, drawing(key, head.shape(said_TS)))
+        return compose(digits, model.config.factor_vocab).astype(before.dtype)
+
+    ids_key_B, own_BT = jax.vmap(choose_frames)(key_B)
+    past = before
+    for number in range(rounds):
+        said = look_beside(model, past, past, masked, actions_BTU, embodiment_B, hidden_BT, slice_B=slice_B).said
+        said = jax.lax.stop_gradient(said[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
+        keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B
+        own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, said), before[:, 1:])
+        past = jnp.concatenate([before[:, :1], own], axis=1)
+    return past

@@ -8,8 +8,9 @@ import pytest
 from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.generation.teacher import next_frame_outputs
 from hma_jax.model.beside import look_beside
-from hma_jax.model.frames import factorise
-from hma_jax.objective import losses
+from hma_jax.model.frames import compose, factorise
+from hma_jax.model.readout import likeliest
+from hma_jax.objective import losses, own_past
 from hma_jax.objective.losses import noise_keys
 from hma_jax.objective.masking import mask_batch
 from hma_jax.objective.own_past import draw_own_past
@@ -26,7 +27,7 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
     one = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[:1], rows, 0), random_batch(0, config, 1))
     before, given = one["tokens"][:, :-1], (one["actions"], one["embodiment"])
     keys = noise_keys(jax.random.key(0), rows)
-    draw = jax.jit(lambda share: draw_own_past(model, before, *given, None, share, keys, given[1]))
+    draw = jax.jit(lambda share: draw_own_past(model, before, *given, None, share, 1, keys, given[1]))
     drawn = np.asarray(draw(1.0))
     assert (drawn[:, 0] == before[:, 0]).all()
     replaced = (drawn != np.asarray(before)).any(-1)[:, 1:]
@@ -56,6 +57,32 @@ def test_frames_are_replaced_by_what_the_model_says_of_them_and_the_first_never(
     assert shown[0] is own and shown[1] is not own
 
 
+def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(monkeypatch):
+    """Where the likeliest ids are taken, the first r frames of r rounds each are what the model says after its own."""
+    monkeypatch.setattr(own_past, "drawing", lambda *_: likeliest)
+    config = shallow_config(action_heads=False)
+    declared, params = lively_params(config, scale=0.5)
+    model, rows = declared.merge(params), 8
+    batch = random_batch(0, config, rows)
+    before, given = jnp.asarray(batch["tokens"])[:, :-1], (batch["actions"], batch["embodiment"])
+    every_frame, frames = 1e9, before.shape[1]
+
+    def own_share(rounds: int) -> np.ndarray:
+        """Of each frame, the share of ids that the model says after the frames before it in what is drawn."""
+        past = draw_own_past(model, before, *given, None, every_frame, rounds, noise_keys(jax.random.key(0), rows), given[1])
+        whole = jnp.concatenate([past, past[:, -1:]], axis=1)
+        digits, _ = model.frame_head.factors_in_turn(next_frame_outputs(model, whole, *given), likeliest)
+        said = compose(digits, config.factor_vocab)[:, : frames - 1]
+        return np.asarray((said == past[:, 1:]).mean((0, 2)))
+
+    shares = [own_share(rounds) for rounds in range(1, frames)]
+    for rounds, share in enumerate(shares, start=1):
+        assert (share[:rounds] == 1).all()
+    assert shares[0][1] < 0.9
+
+
 def test_it_needs_a_past_that_is_shown():
     with pytest.raises(ConfigError, match="own_past replaces frames of the past .*teacher_forcing"):
         MaskingConfig(own_past=0.5)
+    with pytest.raises(ConfigError, match="own_past_rounds must be at least 1, got 0"):
+        MaskingConfig(own_past_rounds=0)
