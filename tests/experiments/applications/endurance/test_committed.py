@@ -36,7 +36,7 @@ def table(header: str) -> dict[str, list[str]]:
 def test_the_page_shows_what_was_measured():
     ten, unlike = (read_rows(RESULTS / name) for name in ("endurance.csv", "unlike.csv"))
     tried = [row for name in ("variants.csv", "own_past.csv") for row in read_rows(RESULTS / name)]
-    trained = read_rows(RESULTS / "chained.csv") + read_rows(RESULTS / "weighed.csv")
+    trained = rows_of_trained()
     shown = {
         "| minute |": lambda label: [row for row in ten if row["part"] == float(label)],
         "| variant, seconds |": lambda label: [row for row in tried if f"{row['variant']}, {_seconds(row)}" == label],
@@ -52,17 +52,22 @@ def test_the_page_shows_what_was_measured():
                 assert cell == ("" if robots < 2 else f"{mean:.{digits}f} ± {half:.{digits}f}"), (label, measure)
 
 
-def gains_beside_the_shipped(name: str, measure: str) -> tuple[float, float]:
+def rows_of_trained() -> list[dict]:
+    """Of all models that were watched for a minute from the same four starts of each robot."""
+    return [row for name in ("chained", "weighed", "long", "mended") for row in read_rows(RESULTS / f"{name}.csv")]
+
+
+def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, float]:
     """(mean, half its interval) over robots, from 20 to 60 s, from the same starts; of the variance, how much nearer it is."""
 
     def goodness(row: dict) -> float:
         return -abs(row[measure] - 1) if measure == "variance" else row[measure]
 
-    rows = read_rows(RESULTS / "chained.csv") + read_rows(RESULTS / "weighed.csv")
+    rows = rows_of_trained()
     cells = {(row["variant"], row["robot"], row["start"], row["part"]): row for row in rows if row["part"] > 1}
-    assert len(cells) == 3 * 8 * 4 * 2
+    assert len(cells) == 5 * 8 * 4 * 2
     apart = [
-        {**row, measure: goodness(row) - goodness(cells["shipped", *place])}
+        {**row, measure: goodness(row) - goodness(cells[beside, *place])}
         for (variant, *place), row in cells.items()
         if variant == name
     ]
@@ -72,7 +77,7 @@ def gains_beside_the_shipped(name: str, measure: str) -> tuple[float, float]:
 
 
 def test_chained_factors_keep_bodies_and_cost_decibels():
-    page, found = " ".join(PAGE.read_text().split()), partial(gains_beside_the_shipped, "chained")
+    page, found = " ".join(PAGE.read_text().split()), partial(gains, "chained")
     for measure, words in (
         ("tool_found", "in {:.2f} ± {:.2f} more of the frames"), ("object_found", "than chance allows ({:+.2f} ± {:.2f})"),
         ("variance", "nearer to the truth's by {:.2f} ± {:.2f}, at the edge of chance"),
@@ -84,7 +89,7 @@ def test_chained_factors_keep_bodies_and_cost_decibels():
 
 
 def test_changes_counted_thrice_keep_bodies_and_cost_nothing():
-    page, found = " ".join(PAGE.read_text().split()), partial(gains_beside_the_shipped, "weighed")
+    page, found = " ".join(PAGE.read_text().split()), partial(gains, "weighed")
     for measure, words in (
         ("tool_found", "tools are found in {:.2f} ± {:.2f} more of the frames"),
         ("variance", "nearer to the truth's by {:.2f} ± {:.2f}. Objects"),
@@ -92,6 +97,23 @@ def test_changes_counted_thrice_keep_bodies_and_cost_nothing():
         ("tool_close", "places (tools {:+.2f} ± {:.2f})"), ("psnr", "PSNR ({:.1f} ± {:.1f} dB)"),
     ):  # fmt: skip
         assert words.format(*found(measure)) in page, measure
+
+
+def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
+    page = " ".join(PAGE.read_text().split())
+    minute = [gains("long", measure, "weighed") for measure in ("object_found", "psnr")]
+    assert "robot, {:+.2f} ± {:.2f}; PSNR {:.1f} ± {:.1f} dB)".format(*minute[0], *minute[1]) in page
+    rounds = [gains("mended", measure, "long") for measure in ("object_found", "psnr", "follows")]
+    said = "found {:.2f} ± {:.2f} beside \"long\", PSNR {:.1f} ± {:.1f} dB, follows {:+.2f} ± {:.2f}."
+    assert said.format(*rounds[0], *rounds[1], *rounds[2]) in page
+    served, long = by_place("endurance.csv"), by_place("long_ten.csv")
+    assert len(served) == 8 * 10 and served.keys() == long.keys()
+    later = [(row, served[place]) for place, row in long.items() if row["part"] > 1]
+    last = over_robots([row for row in long.values() if row["part"] == 10], "object_found")[0]
+    ten = [gain(measure, later) for measure in ("object_found", "psnr", "follows")]
+    assert "found {:.2f} ± {:.2f} from the second minute on, in the last minute".format(*ten[0]) in page
+    said = "minute {:.0f} % of frames, PSNR {:.1f} ± {:.1f} dB, follows {:.2f} ± {:.2f}."
+    assert said.format(100 * last, *ten[1], *ten[2]) in page
 
 
 def by_place(name: str) -> dict[tuple, dict]:
