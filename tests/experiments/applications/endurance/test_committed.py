@@ -106,6 +106,18 @@ def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     rounds = [gains("mended", measure, "long") for measure in ("object_found", "psnr", "follows")]
     said = "found {:.2f} ± {:.2f} beside \"long\", PSNR {:.1f} ± {:.1f} dB, follows {:+.2f} ± {:.2f}."
     assert said.format(*rounds[0], *rounds[1], *rounds[2]) in page
+    tables = ("weighed", "long", "long_likeliest", "mended_likeliest")
+    weighed, drawn, long, mended = ({k: r for k, r in by_place(f"{n}.csv").items() if k[2] > 1} for n in tables)
+
+    def beside(measure: str, of: dict, other: dict) -> tuple[float, float]:
+        assert len(of) == 8 * 4 * 2 and of.keys() == other.keys()
+        return gain(measure, [(row, other[place]) for place, row in of.items()])
+
+    assert 'found {:+.2f} ± {:.2f} beside "long" at that'.format(*beside("object_found", mended, long)) in page
+    assert "sooner than when it draws ({:.2f} ± {:.2f})".format(*beside("object_found", long, drawn)) in page
+    three = [beside(measure, mended, weighed) for measure in ("object_found", "object_close", "psnr")]
+    said = "(objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, PSNR {:.1f} ± {:.1f} dB)"
+    assert said.format(abs(three[0][0]), three[0][1], *three[1], *three[2]) in page
     served, long = by_place("endurance.csv"), by_place("long_ten.csv")
     assert len(served) == 8 * 10 and served.keys() == long.keys()
     later = [(row, served[place]) for place, row in long.items() if row["part"] > 1]
