@@ -6,6 +6,7 @@ table alone cannot be: its files are held by their hashes.
 
 import hashlib
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -84,3 +85,11 @@ def test_the_tables_of_the_largest_study_are_computed_again(tmp_path, monkeypatc
 def test_the_model_that_is_driven_was_trained_as_its_preset_says():
     run = load_run(RESULTS.parents[1] / DRIVEN)
     assert (run.model, run.train) == (PRESETS["play"].model, PRESETS["play"].train)
+
+
+def test_the_model_with_a_past_of_its_own_was_trained_as_docs_say():
+    run, preset = load_run(RESULTS / "simulator_mended"), PRESETS["play"]
+    masking = replace(preset.train.masking, own_past=1.0, own_past_rounds=3)
+    optimizer = replace(preset.train.optimizer, learning_rate=2e-3, decay_fraction=0.5)
+    assert run.model == replace(preset.model, chain_factors=True)
+    assert run.train == replace(preset.train, steps=2500, masking=masking, optimizer=optimizer)
