@@ -128,6 +128,23 @@ def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     assert said.format(100 * last, *ten[1], *ten[2]) in page
 
 
+def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
+    page = " ".join(PAGE.read_text().split())
+    served, ten = by_place("endurance.csv"), by_place("mended_ten.csv")
+    assert len(served) == 8 * 10 and served.keys() == ten.keys()
+    last = over_robots([row for row in ten.values() if row["part"] == 10], "object_found")[0]
+    later = [(row, served[place]) for place, row in ten.items() if row["part"] > 1]
+    gained = gain("object_found", later)
+    assert f"found in {100 * last:.0f} % of the frames of the last minute, {gained[0]:.2f} ± {gained[1]:.2f} beside" in page
+    for robot, measure, words in (
+        ("pusher_sand", "object_found", '({:.0f} % of the last minute, "weighed" {:.0f})'),
+        ("picker_slate", "tool_found", 'its own body ({:.0f} %, "weighed" {:.0f})'),
+    ):
+        assert words.format(*(100 * of[robot, 0, 10][measure] for of in (ten, served))) in page
+    back = over_robots([row for row in read_rows(RESULTS / "mended_hidden.csv") if row["kind"] == "hidden"], "found")[0]
+    assert f"hidden comes back in {100 * back:.0f} % of the cases" in page
+
+
 def by_place(name: str) -> dict[tuple, dict]:
     """(robot, start, part) -> row of a committed table of one variant."""
     rows = read_rows(RESULTS / name)
