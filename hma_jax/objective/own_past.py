@@ -50,6 +50,7 @@ def draw_own_past(
     for number in range(rounds):
         said = look_beside(model, past, past, masked, actions_BTU, embodiment_B, hidden_BT, slice_B=slice_B).said
         said = jax.lax.stop_gradient(said[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
+        # The first round draws what it draws where it is the only one.
         keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B
         own = jnp.where(own_BT[..., None], jax.vmap(draw)(keys, said), before[:, 1:])
         past = jnp.concatenate([before[:, :1], own], axis=1)

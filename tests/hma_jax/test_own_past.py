@@ -65,7 +65,7 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
     model, rows = declared.merge(params), 8
     batch = random_batch(0, config, rows)
     before, given = jnp.asarray(batch["tokens"])[:, :-1], (batch["actions"], batch["embodiment"])
-    every_frame, frames = 1e9, before.shape[1]
+    every_frame, frames = 1e9, before.shape[1]  # of each example u times this, above 1 for any u
 
     def own_share(rounds: int) -> np.ndarray:
         """Of each frame, the share of ids that the model says after the frames before it in what is drawn."""

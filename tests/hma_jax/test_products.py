@@ -43,10 +43,19 @@ def test_what_nothing_needs_is_not_counted():
     assert not count_products(lambda a, b: (a @ b, a)[1], A, B)
 
 
-@pytest.mark.parametrize("teacher_forcing", [False, True])
-def test_a_training_step_has_the_products_that_the_formula_counts(teacher_forcing):
+@pytest.mark.parametrize(
+    "masking",
+    [
+        MaskingConfig(),
+        MaskingConfig(teacher_forcing=True),
+        MaskingConfig(teacher_forcing=True, own_past=1.0),
+        MaskingConfig(teacher_forcing=True, own_past=1.0, own_past_rounds=3),
+    ],
+    ids=["released", "teacher_forcing", "own_past", "three_rounds"],
+)
+def test_a_training_step_has_the_products_that_the_formula_counts(masking):
     model = model_config(width=128, tokens=256, action_tokens=64, frames=12, factor_vocab=512)
-    train = train_config(batch=1, masking=MaskingConfig(teacher_forcing=teacher_forcing))
+    train = train_config(batch=1, masking=masking)
     declared = declare_model(model, TABLE, ExecutionConfig(remat="none"))
     step = make_train_step(declared, TABLE, model, train)
     state = jax.eval_shape(lambda: init_state(declared, TABLE, 0))
