@@ -54,7 +54,7 @@ def test_the_page_shows_what_was_measured():
 
 def rows_of_trained() -> list[dict]:
     """Of all models that were watched for a minute from the same four starts of each robot."""
-    return [row for name in ("chained", "weighed", "long", "mended") for row in read_rows(RESULTS / f"{name}.csv")]
+    return [row for name in ("chained", "weighed", "long", "mended", "coarse") for row in read_rows(RESULTS / f"{name}.csv")]
 
 
 def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, float]:
@@ -65,7 +65,7 @@ def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, floa
 
     rows = rows_of_trained()
     cells = {(row["variant"], row["robot"], row["start"], row["part"]): row for row in rows if row["part"] > 1}
-    assert len(cells) == 5 * 8 * 4 * 2
+    assert len(cells) == 6 * 8 * 4 * 2
     apart = [
         {**row, measure: goodness(row) - goodness(cells[beside, *place])}
         for (variant, *place), row in cells.items()
@@ -126,6 +126,13 @@ def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     assert "found {:.2f} ± {:.2f} from the second minute on, in the last minute".format(*ten[0]) in page
     said = "minute {:.0f} % of frames, PSNR {:.1f} ± {:.1f} dB, follows {:.2f} ± {:.2f}."
     assert said.format(100 * last, *ten[1], *ten[2]) in page
+
+
+def test_half_the_bits_lose_nothing_and_gain_nothing():
+    page = " ".join(PAGE.read_text().split())
+    found = [x for m in ("object_found", "object_close", "tool_close", "psnr") for x in gains("coarse", m, "weighed")]
+    said = "objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, tools in place {:+.2f} ± {:.2f}, PSNR {:+.1f} ± {:.1f} dB"
+    assert said.format(*found) in page
 
 
 def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
