@@ -128,7 +128,7 @@ def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     assert said.format(100 * last, *ten[1], *ten[2]) in page
 
 
-def test_half_the_bits_lose_nothing_and_gain_nothing():
+def test_half_the_bits_keep_no_more_objects():
     page = " ".join(PAGE.read_text().split())
     found = [x for m in ("object_found", "object_close", "tool_close", "psnr") for x in gains("coarse", m, "weighed")]
     said = "objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, tools in place {:+.2f} ± {:.2f}, PSNR {:+.1f} ± {:.1f} dB"
