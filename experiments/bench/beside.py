@@ -12,6 +12,7 @@ from pathlib import Path
 from experiments.bench.record import Stage
 from experiments.bench.timing import summarise
 from hma_jax.config import ConfigError, require
+from hma_jax.config.execution import Dtype
 from hma_jax.runtime.host_memory import KEPT_PAGES
 
 RELEASED = {
@@ -26,6 +27,9 @@ RELEASED = {
 """Our stage -> the release's that gives the same."""
 
 OURS, THEIRS = "ours: ", "release: "
+
+SHARED = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+"""Environment of a process that leaves the GPU's memory to others too."""
 
 
 class Worker:
@@ -56,25 +60,38 @@ class Worker:
 
 
 def time_beside(
-    release: Path, python: Path, names: Sequence[str], turns: int, progress: Callable[[str, int], None]
+    release: Path,
+    python: Path,
+    names: Sequence[str],
+    turns: int,
+    progress: Callable[[str, int], None],
+    *,
+    rows: int = 1,
+    dtype: Dtype = "float32",
 ) -> tuple[list[Stage], dict[str, float]]:
-    """(stages of both, how many times faster ours are). `release` is a checkout, `python` an interpreter that
-    has what it imports. Raises ConfigError."""
+    """(stages of both, how many times faster ours are), of `rows` examples at a time. `release` is a checkout, `python`
+    an interpreter that has what it imports. Raises ConfigError."""
     unknown = sorted(set(names) - set(RELEASED))
     require(not unknown, f"no stage {', '.join(unknown)}; known: {', '.join(RELEASED)}")
     require((release / "hma" / "model").is_dir(), f"{release} is no checkout of the official release (liruiw/HMA)")
     seconds: dict[str, list[float]] = {}
     for theirs in dict.fromkeys(RELEASED[name] for name in names):
         ours = [name for name in names if RELEASED[name] == theirs]
-        seconds |= _take_turns(release, python, theirs, ours, turns, progress)
-    stages = [Stage(stage, 1, summarise(taken)) for stage, taken in seconds.items()]
+        seconds |= _take_turns(release, python, theirs, ours, turns, progress, (str(rows), dtype))
+    stages = [Stage(stage, rows, summarise(taken)) for stage, taken in seconds.items()]
     median = {stage.name: stage.timing.median for stage in stages}
     ratios = {f"{name}, times faster": median[THEIRS + RELEASED[name]] / median[OURS + name] for name in names}
     return stages, ratios
 
 
 def _take_turns(
-    release: Path, python: Path, theirs: str, ours: Sequence[str], turns: int, progress: Callable[[str, int], None]
+    release: Path,
+    python: Path,
+    theirs: str,
+    ours: Sequence[str],
+    turns: int,
+    progress: Callable[[str, int], None],
+    asked: Sequence[str],
 ) -> dict[str, list[float]]:
     """Seconds of every turn, of one stage of the release and those of ours that give the same.
 
@@ -84,9 +101,11 @@ def _take_turns(
     script = Path(__file__).with_name("released.py").read_text()
     as_its_users = {"PYTHONPATH": str(release.absolute())} | dict.fromkeys(KEPT_PAGES, "")
     with ExitStack() as stack:
-        workers = {THEIRS + theirs: (theirs, stack.enter_context(Worker([str(python), "-c", script], **as_its_users)))}
+        their_command = [str(python), "-c", script, *asked]
+        workers = {THEIRS + theirs: (theirs, stack.enter_context(Worker(their_command, **as_its_users)))}
         for name in ours:
-            worker = stack.enter_context(Worker([sys.executable, "-m", "experiments.bench.stages"], **KEPT_PAGES))
+            command = [sys.executable, "-m", "experiments.bench.stages", *asked]
+            worker = stack.enter_context(Worker(command, **KEPT_PAGES, **SHARED))
             workers[OURS + name] = (name, worker)
         seconds: dict[str, list[float]] = {stage: [] for stage in workers}
         for turn in range(-1, turns):  # the first one compiles and warms up

@@ -1,12 +1,16 @@
 """A process that runs stages of the official PyTorch release when told to, as `stages` runs ours.
 
 It is started in an environment of its own, which has torch and what the release imports, with a checkout of
-the release (github.com/liruiw/HMA) on its path; nothing of it is part of this project. On CPU the release's
-`.cuda()` must mean nothing, and its attention the one it has without xformers.
+the release (github.com/liruiw/HMA) on its path; nothing of it is part of this project. Its arguments are the examples at
+a time and what is computed in. On CPU the release's `.cuda()` must mean nothing, and its attention is the one it has
+without xformers. On a GPU it computes as its training program does: float32 products at "medium" precision, attention by
+a fused kernel, which is torch's own where xformers is not installed.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
 import os
 import sys
 import time
@@ -16,31 +20,62 @@ FRAME, PROMPT, WINDOW = 256, 6, 12
 ROBOT, ACTION_WIDTH = "robot", 21
 
 
-def prepare() -> None:
-    """What the release needs to be told on a machine without a GPU."""
+def prepare() -> str:
+    """Tells the release what it needs to know of this machine; returns the device."""
     import torch
 
+    torch.manual_seed(0)
+    if torch.cuda.is_available():
+        torch.set_default_device("cuda")
+        torch.set_float32_matmul_precision("medium")
+        if importlib.util.find_spec("xformers") is None:
+            stand_in(memory_efficient_attention=attend, LowerTriangularMask=bool, unbind=torch.unbind)
+        return "cuda"
     os.environ["XFORMERS_DISABLED"] = "true"
+    stand_in(memory_efficient_attention=None, LowerTriangularMask=None, unbind=None)
+    torch.Tensor.cuda = lambda self, *args, **options: self
+    return "cpu"
+
+
+def stand_in(**names) -> None:
+    """`names` in the place of xformers.ops."""
     xformers, ops = types.ModuleType("xformers"), types.ModuleType("xformers.ops")
-    for name in ("LowerTriangularMask", "memory_efficient_attention", "unbind"):
-        setattr(ops, name, None)
+    vars(ops).update(names)
     xformers.ops = ops
     sys.modules.update({"xformers": xformers, "xformers.ops": ops})
-    torch.Tensor.cuda = lambda self, *args, **options: self
-    torch.manual_seed(0)
+
+
+def attend(q, k, v, attn_bias=None, scale=None):
+    """Of [B, N, H, D], causal with an `attn_bias`, which is the only one that the release gives."""
+    from torch.nn.functional import scaled_dot_product_attention
+
+    turned = (x.transpose(1, 2) for x in (q, k, v))
+    return scaled_dot_product_attention(*turned, is_causal=attn_bias is not None, scale=scale).transpose(1, 2)
 
 
 class Released:
-    """The released base models with drawn weights, one window of one robot."""
+    """The released base models with drawn weights, `rows` windows of one robot, computed in `dtype`."""
 
-    def __init__(self):
+    def __init__(self, rows: int, dtype: str):
+        self.device = prepare()
         import torch
 
-        self.torch = torch
-        self.ids = torch.randint(0, 2**18, (1, WINDOW, 16, 16))
-        self.latents = torch.randn(1, WINDOW, 32, 32, 4)
-        self.actions = torch.randn(1, WINDOW, ACTION_WIDTH)
+        self.torch, self.rows, self.dtype = torch, rows, dtype
+        self.ids = torch.randint(0, 2**18, (rows, WINDOW, 16, 16))
+        self.latents = torch.randn(rows, WINDOW, 32, 32, 4)
+        self.actions = torch.randn(rows, WINDOW, ACTION_WIDTH)
+        self.robots = [ROBOT] * rows
         self.models: dict[str, object] = {}
+
+    def computing(self):
+        """Under which precision the release computes: float32, or automatic mixed precision."""
+        if self.dtype == "float32":
+            return contextlib.nullcontext()
+        return self.torch.autocast(self.device, getattr(self.torch, self.dtype))
+
+    def finish(self) -> None:
+        if self.device == "cuda":
+            self.torch.cuda.synchronize()
 
     def discrete(self):
         if "discrete" not in self.models:
@@ -77,7 +112,7 @@ class Released:
     def forward(self) -> None:
         model = self.discrete().eval()
         with self.torch.no_grad():
-            model.compute_logits(self.ids, action_ids=self.actions, domain=[ROBOT])
+            model.compute_logits(self.ids, action_ids=self.actions, domain=self.robots)
 
     def frame(self) -> None:
         """Two passes over one frame, each over the whole window: the release has no other way."""
@@ -92,18 +127,18 @@ class Released:
         with self.torch.no_grad():
             window[:, PROMPT:] = mask
             model.maskgit_generate(
-                window, out_t=PROMPT, maskgit_steps=2, temperature=0.0, action_ids=self.actions, domain=[ROBOT]
+                window, out_t=PROMPT, maskgit_steps=2, temperature=0.0, action_ids=self.actions, domain=self.robots
             )
 
     def step(self) -> None:
         model = self.discrete().train()
-        labels = self.ids.reshape(1, -1)
+        labels = self.ids.reshape(self.rows, -1)
         inputs = labels.clone()
         inputs[self.torch.rand(inputs.shape) < 0.5] = model.mask_token_id
         inputs[:, :FRAME] = labels[:, :FRAME]
-        side = self.torch.tensor([16])
+        side = self.torch.tensor([16] * self.rows)
         loss = model(
-            input_ids=inputs, labels=labels, action_ids=self.actions, domain=[ROBOT], h=side, w=side
+            input_ids=inputs, labels=labels, action_ids=self.actions, domain=self.robots, h=side, w=side
         ).loss
         self.optimizer.zero_grad()
         loss.backward()
@@ -113,8 +148,8 @@ class Released:
 def main() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    prepare()
-    released = Released()
+    rows, dtype = sys.argv[1:]
+    released = Released(int(rows), dtype)
     calls = {
         "forward": released.forward,
         "frame": released.frame,
@@ -123,7 +158,9 @@ def main() -> None:
     }
     for line in sys.stdin:
         began = time.perf_counter()
-        calls[line.strip()]()
+        with released.computing():
+            calls[line.strip()]()
+        released.finish()
         print(time.perf_counter() - began, file=answers, flush=True)
 
 

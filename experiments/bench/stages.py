@@ -1,4 +1,4 @@
-"""A process that runs one stage of our base models when told to: `python -m experiments.bench.stages`.
+"""A process that runs stages of our base models when told to: `python -m experiments.bench.stages ROWS DTYPE`.
 
 Reads a stage's name per line, runs it once and answers with the seconds it took; the first time includes
 compilation. `experiments.bench.beside` lets it take turns with another program.
@@ -10,18 +10,20 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from experiments.bench.models import Subject, make_subject
+from experiments.bench.models import EXECUTION, make_subject
 from experiments.bench.programs import RELEASED, repeatable
+from hma_jax.config.execution import Dtype
 
 FEW = ("dpm++", 10)
 
 
-def stages() -> dict[str, Callable[[], Any]]:
-    """Name -> a call of it."""
-    return {name: lambda made=made: _call(*made)() for name, made in PROGRAMS.items()}
+def stages(rows: int, dtype: Dtype) -> dict[str, Callable[[], Any]]:
+    """Name -> a call of it, of `rows` examples computed in `dtype`."""
+    return {name: lambda made=made: _call(*made, rows, dtype)() for name, made in PROGRAMS.items()}
 
 
 PROGRAMS = {
@@ -37,13 +39,8 @@ PROGRAMS = {
 
 
 @cache
-def _subject(name: str) -> Subject:
-    return make_subject(name)
-
-
-@cache
-def _call(model: str, program: str, sampler: tuple[str, int]) -> Callable[[], Any]:
-    return repeatable(_subject(model), program, sampler)
+def _call(model: str, program: str, sampler: tuple[str, int], rows: int, dtype: Dtype) -> Callable[[], Any]:
+    return repeatable(make_subject(model, replace(EXECUTION, dtype=dtype)), program, sampler, rows)
 
 
 def serve(calls: dict[str, Callable[[], Any]]) -> None:
@@ -63,4 +60,4 @@ def _wait(result: Any) -> None:
 
 
 if __name__ == "__main__":
-    serve(stages())
+    serve(stages(int(sys.argv[1]), sys.argv[2]))

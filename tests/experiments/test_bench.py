@@ -152,14 +152,15 @@ def test_two_programs_take_turns_and_the_faster_one_is_said_by_how_much(tmp_path
     class Told(beside.Worker):
         def __init__(self, command, **environment):
             whose = beside.THEIRS if "PYTHONPATH" in environment else beside.OURS
+            assert command[-2:] == ["3", "bfloat16"]
             assert bool(environment["GLIBC_TUNABLES"]) == (whose == beside.OURS)  # the release as its users start it
             echo = f"while read stage; do echo $stage >> {tmp_path}/{whose[:4]}; echo {answers[whose]}; done"
             super().__init__(["sh", "-c", echo])
 
     monkeypatch.setattr(beside, "Worker", Told)
-    stages, ratios = beside.time_beside(tmp_path, Path("python"), ("fill", "slide"), 2, lambda *_: None)
+    stages, ratios = beside.time_beside(tmp_path, Path("python"), ("fill", "slide"), 2, lambda *_: None, rows=3, dtype="bfloat16")
     assert ratios == {"fill, times faster": 1.5, "slide, times faster": 1.5}
-    assert [s.name for s in stages] == ["release: frame", "ours: fill", "ours: slide"]
+    assert [(s.name, s.batch) for s in stages] == [("release: frame", 3), ("ours: fill", 3), ("ours: slide", 3)]
     assert (tmp_path / "ours").read_text().split() == ["fill", "slide"] * 3
     assert (tmp_path / "rele").read_text().split() == ["frame"] * 3
 

@@ -1,4 +1,4 @@
-"""`hma bench quality|tokenize|load|release|report`: trained models, tokenizers, data, the release, and the tables."""
+"""`hma bench quality|tokenize|simulate|load|release|report`: trained models, tokenizers, data, the release, and the tables."""
 
 from __future__ import annotations
 
@@ -114,6 +114,33 @@ def tokenize(
     write("tokenize", Path(tokenizer).name, dtype, seed, settings, stages, {}, (), out)
 
 
+def simulate(
+    run: Positional[Path],
+    batch: tuple[int, ...] = (1,),
+    repeats: int = 60,
+    dtype: Dtype = "float32",
+    out: Path = Path("runs/bench"),
+) -> None:
+    """Time a trained model as a simulator: actions in, pixels out, past the model's window.
+
+    Args:
+        run: Directory of a trained model.
+        batch: Episodes that advance together; several numbers give several measurements.
+        repeats: Timed frames of each.
+        dtype: What is computed in.
+        out: Directory for the record.
+    """
+    from experiments.bench.simulate import time_simulator
+
+    require(repeats >= 1 and min(batch, default=0) >= 1, "--repeats and --batch must be at least 1")
+    stages = []
+    for episodes in batch:
+        with step(f"time {episodes} episodes that advance together"):
+            found, decode = time_simulator(run, episodes, repeats, dtype)
+        stages += found
+    write("simulate", run.resolve().name, dtype, 0, {"run": str(run), "decode": decode}, stages, {}, (), out)
+
+
 def load(
     store: Path | None = None,
     data: Annotated[tuple[str, ...], arg(metavar="[DIR ...]")] = (),
@@ -168,9 +195,13 @@ def release(
     python: Path,
     stages: Annotated[tuple[str, ...], arg(metavar="[STAGE ...]")] = (),
     turns: int = 5,
+    batch: int = 1,
+    dtype: Dtype = "float32",
     out: Path = Path("runs/bench"),
 ) -> None:
     """Time the base models beside the official PyTorch release: two processes that take turns.
+
+    On a GPU both use it.
 
     Args:
         checkout: A clone of github.com/liruiw/HMA.
@@ -179,14 +210,20 @@ def release(
         stages: Some of: forward, fill, slide, step, "continuous fill", "continuous slide",
             "continuous few" (10 evaluations by dpm++ against the release's 100). All if not given.
         turns: Timed turns of every stage, after one untimed.
+        batch: Examples at a time.
+        dtype: What both compute in; the release by torch's automatic mixed precision.
         out: Directory for the record.
     """
     from experiments.bench.beside import RELEASED, time_beside
 
+    require(min(turns, batch) >= 1, "--turns and --batch must be at least 1")
     names = stages or tuple(RELEASED)
     with step(f"time {len(names)} stages beside the release") as update:
-        found, ratios = time_beside(checkout, python, names, turns, lambda what, turn: update(turn, turns, what))
-    write("release", "base", "float32", 0, {"stages": list(names)}, found, ratios, (), out)
+        found, ratios = time_beside(
+            checkout, python, names, turns, lambda what, turn: update(turn, turns, what), rows=batch, dtype=dtype
+        )
+    subject = "base" if batch == 1 else f"base-batch-{batch}"
+    write("release", subject, dtype, 0, {"stages": list(names), "batch": batch}, found, ratios, (), out)
 
 
 def report(records: Positional[tuple[Path, ...]], figure: Path | None = None) -> None:
