@@ -6,7 +6,7 @@ Cost: the first an hour and a half of one core and its tokenizer, resumed where 
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
           actions of other episodes.
 
-Writes weights (their average, where the run keeps one), tokenizer, the robots' commands, starts of held-out episodes,
+Writes weights (their average, where the run keeps one, in half precision), tokenizer, the robots' commands, starts of held-out episodes,
 how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model, of a still picture
 and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1. clip.gif shows
 the first of them.
@@ -76,7 +76,7 @@ def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
     try:
         described = describe_run(run.model, run.train, run.table, run.provenance)
         with Checkpoints(aside / "checkpoints", described) as checkpoints:
-            checkpoints.save(run.step, Shipped(run.params))
+            checkpoints.save(run.step, Shipped(halved(run.params)))
         forget_places(aside / "checkpoints" / str(run.step))
         save_tokenizer(simulator.tokenizer, aside / TOKENIZER)
         save_robots(tuple(simulator.robots.values()), aside / ROBOTS)
@@ -88,6 +88,14 @@ def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
         publish(aside, out)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def halved(params: Params) -> Params:
+    """In float16, half of the bytes; what reads them makes them float32 again. Raises ConfigError for a weight that is
+    too large for it."""
+    half = jax.tree.map(lambda x: np.asarray(x, np.float16), params)
+    require(all(np.isfinite(x).all() for x in jax.tree.leaves(half)), "a weight is too large for half precision")
+    return half
 
 
 def forget_places(checkpoint: Path) -> None:
