@@ -186,7 +186,7 @@ CPU_FULL_CONTINUOUS = replace(
 
 PLAY = replace(
     CPU,
-    name="play",  # the model of `make play`: eight robots to drive, 64 pixels, two cores, hours
+    name="play",  # eight robots to drive, 64 pixels, two cores, hours
     suite=SuiteConfig(scale=3.0),
     datasets=(
         "pusher_sand", "rover_road", "arm_chalk", "gripper_wood", "picker_slate", "omni_chalk", "arm_sand", "gripper_night",
@@ -208,10 +208,22 @@ PLAY = replace(
     transfer=TransferConfig(widths=(32, 48, 64), datasets=8, steps=1200),
 )
 
+PLAY_GPU = replace(
+    PLAY,
+    name="play-gpu",  # the model of `make play`: the same robots, more of their data, a larger trunk, minutes of a GPU
+    suite=SuiteConfig(scale=8.0),
+    model=replace(PLAY.model, width=128, layers=4),
+    train=replace(PLAY.train, steps=8000, batch=32),
+    widths=(128,),
+    transfer=TransferConfig(widths=(48, 64, 128), datasets=8, steps=1200),
+    flops_per_second=2e13,
+)
+
 PRESETS = {
     p.name: p
     for p in (
         SMOKE, CPU, CPU_FULL, ACCELERATOR, PAPER, SMOKE_CONTINUOUS, CPU_CONTINUOUS, CPU_FULL_CONTINUOUS, PLAY,
+        PLAY_GPU,
     )
 }  # fmt: skip
 
