@@ -107,7 +107,7 @@ class Released:
     def _with_robot(self, model):
         statistics = [[[0.0] * 7, [1.0] * 7]]
         model.init_action_projectors([ROBOT], [ACTION_WIDTH], statistics, "concat+modulate")
-        return model
+        return model.to(self.device)
 
     def forward(self) -> None:
         model = self.discrete().eval()
