@@ -11,6 +11,7 @@ import pytest
 
 from experiments.applications import DRIVEN
 from experiments.bench.beside import OURS, RELEASED, THEIRS
+from experiments.bench.record import read_record
 from experiments.rows import OVERALL, Row, read_csv
 
 ROOT = Path(__file__).parents[1]
@@ -38,9 +39,7 @@ DIGITS = {"perplexity": 2, "action_nats": 3, "delta_psnr": 3, "psnr": 2}
 STAGES = {
     "a frame while the window fills": "fill",
     "a frame past the window, exact": "slide",
-    "a pass over the window": "forward",
     "a training step": "step",
-    "a continuous frame, the same 100 sampler steps": "continuous fill",
 }
 
 
@@ -83,6 +82,24 @@ def test_the_speed_beside_the_release():
         assert ratio == round(theirs / ours, digits), label
         assert ("slower" in times) == (theirs < ours), label
     assert f"`{record['machine']['commit']}`" in README.read_text() and record["date"] in README.read_text()
+
+
+def test_the_speed_on_a_gpu_beside_the_release():
+    gpu, text = ROOT / "experiments" / "results" / "bench" / "gpu", " ".join(README.read_text().split())
+    page = (ROOT / "docs" / "performance.md").read_text()
+    frames, steps = (read_record(gpu / f"release-base{name}-nvidia-h100-80gb-hbm3.json") for name in ("-float32", "-batch-8-bfloat16"))
+    fill, slide, train = (
+        record.stage(THEIRS + RELEASED[stage], rows).timing.median / record.stage(OURS + stage, rows).timing.median
+        for record, stage, rows in ((frames, "fill", 1), (frames, "slide", 1), (steps, "step", 8))
+    )
+    said = f"frames are {fill:.1f} and {slide:.1f} times faster (float32, batch 1), a training step {train:.1f} times (bfloat16, batch 8)"
+    assert said in text
+    assert all(f"| {ratio:.2f} |" in page for ratio in (fill, slide, train))
+    rollouts = read_record(next(gpu.glob("rollout-base-*.json")))
+    one, many = (rollouts.stage("rollout", rows).frames_per_second for rows in (1, 64))
+    (shown,) = read_record(next(gpu.glob("simulate-*.json"))).stages
+    for rate in (one, many, shown.frames_per_second):
+        assert f" {rate:.0f} frames/s" in " ".join(page.split())
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "experiments" / "results").rglob("results.csv")), ids=str)

@@ -3,6 +3,7 @@
 Command: hma train --preset play --out runs/play
          python -m experiments.applications.ship runs/play/model --unmask-steps 8 --temperature 0.7
 Cost: the first an hour and a half of one core and its tokenizer, resumed where it was stopped; the second three minutes.
+      Of the model that is served: docs/simulator.md.
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
           actions of other episodes.
 

@@ -34,12 +34,12 @@ def play(
     Needs the extra `play`. Runs until it is interrupted. docs/simulator.md describes the page.
 
     Args:
-        run: Directory of a training run; without it the one in experiments/results/simulator_weighed.
+        run: Directory of a training run; without it the one in experiments/results/simulator_grown.
         host: Address to listen at. 127.0.0.1 is this computer alone; 0.0.0.0 lets everybody in who can reach it.
         port: Of the address; 0 takes a free one.
         visitors: Who can drive at once, in one batch.
         window: Past the model's window of frames, exact computes it again for each; streaming is faster and
-            may no longer follow commands (docs/endurance.md).
+            may no longer follow commands (docs/endurance_small.md).
         unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says, or 2; more are
             slower.
         temperature: Of drawing tokens, instead of what RUN/decode.json says, or 0, which takes the likeliest.

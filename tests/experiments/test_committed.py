@@ -82,14 +82,14 @@ def test_the_tables_of_the_largest_study_are_computed_again(tmp_path, monkeypatc
     assert checked[0].verdict != "bad", checked[0].text
 
 
-def test_the_model_that_is_driven_was_trained_as_its_preset_says():
-    run = load_run(RESULTS.parents[1] / DRIVEN)
+def test_the_model_that_two_cores_train_was_trained_as_its_preset_says():
+    run = load_run(RESULTS / "simulator_weighed")
     assert (run.model, run.train) == (PRESETS["play"].model, PRESETS["play"].train)
 
 
-def test_the_model_with_a_past_of_its_own_was_trained_as_docs_say():
-    run, preset = load_run(RESULTS / "simulator_mended"), PRESETS["play"]
+def test_the_model_that_is_driven_was_trained_as_docs_say():
+    run, preset = load_run(RESULTS.parents[1] / DRIVEN), PRESETS["play-gpu"]
     masking = replace(preset.train.masking, own_past=1.0, own_past_rounds=3)
     optimizer = replace(preset.train.optimizer, learning_rate=2e-3, decay_fraction=0.5)
-    assert run.model == replace(preset.model, chain_factors=True)
-    assert run.train == replace(preset.train, steps=2500, masking=masking, optimizer=optimizer)
+    assert run.model == preset.model
+    assert run.train == replace(preset.train, steps=1157, masking=masking, optimizer=optimizer)

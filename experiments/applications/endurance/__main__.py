@@ -1,6 +1,6 @@
 """Question: how long does a learned simulator hold?
 Command: python -m experiments.applications.endurance RUN --minutes 10 --out DIR
-Cost: ten minutes of eight robots, 20 minutes of one core for each variant.
+Cost: ten minutes of eight robots, half an hour of one core for each variant.
 Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
 
 Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped. Writes

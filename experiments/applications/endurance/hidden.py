@@ -1,9 +1,9 @@
 """Objects that are hidden or out of view for a while and come back: are they still what and where they were?
 
 Command: python -m experiments.applications.endurance.hidden RUN --out DIR
-Cost: two minutes of one core.
+Cost: two minutes of one core, three for the model that is served.
 Expected: within the model's window what was hidden comes back as often as what was never hidden is still there. Found:
-          it comes back less often, the less the longer it was hidden (docs/endurance.md).
+          it comes back less often; in small models the less the longer it was hidden (docs/endurance.md).
 
 Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
 after the start. Beside each stands a control: an object that is seen all the time, judged as long after the start.

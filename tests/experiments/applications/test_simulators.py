@@ -11,6 +11,8 @@ import pytest
 from experiments.applications import ship as ship_module
 from experiments.applications.ship import ship
 from experiments.applications.simulators import load_simulator, make_simulator
+from experiments.bench.record import read_record
+from experiments.cli.main import main
 from experiments.running.workspace import Workspace
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
@@ -53,6 +55,15 @@ def test_true_and_learned_are_exchanged_by_one_word(run):
         np.testing.assert_array_equal(simulator.rewind(1, [0]), first)
         seen[world] = simulator.robots, images.shape
     assert seen["learned"] == seen["true"]
+
+
+def test_a_simulator_is_timed_as_its_users_step_it(run, tmp_path, capsys):
+    assert main(["bench", "simulate", str(run), "--batch", "2", "--repeats", "3", "--out", str(tmp_path)]) == 0
+    (file,) = tmp_path.glob("simulate-*.json")
+    (stage,) = read_record(file).stages
+    assert (stage.name, stage.batch, stage.frames, stage.timing.repeats) == ("step", 2, 2, 3)
+    assert main(["bench", "simulate", str(run), "--batch", "0"]) == 2
+    assert "--repeats and --batch must be at least 1" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.slow

@@ -1,239 +1,106 @@
-"""The committed tables of how long the models of this repository hold, and that docs/endurance.md shows their figures."""
+"""The committed tables of how long the served model holds are what docs/endurance.md shows."""
 
 from __future__ import annotations
 
 import csv
-from functools import partial
-from pathlib import Path
 
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.detector import WEIGHTS, Detector
 from experiments.applications.endurance.tables import over_robots, read_rows
-
-ROOT = Path(__file__).parents[4]
-RESULTS = ROOT / "experiments" / "results" / "endurance"
-PAGE = ROOT / "docs" / "endurance.md"
-
-SHOWN = {
-    "psnr": 1, "psnr_still": 1, "tool_found": 2, "tool_close": 2, "object_found": 2, "object_close": 2, "follows": 2,
-    "moves": 2,
-}  # fmt: skip
-"""Measures of the page's tables, in the order of their columns, and digits."""
-
-
-def table(header: str) -> dict[str, list[str]]:
-    """First cell -> the others, of the page's table whose head begins with `header`."""
-    rows = {}
-    for line in PAGE.read_text().split(header, 1)[1].splitlines()[2:]:
-        if not line.startswith("|"):
-            break
-        first, *rest = (cell.strip() for cell in line.strip().strip("|").split("|"))
-        rows[first] = rest
-    assert rows
-    return rows
+from tests.experiments.applications.endurance.committed import (
+    PAGE,
+    RESULTS,
+    ROOT,
+    by_label,
+    by_place,
+    check_tables,
+    gain,
+    gains,
+    rows_of_trained,
+    words_of,
+)
 
 
 def test_the_page_shows_what_was_measured():
-    ten, unlike = (read_rows(RESULTS / name) for name in ("endurance.csv", "unlike.csv"))
-    tried = [row for name in ("variants.csv", "own_past.csv") for row in read_rows(RESULTS / name)]
-    trained = rows_of_trained()
-    shown = {
-        "| minute |": lambda label: [row for row in ten if row["part"] == float(label)],
-        "| variant, seconds |": lambda label: [row for row in tried if f"{row['variant']}, {_seconds(row)}" == label],
-        "| trained, seconds |": lambda label: [row for row in trained if f"{row['variant']}, {_seconds(row)}" == label],
-        "| drive |": lambda label: [row for row in unlike if row["drive"] == label and row["part"] == 3],
-    }
-    for header, rows_of in shown.items():
-        for label, cells in table(header).items():
-            mine = rows_of(label)
-            assert len({row["robot"] for row in mine}) == 8, f"{label}: all eight robots"
-            for (measure, digits), cell in zip(SHOWN.items(), cells, strict=True):
-                mean, half, robots = over_robots(mine, measure)
-                assert cell == ("" if robots < 2 else f"{mean:.{digits}f} ± {half:.{digits}f}"), (label, measure)
-
-
-def rows_of_trained() -> list[dict]:
-    """Of all models that were watched for a minute from the same four starts of each robot."""
-    return [row for name in ("chained", "weighed", "long", "mended", "coarse") for row in read_rows(RESULTS / f"{name}.csv")]
-
-
-def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, float]:
-    """(mean, half its interval) over robots, from 20 to 60 s, from the same starts; of the variance, how much nearer it is."""
-
-    def goodness(row: dict) -> float:
-        return -abs(row[measure] - 1) if measure == "variance" else row[measure]
-
-    rows = rows_of_trained()
-    cells = {(row["variant"], row["robot"], row["start"], row["part"]): row for row in rows if row["part"] > 1}
-    assert len(cells) == 6 * 8 * 4 * 2
-    apart = [
-        {**row, measure: goodness(row) - goodness(cells[beside, *place])}
-        for (variant, *place), row in cells.items()
-        if variant == name
-    ]
-    mean, half, robots = over_robots(apart, measure)
-    assert robots == 8
-    return mean, half
-
-
-def test_chained_factors_keep_bodies_and_cost_decibels():
-    page, found = " ".join(PAGE.read_text().split()), partial(gains, "chained")
-    for measure, words in (
-        ("tool_found", "in {:.2f} ± {:.2f} more of the frames"), ("object_found", "than chance allows ({:+.2f} ± {:.2f})"),
-        ("variance", "nearer to the truth's by {:.2f} ± {:.2f}, at the edge of chance"),
-        ("tool_close", "better in place ({:.2f} ± {:.2f})"),
-    ):  # fmt: skip
-        assert words.format(*found(measure)) in page, measure
-    loss, half = found("psnr")
-    assert f"at wrong places cost {-loss:.1f} ± {half:.1f} dB" in page
-
-
-def test_changes_counted_thrice_keep_bodies_and_cost_nothing():
-    page, found = " ".join(PAGE.read_text().split()), partial(gains, "weighed")
-    for measure, words in (
-        ("tool_found", "tools are found in {:.2f} ± {:.2f} more of the frames"),
-        ("variance", "nearer to the truth's by {:.2f} ± {:.2f}. Objects"),
-        ("object_found", "Objects are found in {:.2f} ± {:.2f} more"),
-        ("tool_close", "places (tools {:+.2f} ± {:.2f})"), ("psnr", "PSNR ({:.1f} ± {:.1f} dB)"),
-    ):  # fmt: skip
-        assert words.format(*found(measure)) in page, measure
-
-
-def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
-    page = " ".join(PAGE.read_text().split())
-    minute = [gains("long", measure, "weighed") for measure in ("object_found", "psnr")]
-    assert "robot, {:+.2f} ± {:.2f}; PSNR {:.1f} ± {:.1f} dB)".format(*minute[0], *minute[1]) in page
-    rounds = [gains("mended", measure, "long") for measure in ("object_found", "psnr", "follows")]
-    said = "found {:.2f} ± {:.2f} beside \"long\", PSNR {:.1f} ± {:.1f} dB, follows {:+.2f} ± {:.2f}."
-    assert said.format(*rounds[0], *rounds[1], *rounds[2]) in page
-    tables = ("weighed", "long", "long_likeliest", "mended_likeliest")
-    weighed, drawn, long, mended = ({k: r for k, r in by_place(f"{n}.csv").items() if k[2] > 1} for n in tables)
-
-    def beside(measure: str, of: dict, other: dict) -> tuple[float, float]:
-        assert len(of) == 8 * 4 * 2 and of.keys() == other.keys()
-        return gain(measure, [(row, other[place]) for place, row in of.items()])
-
-    assert 'found {:+.2f} ± {:.2f} beside "long" at that'.format(*beside("object_found", mended, long)) in page
-    assert "sooner than when it draws ({:.2f} ± {:.2f})".format(*beside("object_found", long, drawn)) in page
-    three = [beside(measure, mended, weighed) for measure in ("object_found", "object_close", "psnr")]
-    said = "(objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, PSNR {:.1f} ± {:.1f} dB)"
-    assert said.format(abs(three[0][0]), three[0][1], *three[1], *three[2]) in page
-    served, long = by_place("endurance.csv"), by_place("long_ten.csv")
-    assert len(served) == 8 * 10 and served.keys() == long.keys()
-    later = [(row, served[place]) for place, row in long.items() if row["part"] > 1]
-    last = over_robots([row for row in long.values() if row["part"] == 10], "object_found")[0]
-    ten = [gain(measure, later) for measure in ("object_found", "psnr", "follows")]
-    assert "found {:.2f} ± {:.2f} from the second minute on, in the last minute".format(*ten[0]) in page
-    said = "minute {:.0f} % of frames, PSNR {:.1f} ± {:.1f} dB, follows {:.2f} ± {:.2f}."
-    assert said.format(100 * last, *ten[1], *ten[2]) in page
-
-
-def test_half_the_bits_keep_no_more_objects():
-    page = " ".join(PAGE.read_text().split())
-    found = [x for m in ("object_found", "object_close", "tool_close", "psnr") for x in gains("coarse", m, "weighed")]
-    said = "objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, tools in place {:+.2f} ± {:.2f}, PSNR {:+.1f} ± {:.1f} dB"
-    assert said.format(*found) in page
-
-
-def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
-    page = " ".join(PAGE.read_text().split())
-    served, ten = by_place("endurance.csv"), by_place("mended_ten.csv")
-    assert len(served) == 8 * 10 and served.keys() == ten.keys()
-    last = over_robots([row for row in ten.values() if row["part"] == 10], "object_found")[0]
-    later = [(row, served[place]) for place, row in ten.items() if row["part"] > 1]
-    gained = gain("object_found", later)
-    assert f"found in {100 * last:.0f} % of the frames of the last minute, {gained[0]:.2f} ± {gained[1]:.2f} beside" in page
-    for robot, measure, words in (
-        ("pusher_sand", "object_found", '({:.0f} % of the last minute, "weighed" {:.0f})'),
-        ("picker_slate", "tool_found", 'its own body ({:.0f} %, "weighed" {:.0f})'),
-    ):
-        assert words.format(*(100 * of[robot, 0, 10][measure] for of in (ten, served))) in page
-    back = over_robots([row for row in read_rows(RESULTS / "mended_hidden.csv") if row["kind"] == "hidden"], "found")[0]
-    assert f"hidden comes back in {100 * back:.0f} % of the cases" in page
-
-
-def by_place(name: str) -> dict[tuple, dict]:
-    """(robot, start, part) -> row of a committed table of one variant."""
-    rows = read_rows(RESULTS / name)
-    places = {(row["robot"], row["start"], row["part"]): row for row in rows}
-    assert len(places) == len(rows)
-    return places
-
-
-def gain(measure: str, pairs: list[tuple[dict, dict]]) -> tuple[float, float]:
-    """(mean, half its interval) over robots, of how much more the first of each pair of rows has than the second."""
-    mean, half, robots = over_robots([{**row, measure: row[measure] - other[measure]} for row, other in pairs], measure)
-    assert robots == 8
-    return mean, half
-
-
-def test_likeliest_tokens_are_no_better():
-    page = " ".join(PAGE.read_text().split())
-    drawn, likeliest = by_place("weighed.csv"), by_place("weighed_likeliest.csv")
-    assert len(drawn) == 8 * 4 * 3 and drawn.keys() == likeliest.keys()
-    later = [(row, drawn[place]) for place, row in likeliest.items() if row["part"] > 1]
-    for measure, words in (("object_found", "objects found {:.2f} ± {:.2f}"), ("psnr", "PSNR {:+.1f} ± {:.1f} dB.")):
-        assert words.format(*gain(measure, later)) in page, measure
+    ten = read_rows(RESULTS / "grown_ten.csv")
+    minutes = {"| minute |": lambda label: [row for row in ten if row["part"] == float(label)]}
+    check_tables(PAGE, minutes | {"| trained, seconds |": by_label(rows_of_trained())})
 
 
 def test_ten_minutes_are_as_the_page_says():
-    page = " ".join(PAGE.read_text().split())
-    mine, first = (
-        {(robot, minute): row for (robot, _, minute), row in by_place(name).items()}
-        for name in ("endurance.csv", "first_ten.csv")
-    )
-    assert len(mine) == 8 * 10 and mine.keys() == first.keys()
+    page, mine = words_of(PAGE), {(robot, minute): row for (robot, _, minute), row in by_place("grown_ten.csv").items()}
+    small = {(robot, minute): row for (robot, _, minute), row in by_place("endurance.csv").items()}
+    assert len(mine) == 8 * 10 and mine.keys() == small.keys()
 
     def mean(measure: str, minute: int, of: dict = mine) -> float:
         found, _, robots = over_robots([row for (_, at), row in of.items() if at == minute], measure)
         assert robots == 8
         return found
 
-    def percent(*where) -> str:
-        return f"{100 * mean(*where):.0f}"
+    def objects(of: dict) -> list[str]:
+        return [f"{100 * mean('object_found', minute, of):.0f}" for minute in (1, 2, 10)]
 
-    tools, objects = percent("tool_found", 10), [percent("object_found", minute) for minute in (1, 2, 10)]
+    first, second, last = objects(mine)
+    assert f"found in {first} % of frames of the first minute, in {second} % of those of the second, in {last} % of the last" in page
+    assert "two cores train in {}, {} and {}.".format(*objects(small)) in page
+    tools = f"{100 * mean('tool_found', 10):.0f}"
+    assert f"after ten minutes {last} % of objects are found, {tools} % of tools" in words_of(ROOT / "README.md")
+    assert f"Objects are found in {last} % of the frames of the last minute, not in all" in page
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
     assert f"commands by {mean('follows', 10):.2f} after {mean('follows', 1):.2f} in the first minute" in page
-    assert f"found in {objects[0]} % of frames of the first minute, in {objects[1]} % of those of the second, in" in page
-    assert f"Objects are found in {objects[2]} % of the frames of the last minute" in page
-    variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
-    assert f"variance ({variance:.2f} of the truth's)" in page
-    colours = mean("histogram", 1), mean("histogram", 10)
-    assert "({:.2f} of the histogram differs in the first minute, {:.2f} in the last)".format(*colours) in page
-    before = percent("tool_found", 10, first), percent("object_found", 10, first)
-    assert f"where it was {before[0]}, objects in {objects[2]}, where it was {before[1]}" in page
-    arm = [each["arm_sand", 10]["follows"] for each in (mine, first)]
-    assert f"(follows by {arm[0]:.2f}, where the first model has {arm[1]:.2f})" in page
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
-    assert len(following) == 6 and all(mine[r, 10]["follows"] > mine[r, 1]["follows"] / 2 for r in following)
+    keeping = [robot for robot in following if mine[robot, 10]["follows"] >= mine[robot, 1]["follows"] / 2]
+    assert f"Of {len(following)} robots that follow at all (above 0.5 in the first minute) {len(keeping)} keep" in page
     places = [f"{100 * mine[robot, 10]['tool_close']:.0f}" for robot in ("gripper_wood", "gripper_night")]
     assert f"{places[0]} and {places[1]} % of the last minute of the two grippers" in page
     pusher = mine["pusher_sand", 10]
     assert f"follows by {pusher['follows']:.2f} and stands {pusher['tool_px']:.0f} pixels beside the truth" in page
-    last = [(mine[robot, 10], mine[robot, 2]) for robot, minute in mine if minute == 10]
-    later = [(row, first[place]) for place, row in mine.items() if place[1] > 1]
-    for measure, words, pairs in (
-        ("psnr", "PSNR {:.1f} ± {:.1f} dB, follows", last), ("follows", "follows {:.2f} ± {:.2f})", last),
-        ("follows", "follows by {:.2f} ± {:.2f} more", later), ("psnr", "PSNR is level ({:.1f} ± {:.1f} dB)", later),
+    change = [(mine[robot, 10], mine[robot, 2]) for robot, minute in mine if minute == 10]
+    for measure, words in (
+        ("psnr", "PSNR changes by {:+.1f} ± {:.1f} dB"), ("follows", "follows by {:+.2f} ± {:.2f}"),
+        ("object_found", "objects found by {:+.2f} ± {:.2f}"),
     ):  # fmt: skip
-        assert words.format(*gain(measure, pairs)) in page, measure
+        assert words.format(*gain(measure, change)) in page, measure
+    variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
+    colours = mean("histogram", 1), mean("histogram", 10)
+    assert f"variance is {variance:.2f} of the truth's" in page
+    assert "{:.2f} of the histogram of colours differs in the first minute, {:.2f} in the last".format(*colours) in page
+    lasting = {robot: round(100 * row["object_found"]) for (robot, minute), row in mine.items() if minute == 10}
+    assert lasting["pusher_sand"] == lasting["omni_chalk"] == 100
+    assert sorted(lasting[robot] for robot in ("arm_chalk", "arm_sand", "picker_slate"))[::2] == [0, 3]
+    later = [(row, small[place]) for place, row in mine.items() if place[1] > 1]
+    beside = [x for measure in ("object_found", "psnr", "follows") for x in gain(measure, later)]
+    said = "From the second minute on, paired by robot, objects are found in {:.2f} ± {:.2f} more of the frames, PSNR is {:.1f} ± {:.1f} dB"
+    assert f"{said} and follows {{:.2f}} ± {{:.2f}} higher.".format(*beside) in page
 
 
-def test_what_was_hidden_for_long_does_not_come_back():
-    rows, page = read_rows(RESULTS / "hidden.csv"), " ".join(PAGE.read_text().split())
+def test_size_and_data_keep_objects():
+    page = words_of(PAGE)
+    larger, grown = (
+        [x for measure in ("object_found", "object_close", "tool_close", "psnr") for x in gains(name, measure, "weighed")]
+        for name in ("larger", "grown")
+    )
+    said = (
+        '"larger" finds objects in {:.2f} ± {:.2f} more of the frames than "weighed" (in place {:.2f} ± {:.2f}), has tools in place '
+        "in {:.2f} ± {:.2f} more and {:.1f} ± {:.1f} dB more PSNR"
+    )
+    assert said.format(*larger) in page
+    said = '"grown" finds objects in {:.2f} ± {:.2f} more (in place {:.2f} ± {:.2f}), tools in place in {:.2f} ± {:.2f} more, PSNR {:+.1f} ± {:.1f} dB'
+    assert said.format(*grown) in page
+    assert "from chance (objects found {:+.2f} ± {:.2f})".format(*gains("grown", "object_found", "larger")) in page
+
+
+def test_half_of_what_was_hidden_comes_back():
+    rows, page = read_rows(RESULTS / "grown_hidden.csv"), words_of(PAGE)
     hidden, control = ([row for row in rows if row["kind"] == kind] for kind in ("hidden", "control"))
     assert len(hidden) == len(control) == 48
-    for mine in (hidden, control):
-        found, close = ([round(100 * x) for x in over_robots(mine, name)[:2]] for name in ("found", "close"))
-        assert f"{found[0]} ± {found[1]} " in page and f"{close[0]} ± {close[1]} %" in page
+    found, close, stay, stay_close = (
+        [round(100 * x) for x in over_robots(mine, name)[:2]] for mine in (hidden, control) for name in ("found", "close")
+    )
+    assert f"in {found[0]} ± {found[1]} % of the cases, in {close[0]} ± {close[1]} % in place; of those never hidden" in page
+    assert f"of those never hidden {stay[0]} ± {stay[1]} and {stay_close[0]} ± {stay_close[1]} %." in page
     short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
     assert f"it is {sum(short):.0f} of {len(short)}, after four or more {sum(long):.0f} of {len(long)}" in page
-
-
-def _seconds(row: dict) -> str:
-    end = row["part"] * row["seconds"]
-    return f"{end - row['seconds']:.0f} to {end:.0f}"
 
 
 def test_the_detector_finds_what_is_there():
