@@ -7,10 +7,10 @@ Cost: the first an hour and a half of one core and its tokenizer, resumed where 
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
           actions of other episodes.
 
-Writes weights (their average, where the run keeps one, in half precision), tokenizer, the robots' commands, starts of held-out episodes,
-how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model, of a still picture
-and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1. clip.gif shows
-the first of them.
+Writes weights (in half precision; their average, where the run keeps one), tokenizer, the robots' commands, starts of
+held-out episodes, how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model,
+of a still picture and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
+clip.gif shows the first of them.
 """
 
 from __future__ import annotations

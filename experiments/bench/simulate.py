@@ -17,8 +17,8 @@ from hma_jax.simulator.folder import find_decode
 def time_simulator(
     run: Path, episodes: int, repeats: int, dtype: Dtype = "float32"
 ) -> tuple[list[Stage], DecodeConfig]:
-    """(stage `step`, how frames are filled): `episodes` that advance together past the window, one robot after the other
-    of the run's, at rest.
+    """(stage `step`, how frames are filled): `episodes` that advance together past the window, from the run's starts
+    in turn, at rest.
 
     Raises ConfigError where there is no run, or nothing to start from.
     """

@@ -53,7 +53,8 @@ def words_of(page: Path) -> str:
 
 def rows_of_trained() -> list[dict]:
     """Of all models that were watched for a minute from the same four starts of each robot."""
-    return [row for name in ("chained", "weighed", "long", "mended", "coarse", "larger", "grown") for row in read_rows(RESULTS / f"{name}.csv")]
+    names = ("chained", "weighed", "long", "mended", "coarse", "larger", "grown")
+    return [row for name in names for row in read_rows(RESULTS / f"{name}.csv")]
 
 
 def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, float]:
