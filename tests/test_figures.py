@@ -13,6 +13,7 @@ from experiments.applications import DRIVEN
 from experiments.bench.beside import OURS, RELEASED, THEIRS
 from experiments.bench.record import read_record
 from experiments.rows import OVERALL, Row, read_csv
+from tests.pages import table
 
 ROOT = Path(__file__).parents[1]
 README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
@@ -41,19 +42,6 @@ STAGES = {
     "a frame past the window, exact": "slide",
     "a training step": "step",
 }
-
-
-def table(page: Path, header: str) -> dict[str, list[str]]:
-    """First cell -> the others, of the table that begins with `header`."""
-    lines = page.read_text().split(header, 1)[1].splitlines()[2:]
-    rows = {}
-    for line in lines:
-        if not line.startswith("|"):
-            break
-        first, *rest = (cell.strip() for cell in line.strip().strip("|").split("|"))
-        rows[first] = rest
-    assert rows
-    return rows
 
 
 def shown(row: Row, digits: int) -> str:

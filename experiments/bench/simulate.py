@@ -9,16 +9,12 @@ import numpy as np
 from experiments.applications.simulators import load_simulator
 from experiments.bench.record import Stage
 from experiments.bench.timing import time_by_turns, time_once
-from hma_jax.config import DecodeConfig, ExecutionConfig
+from hma_jax.config import ExecutionConfig
 from hma_jax.config.execution import Dtype
-from hma_jax.simulator.folder import find_decode
 
 
-def time_simulator(
-    run: Path, episodes: int, repeats: int, dtype: Dtype = "float32"
-) -> tuple[list[Stage], DecodeConfig]:
-    """(stage `step`, how frames are filled): `episodes` that advance together past the window, from the run's starts
-    in turn, at rest.
+def time_simulator(run: Path, episodes: int, repeats: int, dtype: Dtype = "float32") -> Stage:
+    """Stage `step`: `episodes` that advance together past the window, from the run's starts in turn, at rest.
 
     Raises ConfigError where there is no run, or nothing to start from.
     """
@@ -31,4 +27,4 @@ def time_simulator(
     for _ in range(simulator.model.config.frames):
         simulator.step(actions)
     timing = time_by_turns({"step": lambda: simulator.step(actions)}, repeats)["step"]
-    return [Stage("step", episodes, timing, max(first - timing.median, 0.0), frames=episodes)], find_decode(run)
+    return Stage("step", episodes, timing, max(first - timing.median, 0.0), frames=episodes)

@@ -131,14 +131,15 @@ def simulate(
         out: Directory for the record.
     """
     from experiments.bench.simulate import time_simulator
+    from hma_jax.simulator.folder import find_decode
 
     require(repeats >= 1 and min(batch, default=0) >= 1, "--repeats and --batch must be at least 1")
     stages = []
     for episodes in batch:
         with step(f"time {episodes} episodes that advance together"):
-            found, decode = time_simulator(run, episodes, repeats, dtype)
-        stages += found
-    write("simulate", run.resolve().name, dtype, 0, {"run": str(run), "decode": decode}, stages, {}, (), out)
+            stages.append(time_simulator(run, episodes, repeats, dtype))
+    settings = {"run": str(run), "decode": find_decode(run)}
+    write("simulate", run.resolve().name, dtype, 0, settings, stages, {}, (), out)
 
 
 def load(

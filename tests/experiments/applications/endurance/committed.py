@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from experiments.applications.endurance.tables import over_robots, read_rows
+from tests.pages import table
 
 ROOT = Path(__file__).parents[4]
 RESULTS = ROOT / "experiments" / "results" / "endurance"
@@ -17,18 +18,6 @@ SHOWN = {
     "moves": 2,
 }  # fmt: skip
 """Measures of the page's tables, in the order of their columns, and digits."""
-
-
-def table(page: Path, header: str) -> dict[str, list[str]]:
-    """First cell -> the others, of a page's table whose head begins with `header`."""
-    rows = {}
-    for line in page.read_text().split(header, 1)[1].splitlines()[2:]:
-        if not line.startswith("|"):
-            break
-        first, *rest = (cell.strip() for cell in line.strip().strip("|").split("|"))
-        rows[first] = rest
-    assert rows
-    return rows
 
 
 def check_tables(page: Path, shown: Mapping[str, Callable[[str], list[dict]]]) -> None:
