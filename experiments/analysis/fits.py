@@ -6,8 +6,9 @@ intervals are percentiles over bootstraps of seeds x episodes (`measured`).
 
 Points that cannot tell the form from another are refused, with the reason: fewer than four positions on an axis, a
 loss that does not fall, an exponent at the end of what was searched. What is only doubtful is said beside the
-numbers: one seed per point, a coefficient that a good part of the bootstraps leaves at its bound, points that lie off
-the curve by more than seeds scatter, an exponent that hangs on the first position.
+numbers: one seed per point, a coefficient that a good part of the bootstraps leaves at its bound, an axis along which
+no two trials differ in nothing else, points that lie off the curve by more than seeds scatter, an exponent that hangs
+on the first position.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: b
     wide = [c for c in found if c.name in ("alpha", "beta") and c.high > WIDE * c.low]
     if not refused:
         doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide)
-        doubts += _misfit(measured, residuals) + _first_position(measured, found, weight)
+        doubts += _inferred(measured) + _misfit(measured, residuals) + _first_position(measured, found, weight)
     return PowerFit(
         measured.axes, measured.trial, refused, doubts, found, residuals, noise, theta, thetas, centre
     )
@@ -129,25 +130,36 @@ def _unfit(measured: Measured) -> str:
             return f"{len(distinct)} distinct {name}; the form has to be told from at least {LEAST}"
         if not (distinct > 0).all():
             return f"{name} has to be positive, got {distinct.min():g}"
+    positions, least = len(np.unique(measured.points)), LEAST + 2 * (len(measured.axes) - 1)
+    if positions < least:
+        return f"{positions} positions; the form over {' and '.join(measured.axes)} has to be told from at least {least}"
+    if not any(_lines(measured, k) for k in range(len(measured.axes))):
+        return f"no two trials differ in {' or in '.join(measured.axes)} alone: what each does cannot be told apart"
     if not (measured.value > 0).all():
         return f"the loss has to be positive, got {measured.value.min():g}"
     return _rising(measured)
+
+
+def _lines(measured: Measured, k: int) -> list[np.ndarray]:
+    """[n] each: the trials that differ on axis `k` alone, at two positions of it or more. None where no two share a
+    position on the other axis, as at equal compute no two sizes see as many windows."""
+    others = np.delete(measured.x, k, axis=1)
+    lines = [(others == rest).all(1) for rest in np.unique(others, axis=0)]
+    return [line for line in lines if len(np.unique(measured.x[line, k])) > 1]
 
 
 def _rising(measured: Measured) -> str:
     """A loss that does not fall from the first position of an axis to the last, by more than seeds scatter."""
     logs, noise = np.log(measured.value), np.nan_to_num(measured.noise())
     for k, name in enumerate(measured.axes):
-        others = np.delete(measured.x, k, axis=1)
         falls, errors = [], []
-        for rest in np.unique(others, axis=0):
-            line = (others == rest).all(1)
+        for line in _lines(measured, k):
             column = measured.x[line, k]
-            if len(np.unique(column)) < 2:
-                continue
             first, last = column == column.min(), column == column.max()
             falls.append(logs[line][first].mean() - logs[line][last].mean())
             errors.append(math.hypot(*(noise[line][e].mean() / math.sqrt(e.sum()) for e in (first, last))))
+        if not falls:
+            continue  # `_inferred` says so
         fall, error = np.mean(falls), math.sqrt(np.sum(np.square(errors))) / len(errors)
         if fall <= 2 * error:
             return (
@@ -155,6 +167,12 @@ def _rising(measured: Measured) -> str:
                 f"with a standard error over seeds of {100 * error:.1f} %"
             )
     return ""
+
+
+def _inferred(measured: Measured) -> tuple[str, ...]:
+    """Axes along which no trials were compared: that the loss falls there follows from the form."""
+    alone = [name for k, name in enumerate(measured.axes) if not _lines(measured, k)]
+    return tuple(f"no two trials differ in {name} alone: what it does is told by the form, not compared" for name in alone)
 
 
 def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> tuple[Coefficient, ...]:
@@ -174,7 +192,7 @@ def _misfit(measured: Measured, residuals: np.ndarray) -> tuple[str, ...]:
     """Whether positions lie off the curve by more than the seeds at a position scatter: an F test of lack of fit. It
     takes trials for independent, which branches of one run are not quite."""
     points, count = measured.points, np.bincount(measured.points)
-    left, free = len(count) - 1 - 2 * len(measured.axes), int((count - 1).sum())
+    left, free = len(count) - 1 - 2 * len(measured.axes), measured.freedom
     mean = np.bincount(points, residuals) / count
     scatter = float(((residuals - mean[points]) ** 2).sum())
     if left < 1 or free < 2 or scatter == 0:

@@ -108,6 +108,33 @@ def test_what_cannot_be_fitted_is_refused(rng, x, loss, reason):
     assert reason in fit.refused and not fit.coefficients
 
 
+SIZES = np.geomspace(1e4, 3e5, 5)
+LAW = (1.2, (0.8, 0.6), (0.4, 0.35))
+
+
+def test_sizes_that_share_no_windows_are_fitted_and_it_is_said(rng):
+    """At equal compute a larger model sees fewer windows: no two sizes see as many."""
+    x = np.array([(n, c / n) for n in SIZES for c in np.geomspace(1e8, 1e10, 4)])
+    assert len(np.unique(x[:, 1])) == len(x)
+    fit = fit_power(measured(x, power(x, *LAW), 5e-4, 3, rng), draws=50)
+    assert not fit.refused
+    assert (fit["alpha"].value, fit["beta"].value) == (pytest.approx(0.6, abs=0.1), pytest.approx(0.35, abs=0.05))
+    assert any(doubt.startswith("no two trials differ in trunk parameters alone") for doubt in fit.doubts)
+
+
+@pytest.mark.parametrize(
+    "x, reason",
+    [
+        ([(n, 1e9 / n) for n in np.geomspace(1e4, 3e5, 6)], "differ in trunk parameters or in windows alone"),
+        ([(n, 1e9 / n) for n in SIZES], "5 positions; the form over trunk parameters and windows"),
+    ],
+)
+def test_axes_that_never_change_alone_are_refused(rng, x, reason):
+    x = np.array(x)
+    fit = fit_power(measured(x, power(x, *LAW), 5e-4, 3, rng), draws=20)
+    assert reason in fit.refused and not fit.coefficients
+
+
 def test_a_step_is_no_power_law(rng):
     x = sizes(6)
     step = np.where(x[:, 0] > 1.1e4, 1.5, 2.0)
