@@ -21,7 +21,7 @@ from experiments.running.workspace import Record, Workspace, find_record, save_r
 from experiments.setting import Setting
 from experiments.study import Study
 from experiments.sweeps.registry import keep_axis, plan_sweeps
-from experiments.sweeps.sweep import Sweep, titles, unique_trials
+from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
 
@@ -59,7 +59,7 @@ def run_study(
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
         provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
-        require_judged(study, workspace, {name for sweep in sweeps for name in sweep.scope})
+        require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
             what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
             console.print(what, markup=False, soft_wrap=True)

@@ -187,6 +187,11 @@ def unique_trials(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, 
     return trials
 
 
+def all_judged(sweeps: Sequence[Sweep]) -> set[str]:
+    """Every dataset that a point of `sweeps` is averaged over."""
+    return {name for sweep in sweeps for point in sweep.points for name in point.scope or sweep.scope}
+
+
 def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     """A line for every trial of `sweeps`, by id, that tells it from the others."""
     lines: dict[str, str] = {}

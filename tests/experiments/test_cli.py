@@ -10,11 +10,14 @@ import pytest
 from experiments import run_study as study_runs
 from experiments.cli.main import main
 from experiments.preparing import pipeline, windows
+from experiments.presets import get_preset
 from experiments.running.attempts import read_states
 from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.setting import StudyArguments, make_setting
+from experiments.sweeps.draws import draw_judged
+from hma_jax.config import ConfigError
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
 COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer",
@@ -178,6 +181,20 @@ def test_a_study_of_other_settings_is_not_drawn_over(instant_trials, tmp_path, c
     assert load_record(Workspace(tmp_path)).axes == ("settings",)
     assert main([*other, "--replace", "study"]) == 0
     assert load_record(Workspace(tmp_path)).axes == ("conditioning",)  # nothing in common
+
+
+def test_robots_that_any_seed_is_judged_on_need_held_out_windows(instant_trials, tmp_path, capsys, monkeypatch):
+    """Before any trial: on designs over robots every seed judges others."""
+    smoke = get_preset("smoke")
+    drawn = [set(draw_judged(smoke, seed)) for seed in (0, 3)]
+    assert drawn[0] != set.union(*drawn)
+
+    def require_judged(study, workspace, judged):
+        raise ConfigError(f"judged: {sorted(judged)}")
+
+    monkeypatch.setattr(windows, "require_judged", require_judged)
+    assert main(["sweep", "dilution", "--preset", "smoke", "--set", "seeds=0,3", "--out", str(tmp_path)]) == 2
+    assert f"judged: {sorted(set.union(*drawn))}" in capsys.readouterr().err
 
 
 def test_settings_that_no_axis_so_far_depends_on_go_on_with_the_study(instant_trials, tmp_path):
