@@ -16,7 +16,10 @@ from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 
 if TYPE_CHECKING:
-    from experiments.analysis.scaling import Fitted
+    from experiments.analysis.measured import Place
+    from experiments.analysis.scaling import Curve, Fitted
+    from experiments.running.provenance import Provenance
+    from experiments.sweeps.sweep import Sweep
 
 
 def fit(
@@ -33,7 +36,8 @@ def fit(
 
     Args:
         study: Directory of a study that has run.
-        predict: The trials to predict, of every seed, by axis and position, such as width=96. They must not have run.
+        predict: The trials to predict, of every seed, by axis and position, such as width=96; where an axis has several
+            curves, by AXIS-SERIES=X, such as 'episodes-4,000 steps=160'. They must not have run.
         out: File of the prediction. Commit it before the trials are run: the commits show the order.
         settings: Change one setting of the study for the plan, so that it has the trials to predict, such as
             widths=16,32,64,96.
@@ -72,48 +76,38 @@ def _words(fitted: Fitted) -> tuple[str, str, str]:
 
 def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]) -> None:
     from experiments.analysis.predictions import predict, save_prediction
-    from experiments.analysis.scaling import curves_of
     from experiments.report.numbers import read_results, result_hashes
     from experiments.running.attempts import read_states
     from experiments.running.ledger import MISSING, Ledger
-    from experiments.running.trial import trial_id
     from experiments.study import override
     from experiments.sweeps.registry import plan_sweeps
-    from experiments.sweeps.sweep import POINT, unique_trials
+    from experiments.sweeps.sweep import unique_trials
 
     workspace = Workspace(root.absolute())
     record = load_record(workspace)
     require(record.provenance is not None, f"the study in {root} has not run yet; run `{record.command}`")
-    name, separator, text = asked.partition("=")
+    name, _, text = asked.rpartition("=")
     try:
         x = float(text)
     except ValueError:
         raise ConfigError(f"--predict {asked}: write it as AXIS=X, such as width=96") from None
     study = override(record.study, settings) if settings else record.study
-    axes = record.axes if name in record.axes else (*record.axes, name)
-    sweeps = plan_sweeps(study, axes, workspace.root)
-    sweep = next((s for s in sweeps if s.name == name), None)
+    sweeps, axis = plan_sweeps(study, record.axes, workspace.root), name.partition("-")[0]
+    if axis not in {s.name for s in sweeps}:
+        sweeps = plan_sweeps(study, (*record.axes, axis), workspace.root)
+    sweep = next((s for s in sweeps if s.name == axis), None)
     if sweep is None or not sweep.measured:
-        raise ConfigError(f"--predict {asked}: {name} is no axis over a number")
-    held = [p for p in sweep.points if p.x == x and p.role == POINT]
-    known = ", ".join(f"{v:g}" for v in sorted({p.x for p in sweep.points}))
-    if not held:
-        raise ConfigError(
-            f"--predict {asked}: the study plans no trial there (its positions: {known}); add it to the plan with --set"
-        )
-    ids = {trial_id(p.trial, record.provenance) for p in held}
+        raise ConfigError(f"--predict {asked}: {axis} is no axis over a number")
+    curve, held = _held_out(sweep, record.provenance, asked, x)
+    ids = [place.trial for place in held]
     states = read_states(sorted(ids), workspace.trials, Ledger(workspace.ledger))
     for id, state in states.items():
         require(
             state.event == MISSING,
             f"--predict {asked}: trial {id} exists already ({state.event}); a prediction is made before its trial runs",
         )
-    trials = list(unique_trials(sweeps, record.provenance))
-    results, windows = read_results(workspace, trials)
-    curves = [c for c in curves_of(sweeps, record.provenance) if ids & {p.trial for p in c.places}]
-    curve = next(c for c in curves if c.name.split("-")[0] == name)
-    places = [p for p in curve.places if p.trial in ids]
-    prediction = predict(curve, places, windows, result_hashes(results))
+    results, windows = read_results(workspace, unique_trials(sweeps, record.provenance))
+    prediction = predict(curve, held, windows, result_hashes(results))
     path = out or workspace.predictions / f"{curve.name}-{text}.json"
     save_prediction(path, prediction)
     console.print(
@@ -121,3 +115,33 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
         f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}", soft_wrap=True, highlight=False,
     )  # fmt: skip
     wrote(path, then=f"git add {shlex.quote(short(path))} && git commit, and only then run the trials")
+
+
+def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float) -> tuple[Curve, list[Place]]:
+    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`. Raises ConfigError where a
+    power law is not what the axis is to show, where it is not said which of several curves, and for a curve without a
+    trial there."""
+    from experiments.analysis.scaling import curves_of
+    from experiments.running.trial import trial_id
+    from experiments.sweeps.sweep import POINT
+
+    name, _, text = asked.rpartition("=")
+    require(
+        not sweep.valley,
+        f"--predict {asked}: along {sweep.name} the loss is lowest within, where no power law holds; `hma fit STUDY` "
+        "says which size is best for a budget (isoflop)",
+    )
+    curves = {curve.name: curve for curve in curves_of([sweep], provenance)}
+    if name == sweep.name and len(curves) == 1:
+        (name,) = curves
+    known = ", ".join(shlex.quote(f"{one}={text}") for one in curves)
+    require(name in curves, f"--predict {asked}: which curve of {sweep.name}? Write one of {known}")
+    series = name.removeprefix(sweep.name).removeprefix("-")
+    points = [p for p in sweep.points if p.role == POINT and p.series == series]
+    ids = {trial_id(p.trial, provenance) for p in points if p.x == x}
+    positions = ", ".join(f"{v:g}" for v in sorted({p.x for p in points}))
+    require(
+        bool(ids),
+        f"--predict {asked}: the study plans no trial there (its positions: {positions}); add it to the plan with --set",
+    )
+    return curves[name], [place for place in curves[name].places if place.trial in ids]

@@ -128,3 +128,42 @@ def test_a_prediction_after_the_fact_is_marked(root):
 def test_what_cannot_be_predicted_says_why(before, words, says, capsys):
     assert command(before, *words) == 2
     assert says in " ".join(capsys.readouterr().err.split())
+
+
+def with_own_axis(root, change):
+    """The study has a file's axis `own`, too: its widths once more, its trials finished; `change` is what becomes of it."""
+    (root / "axes").mkdir()
+    (root / "axes/mine.py").write_text(
+        "from dataclasses import replace\nfrom experiments.sweeps import width\n\n\n"
+        f"def plan(study):\n    sweep = replace(width.plan(study), name='own')\n    return {change}\n"
+    )
+    values = json.loads((root / "study.json").read_text())
+    (root / "study.json").write_text(json.dumps(values | {"axes": ["width", "axes/mine.py"]}))
+
+
+def predict_own(root, asked):
+    return command(root, "--predict", f"{asked}={HELD}", "--set", f"widths=8,16,24,32,48,{HELD}")
+
+
+def test_an_axis_of_a_file_is_predicted(root):
+    with_own_axis(root, "sweep")
+    assert predict_own(root, "own") == 0
+    [prediction] = load_predictions(root / "predictions").values()
+    assert prediction.curve == "own" and len(prediction.inputs) == 15 and len(prediction.trials) == 3
+
+
+def test_of_several_curves_one_is_chosen(root, capsys):
+    with_own_axis(root, "replace(sweep, points=tuple(replace(p, series=s) for s in ('one', 'as well') for p in sweep.points))")
+    assert predict_own(root, "own") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"which curve of own? Write one of own-one={HELD}, 'own-as well={HELD}'" in said
+    assert not (root / "predictions").exists()
+    assert predict_own(root, "own-as well") == 0
+    [(name, prediction)] = load_predictions(root / "predictions").items()
+    assert prediction.curve == "own-as well" and name == f"own-as well-{HELD}.json"
+
+
+def test_nothing_is_predicted_where_the_lowest_loss_is_within(root, capsys):
+    with_own_axis(root, "replace(sweep, valley=True)")
+    assert predict_own(root, "own") == 2
+    assert "along own the loss is lowest within, where no power law holds" in " ".join(capsys.readouterr().err.split())
