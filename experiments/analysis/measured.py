@@ -5,7 +5,9 @@ for all of them, and what makes an episode hard moves the whole curve and not it
 fit is made to every trial and not to the mean over seeds: an outlier among them then weighs little.
 
 Where every seed is judged on robots of its own, how hard these are is taken out: each seed is shifted, in the
-logarithm, to the mean level of all. Their windows differ, so that seeds alone are drawn.
+logarithm, to the mean level of all. Their windows differ, so that seeds alone are drawn. Levels are estimated from the
+same losses, which makes the seeds of a position scatter less than they do: their spread is put right by the degrees of
+freedom that the levels took.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ class Measured:
     seed: np.ndarray  # [n], int
     value: np.ndarray  # [n]: mean over windows, then over robots
     panel: Panel | None  # of their windows, each trial a point with one seed; None where seeds have other windows
+    levels: int = 0  # differences between seeds that were estimated from these losses and taken out of `value`
 
     def __post_init__(self):
         lengths = {len(x) for x in (self.x, self.run, self.trial, self.seed, self.value)}
@@ -55,24 +58,36 @@ class Measured:
             points, seeds = (tuple(column[i] for i in at) for column in (panel.points, panel.seeds))
             panel = Panel(panel.robot, panel.episode, points, seeds)
         trial = tuple(self.trial[i] for i in at)
-        return Measured(self.axes, self.x[at], self.run[at], trial, self.seed[at], self.value[at], panel)
+        levels = min(self.levels, len(np.unique(self.seed[at])) - 1)
+        return Measured(self.axes, self.x[at], self.run[at], trial, self.seed[at], self.value[at], panel, levels)
 
     def seeds_per_point(self) -> int:
         """The least that any position has."""
         return int(np.bincount(self.points).min())
 
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the scatter of S seeds at each of P positions, P (S - 1); (P - 1)(S - 1) where levels
+        were taken out."""
+        return len(self.value) - len(np.unique(self.points)) - self.levels
+
+    def _stretch(self) -> float:
+        """How many times too small a seed's deviation from the mean of its position is, since levels were taken out:
+        sqrt(P / (P - 1)) with all seeds at each of P positions."""
+        return float(np.sqrt((self.freedom + self.levels) / self.freedom)) if self.freedom > 0 else 1.0
+
     def noise(self) -> np.ndarray:
         """[n]: standard deviation over seeds of the logarithm of a trial's loss, at its position.
 
         The variance of a position is joined with that of all, which counts as PRIOR more observations. nan where no
-        position has two seeds.
+        position has two seeds, or levels left nothing of their scatter.
         """
         logs, points = np.log(self.value), self.points
         count = np.bincount(points)
         mean = np.bincount(points, logs) / count
-        squares = np.bincount(points, (logs - mean[points]) ** 2)
+        squares = np.bincount(points, (self._stretch() * (logs - mean[points])) ** 2)
         freedom = count - 1
-        if not freedom.sum():
+        if self.freedom < 1:
             return np.full(len(logs), np.nan)
         pooled = squares.sum() / freedom.sum()
         return np.sqrt((squares + PRIOR * pooled) / (freedom + PRIOR))[points]
@@ -81,8 +96,9 @@ class Measured:
         """[draws, n]: the losses with seeds, and unless told otherwise episodes, drawn with replacement.
 
         Seeds are drawn per run, so that branches of a run move together. A seed's deviation from the mean of its
-        position is taken sqrt(m / (m - 1)) times for m seeds: otherwise the spread of few would come out too small.
-        With a single seed nothing is known of the spread, and the loss keeps it.
+        position is taken sqrt(m / (m - 1)) times for m seeds, and `_stretch` times where levels were taken out: otherwise
+        the spread of few would come out too small. With a single seed nothing is known of the spread, and the loss keeps
+        it.
         """
         number = int(rng.integers(2**31))
         if self.panel is None:
@@ -104,7 +120,8 @@ class Measured:
                 chosen = chosen_RS if m == len(seeds) else rng.integers(0, m, (draws, m))
                 own = means_Rn[:, at]
                 centre = own.mean(1, keepdims=True)
-                found[:, at] = centre + np.sqrt(m / (m - 1)) * (np.take_along_axis(own, chosen, 1) - centre)
+                times = self._stretch() * np.sqrt(m / (m - 1))
+                found[:, at] = centre + times * (np.take_along_axis(own, chosen, 1) - centre)
         return found
 
 
@@ -142,7 +159,7 @@ def measure(
     panel = next(iter(panels.values())) if len(panels) == 1 else None
     return Measured(
         tuple(axes), x, np.array([place.run for place in places]), tuple(place.trial for place in places), seed,
-        value if panel else _levelled(value, x, seed), panel,
+        value if panel else _levelled(value, x, seed), panel, 0 if panel else len(np.unique(seed)) - 1,
     )  # fmt: skip
 
 
