@@ -27,6 +27,8 @@ from data_pipelines.suite.embodiments import EMBODIMENTS, siblings, strangers
 from data_pipelines.suite.render import positions_of
 from data_pipelines.suite.rollout import episode_seeds, simulate
 from data_pipelines.suite.spec import EmbodimentSpec
+from experiments.analysis.intervals import interval_of
+from hma_jax.evaluation.statistics import mean_and_sem
 
 OUT = Path("experiments/results/suite/siblings.csv")
 EPISODES = 64
@@ -35,8 +37,6 @@ STEPS = 40
 
 RIDGE = 3e-3
 """Of the mean squared feature, for each sample."""
-
-RESAMPLES = 2000
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Result:
-    """Errors as shares of the robots' motion; gains over the controls with 95 % intervals."""
+    """Errors as shares of the robots' motion; gains over the controls with 95 % intervals over other robots."""
 
     family: str
     siblings: float
@@ -120,20 +120,16 @@ def judge(family: str, samples: dict[str, Samples]) -> Result:
     means = {name: float(np.mean([e.mean() for e in values])) for name, values in errors.items()}
     return Result(
         family, **means,
-        over_strangers=_gain(errors["strangers"], errors["siblings"], rng),
-        over_shuffled=_gain(errors["shuffled"], errors["siblings"], rng),
+        over_strangers=gain(errors["strangers"], errors["siblings"]),
+        over_shuffled=gain(errors["shuffled"], errors["siblings"]),
     )  # fmt: skip
 
 
-def _gain(control: list[np.ndarray], own: list[np.ndarray], rng: np.random.Generator) -> tuple[float, float, float]:
-    """Mean of control - own and its 95 % interval, resampling robots and then their episodes."""
-    differences = [c - o for c, o in zip(control, own, strict=True)]
-    means = []
-    for _ in range(RESAMPLES):
-        drawn = [differences[k] for k in rng.integers(len(differences), size=len(differences))]
-        means.append(np.mean([d[rng.integers(len(d), size=len(d))].mean() for d in drawn]))
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(np.mean([d.mean() for d in differences])), float(low), float(high)
+def gain(control: Sequence[np.ndarray], own: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """(mean of control - own, low, high) of errors per episode of each robot; the 95 % interval is Student's t of the
+    robots' means: how far episodes scatter is in them. nan around the gain of a single robot."""
+    i = interval_of(mean_and_sem([(c - o).mean() for c, o in zip(control, own, strict=True)]))
+    return i.mean, i.low, i.high
 
 
 def main() -> None:

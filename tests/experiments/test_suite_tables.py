@@ -11,7 +11,7 @@ from data_pipelines.suite.embodiments import EMBODIMENTS, siblings
 from experiments.suite import explained as explained_module
 from experiments.suite.clips import animation, clip
 from experiments.suite.explained import explained, read_table
-from experiments.suite.siblings import OUT, Samples, judge, predictor, sample
+from experiments.suite.siblings import OUT, Samples, gain, judge, predictor, sample
 from experiments.suite.tokenizer import quality
 
 BY_NAME = {s.name: s for s in EMBODIMENTS}
@@ -81,12 +81,27 @@ def test_a_prediction_from_siblings_uses_the_actions():
     assert right < 0.4 * wrong
 
 
+def test_about_nineteen_of_twenty_intervals_of_a_gain_hold_the_truth():
+    """Of five robots, whose gains differ; 16 would be held by percentiles of resampled robots."""
+    rng, held = np.random.default_rng(0), 0
+    for _ in range(400):
+        own = [np.zeros(8)] * 5
+        control = [1.0 + 0.3 * rng.standard_normal() + 0.1 * rng.standard_normal(8) for _ in own]
+        mean, low, high = gain(control, own)
+        assert mean == pytest.approx(np.mean(control))
+        held += low <= 1.0 <= high
+    assert 0.92 <= held / 400 <= 0.98  # 0.95 ± 0.011
+
+
 @pytest.mark.slow
 def test_the_simulator_still_gives_the_committed_sibling_figures():
     family = [s for s in EMBODIMENTS if s.family in ("pusher", "rover")]
     result, row = judge("pusher", {s.name: sample(s, 3) for s in family}), sibling_rows()["pusher"]
     for name in ("siblings", "strangers", "shuffled"):
         assert getattr(result, name) == pytest.approx(float(row[name]), abs=5e-3)
+    for name in ("over_strangers", "over_shuffled"):
+        then = [float(row[column]) for column in (name, f"{name}_low", f"{name}_high")]
+        assert getattr(result, name) == pytest.approx(then, abs=2e-2)
 
 
 def test_a_clip_plays():
