@@ -189,13 +189,18 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
             controls[r.trial] = max(controls.get(r.trial, r), r, key=lambda row: row.n)
     if not controls:
         return Check(name, "open", "No control, trained on shuffled actions, is finished.")
-    far = max(abs(_errors(r.mean, r.sem)) for r in controls.values())
-    mean = sum(r.mean for r in controls.values()) / len(controls)
-    sem = math.sqrt(sum(r.sem**2 for r in controls.values())) / len(controls)
+    unknown = [r.trial for r in controls.values() if math.isfinite(r.mean) and math.isnan(r.sem)]
+    known = [r for id, r in controls.items() if id not in unknown]
+    far = max((abs(_errors(r.mean, r.sem)) for r in known), default=0.0)
+    if unknown and far <= EACH:
+        text = f"Of {len(unknown)} of {len(controls)} controls nobody knows the error: one episode per robot tells none."
+        return Check(name, "open", text)
+    mean = sum(r.mean for r in known) / len(known)
+    sem = math.sqrt(sum(r.sem**2 for r in known)) / len(known)
     fine = far <= EACH and abs(_errors(mean, sem)) <= MEAN  # nan: not fine
     off = f"{_errors(mean, sem):+.1f}"
-    text = f"{len(controls)} controls: at most {far:.1f} standard errors from zero, their mean {off}"
-    if len(controls) == 1:
+    text = f"{len(known)} controls: at most {far:.1f} standard errors from zero, their mean {off}"
+    if len(known) == 1:
         text = f"One control: {off} standard errors from zero"
     text = f"{text} (allowed: {EACH:g} each, {MEAN:g} for the mean).".replace("-", "\u2212")
     return Check(name, "good" if fine else "bad", text)

@@ -14,6 +14,7 @@ from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT
+from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, judged_study
@@ -65,8 +66,6 @@ def trials_of(record, **wanted):
 
 def rejudge(workspace, id, change):
     """Windows of a trial changed, and all that follows from them made again: nothing but the numbers can tell."""
-    from hma_jax.evaluation.summary import summarise
-
     directory = workspace.trials / id
     windows = WindowTable.load(directory / FILE)
     metrics = change(dict(windows.metrics))
@@ -183,6 +182,23 @@ def test_a_control_that_follows_actions_is_bad(copied):
     workspace.results.unlink()
     draw(workspace, record)
     assert verdicts(workspace)["controls"][0] == "bad"
+
+
+def test_a_control_of_one_episode_per_robot_leaves_the_question_open(copied):
+    workspace, record = copied
+    [control] = trials_of(record, role=CONTROL)
+    directory = workspace.trials / control
+    result = json.loads((directory / RESULT).read_text())
+    result.pop("hash")
+    windows = WindowTable.load(directory / FILE)
+    windows = replace(windows, episode=np.zeros_like(windows.episode), start=np.arange(len(windows)))
+    windows.save(directory / FILE, control)
+    write_result(directory, result | {"evaluation": summarise(windows, 1).to_dict()})
+    workspace.results.unlink()
+    draw(workspace, record)
+    assert verdicts(workspace)["controls"] == (
+        "open", ".</b> Of 1 of 1 controls nobody knows the error: one episode per robot tells none.",
+    )  # fmt: skip
 
 
 def test_robots_worse_than_copying_are_named(copied):
