@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
 from experiments.preparing.made_from import Step, require_same
-from experiments.program import command_line
+from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console
 from experiments.report.draw import draw
 from experiments.running.attempts import State, read_states
@@ -18,9 +19,9 @@ from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import share_runs
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
-from experiments.setting import Setting
+from experiments.setting import Setting, short
 from experiments.study import Study
-from experiments.sweeps.registry import keep_axis, plan_sweeps
+from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_sweeps
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
@@ -63,11 +64,12 @@ def run_study(
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
             what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
             console.print(what, markup=False, soft_wrap=True)
-        kept = [keep_axis(axis, workspace.root) for axis in axes]
-        all_axes = tuple(dict.fromkeys([*(earlier.axes if earlier else ()), *kept]))
-        record = Record(study, setting.data, all_axes, command_line(), provenance)
+        every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
+        shown = unique_trials(plan_sweeps(study, tuple(every.values())), provenance)
         trials = unique_trials(sweeps, provenance)
-        require_agreement(workspace, record, trials, sources, accept_code)
+        require_agreement(workspace, shown, trials, sources, accept_code)
+        kept = keep_axes(every, workspace.root)
+        record = Record(study, setting.data, kept, whole_command(setting, kept), provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
         jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common)
@@ -91,15 +93,24 @@ def make_jobs(
     return jobs
 
 
+def whole_command(setting: Setting, axes: Sequence[str]) -> str:
+    """The command line that runs all `axes` of the study anew, whichever commands ran them; files of axes are relative
+    to its directory."""
+    where = [short(setting.workspace.root / axis) if is_file(axis) else axis for axis in axes]
+    asked = [one for one in setting.asked.set if one.partition("=")[0].strip() != "axes"]
+    if tuple(axes) != get_preset(setting.asked.preset).axes:
+        asked.append(f"axes={','.join(where)}")
+    return dataclasses.replace(setting, asked=dataclasses.replace(setting.asked, set=tuple(asked))).command("study")
+
+
 def require_agreement(
-    workspace: Workspace, record: Record, asked: Collection[str], sources: Closure, accept_code: bool
+    workspace: Workspace, shown: Collection[str], asked: Collection[str], sources: Closure, accept_code: bool
 ) -> None:
-    """Raises ConfigError if a finished trial of the study is not what it was, or if its trials, with those to be run
-    of the ids that are `asked` for, ran different sources and nobody accepts that."""
+    """Raises ConfigError if a finished trial of those `shown`, all of the study, is not what it was, or if they, with
+    those to be run of the ids that are `asked` for, ran different sources and nobody accepts that."""
     from experiments.running.agreement import check_finished, require_one_closure
     from experiments.running.sealed import RESULT
 
-    shown = unique_trials(plan_sweeps(record.study, record.axes, workspace.root), record.provenance)
     check_finished(workspace.trials, shown)
     complete = all((workspace.trials / id / RESULT).exists() for id in asked)
     require_one_closure(workspace.trials, shown, None if complete else sources, accept_code)

@@ -9,7 +9,7 @@ import difflib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from data_pipelines.publishing.files import write_file
@@ -26,6 +26,9 @@ DESIGNS = ("dilution", "transfer", "newcomers", "fewshot", "episodes", "compute"
 AXES = (*SCALING, "settings", "conditioning", "ladder", "lr", *DESIGNS)
 """Each is `experiments.sweeps.<name>`."""
 
+KEPT = "axes"
+"""The directory of a study that holds the files of its axes."""
+
 Plan = Callable[[Study], Sweep]
 
 
@@ -34,16 +37,25 @@ def is_file(axis: str) -> bool:
     return axis.endswith(".py")
 
 
-def keep_axis(axis: str, root: Path) -> str:
-    """The axis as a study in `root` remembers it: a user's file is copied there, so that its report can be drawn
-    anywhere and its trials be planned again."""
-    if not is_file(axis):
-        return axis
-    kept = Path("axes") / Path(axis).name
-    text = Path(axis).read_bytes()
-    (root / kept).parent.mkdir(exist_ok=True)
-    write_file(root / kept, text)
-    return str(kept)
+def join_axes(study: Study, root: Path, before: Sequence[str], axes: Sequence[str]) -> dict[str, str]:
+    """{name: axis} of the axes that a study in `root` had `before`, whose files lie there, and of those asked for now:
+    an axis takes the place of another one only if it has its name, whatever their files are called."""
+    had = [str(root / axis) if is_file(axis) else axis for axis in before]
+    return {
+        sweep.name: axis
+        for some in (had, axes)
+        for axis, sweep in zip(some, plan_sweeps(study, some), strict=True)
+    }
+
+
+def keep_axes(axes: Mapping[str, str], root: Path) -> tuple[str, ...]:
+    """The axes, {name: axis}, as a study in `root` remembers them: of a user's file a copy there, by the axis's name,
+    so that its report can be drawn anywhere and its trials be planned again."""
+    texts = {name: Path(axis).read_bytes() for name, axis in axes.items() if is_file(axis)}
+    for name, text in texts.items():
+        (root / KEPT).mkdir(exist_ok=True)
+        write_file(root / KEPT / f"{name}.py", text)
+    return tuple(f"{KEPT}/{name}.py" if name in texts else axis for name, axis in axes.items())
 
 
 def find_axis(axis: str, root: Path = Path()) -> Plan:

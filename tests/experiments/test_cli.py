@@ -4,6 +4,7 @@ import shlex
 import subprocess
 import sys
 from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 
@@ -157,6 +158,48 @@ def test_an_ablation_ends_in_its_own_page(instant_trials, tmp_path, capsys):
     assert main(["sweep", "settings", "--preset", "smoke", "--out", str(tmp_path)]) == 0
     assert [p.name for p in (tmp_path / "figures").iterdir()] == ["settings.png"]
     assert "Ablation: dynamics setting" in (tmp_path / "report.html").read_text()
+
+
+@pytest.fixture
+def no_trials(instant_trials, monkeypatch):
+    """None is run, and nothing is drawn."""
+    for name in ("run_jobs", "draw", "require_results"):
+        monkeypatch.setattr(study_runs, name, lambda *_: None)
+
+
+def test_a_study_remembers_the_command_that_runs_all_of_it(no_trials, tmp_path, monkeypatch, capsys):
+    """Not the last one, which ran one axis and was to replace something."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(
+        "from dataclasses import replace\nfrom experiments.sweeps import trajectories\n"
+        "def plan(study):\n    return replace(trajectories.plan(study), name='own')\n"
+    )
+    where, others = ["--preset", "smoke", "--out", "a b"], ["--set", "train.steps=2"]
+    assert main(["study", *where, "--set", "axes=settings", *others, "--replace", "study", "--accept-code"]) == 0
+    assert main(["sweep", "mine.py", *where, *others, "--retry-failed", "--accept-code"]) == 0
+    command = load_record(Workspace(tmp_path / "a b")).command
+    assert shlex.split(command) == ["hma", "study", *where, *others, "--set", "axes=settings,a b/axes/own.py"]
+    Path("mine.py").unlink()
+    capsys.readouterr()
+    assert main([*shlex.split(command)[1:], "--dry-run"]) == 0 and "full dynamics" in capsys.readouterr().out
+    assert main(["study", "--preset", "smoke", "--out", "plain"]) == 0
+    assert load_record(Workspace(tmp_path / "plain")).command == "hma study --preset smoke --out plain"
+
+
+def test_a_refused_command_leaves_the_axes_of_a_study_alone(no_trials, tmp_path, monkeypatch):
+    path, out = tmp_path / "mine.py", tmp_path / "out"
+    path.write_text("from dataclasses import replace\nfrom experiments.sweeps import settings\n"
+                    "def plan(study):\n    return replace(settings.plan(study), name='own')\n")  # fmt: skip
+    assert main(["sweep", str(path), "--preset", "smoke", "--out", str(out)]) == 0
+    kept = {file: file.read_bytes() for file in (out / "axes/own.py", out / "study.json")}
+    path.write_text(path.read_text() + "# edited\n")
+
+    def refuse(*_):
+        raise ConfigError("trials ran other sources")
+
+    monkeypatch.setattr(study_runs, "require_agreement", refuse)
+    assert main(["sweep", str(path), "--preset", "smoke", "--out", str(out)]) == 2
+    assert {file: file.read_bytes() for file in kept} == kept
 
 
 def test_axes_of_one_study_share_a_report(instant_trials, tmp_path):

@@ -10,7 +10,7 @@ from experiments.cli.main import main
 from experiments.presets import CPU_FULL
 from experiments.report.draw import draw
 from experiments.running.workspace import Workspace, load_record, save_record
-from experiments.sweeps.registry import AXES, find_axis, keep_axis, plan_sweeps
+from experiments.sweeps.registry import AXES, find_axis, join_axes, keep_axes, plan_sweeps
 from hma_jax.config import ConfigError
 from tests.experiments.fakes import STUDY, finished_study, record_of
 
@@ -60,7 +60,7 @@ def test_the_documented_axis_is_planned(documented, capsys):
 def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
     root = tmp_path / "study"
     root.mkdir()
-    kept = keep_axis(str(documented), root)
+    (kept,) = keep_axes({"temperature": str(documented)}, root)
     documented.unlink()
     axes = ("width", kept)
     save_record(Workspace(root), record_of(axes=axes))
@@ -70,6 +70,23 @@ def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
     assert (root / "figures/temperature.png").exists()
     rows = (root / "results.csv").read_text()
     assert all(f"temperature,{x}," in rows.replace(".0,", ",") for x in (1, 3, 10))
+
+
+def test_files_are_kept_by_the_names_of_their_axes(tmp_path):
+    """Two people's `mine.py` are two axes; an axis of a name that is there takes its place."""
+    root = tmp_path / "study"
+    root.mkdir()
+    axes = ("width",)
+    for folder, name, width in (("a", "narrow", 8), ("b", "wide", 32), ("c", "narrow", 4)):
+        path = tmp_path / folder / "mine.py"
+        path.parent.mkdir()
+        path.write_text(
+            "from dataclasses import replace\nfrom experiments.sweeps import width\n"
+            f"def plan(study):\n    return replace(width.plan(replace(study, widths=({width},))), name={name!r})\n"
+        )
+        axes = keep_axes(join_axes(STUDY, root, axes, [str(path)]), root)
+    assert axes == ("width", "axes/narrow.py", "axes/wide.py")
+    assert [min(p.x for p in s.points) for s in plan_sweeps(STUDY, axes, root)] == [8, 4, 16]
 
 
 @pytest.mark.parametrize(
