@@ -281,6 +281,14 @@ def test_what_was_found_is_as_readme_says():
     assert f"best trunk grows as C^{best['a']:.2f}" in text
 
 
+def test_the_curve_over_robots_in_the_mixture_is_as_findings_say():
+    with open(RESULTS / "cpu-full" / "fits.csv", newline="") as file:
+        rows = {r["coefficient"]: r for r in csv.DictReader(file) if r["curve"] == "transfer"}
+    e, alpha = ([f"{float(rows[name][column]):.2f}" for column in ("value", "low", "high")] for name in ("E", "alpha"))
+    said = f"flattens to {e[0]} nats ({e[1]} to {e[2]} with 90 %; exponent {alpha[0]}, {alpha[1]} to {alpha[2]})"
+    assert said in " ".join(findings().split()), said
+
+
 OF_ONE_CURVE = [(sweep, "cpu-full") for sweep in ("width", "dilution", "transfer", "newcomers", "settings", "conditioning")]
 
 
