@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import difflib
 import json
+import types
+import typing
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any, Literal
 
 from hma_jax.config import (
@@ -112,6 +114,11 @@ class DesignConfig:
     def __post_init__(self):
         for name in ("counts", "shots", "shots_after", "caps", "budgets", "long", "compute"):
             require_increasing(f"designs.{name}", getattr(self, name), at_least=1)
+        factors = self.rate_factors
+        require(
+            list(factors) == sorted(set(factors)) and all(f > 0 for f in factors),
+            f"designs.rate_factors must increase and be positive, got {factors}",
+        )
         for name in ("judged", "poor", "kinship", "shots_steps"):
             require(getattr(self, name) >= 1, f"designs.{name} must be at least 1, got {getattr(self, name)}")
         n = self.other_actions
@@ -167,6 +174,9 @@ class Study:
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
             require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
         self._check_tokens()
+        for name in ("tau", "flops_per_second"):
+            require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")
+        require(self.trial_seconds >= 0, f"trial_seconds must not be negative, got {self.trial_seconds:g}")
         require(
             self.rate is None or self.rate > 0,
             f"rate, in frames per second, must be positive, or null for the native rate, got {self.rate}",
@@ -328,8 +338,15 @@ def _meant(node: dict[str, Any], group: str, rest: Sequence[str], known: Sequenc
     )
 
 
-OF_NAMES = ("datasets", "unseen")
-"""Lists of names, which may be empty."""
+def _of_names(config: type, path: str) -> bool:
+    """Whether the setting at `path` of a `config` is a list of names, which may be empty."""
+    name, _, rest = path.partition(".")
+    hint = typing.get_type_hints(config).get(name)
+    kinds = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
+    if rest:
+        return any(is_dataclass(kind) and _of_names(kind, rest) for kind in kinds)
+    elements = [typing.get_args(kind)[0] for kind in kinds if typing.get_origin(kind) is tuple]
+    return any(element is str or typing.get_origin(element) is Literal for element in elements)
 
 
 def _parse(path: str, text: str, old: Any) -> Any:
@@ -338,7 +355,7 @@ def _parse(path: str, text: str, old: Any) -> Any:
         return text
     if isinstance(old, list) and not text.startswith("["):
         items = [t.strip() for t in text.split(",") if t.strip()]
-        return [t if path in OF_NAMES or old and isinstance(old[0], str) else _json(path, t) for t in items]
+        return items if _of_names(Study, path) else [_json(path, t) for t in items]
     value = _json(path, text)
     if old is not None and value is not None:
         number = isinstance(old, (int, float)) and not isinstance(old, bool)

@@ -12,7 +12,7 @@ from experiments.progress import console
 from experiments.running.launchers.registry import Launching
 from experiments.setting import StudyArguments, make_setting
 from experiments.sweeps.registry import AXES, is_file, plan_sweeps
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 
 def study(
@@ -71,6 +71,7 @@ def _run(
     """`axes`: () for those of the study."""
     setting = make_setting(asked)
     axes = axes or setting.study.axes
+    require(bool(axes), "axes is empty: the study has nothing to run; name some, such as --set axes=width,datasets")
     if running.workers is not None and running.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     if running.dry_run:

@@ -17,10 +17,12 @@ from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
+from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """Steps so that every width spends the FLOPs that the reference spends in each of `designs.compute` steps."""
+    """Steps so that every width spends the FLOPs that the reference spends in each of `designs.compute` steps. Raises
+    ConfigError where none of these is enough."""
     widths = sorted({*study.widths, study.model.width})
     flops = {width: flops_per_step(of_width(reference_trial(study, study.seeds[0]), width)) for width in widths}
     budgets = {steps: steps * flops[study.model.width] for steps in study.designs.compute}
@@ -40,14 +42,19 @@ def plan(study: Study) -> Sweep:
         for width in widths
         for seed in study.seeds
     ]
+    require(
+        bool(points),
+        f"designs.compute {study.designs.compute}: at none of these steps' FLOPs the widest model, of {widths[-1]}, trains "
+        f"beyond train.optimizer.warmup_steps, {study.train.optimizer.warmup_steps}; --set designs.compute=...",
+    )
     return Sweep(
         "compute",
         "width of the trunk",
         study.dataset_names(),
         tuple(points),
         question="How wide should a model be for a given amount of compute? Along a curve every model spends the same "
-        "training FLOPs: wide ones see fewer windows. All have one learning rate, which is too low for the shortest "
-        "runs, those of wide models on little compute: their loss is an upper bound.",
+        "training FLOPs: wide ones see fewer windows. All have one learning rate, however few their steps: where "
+        "another suits so few better, their loss is an upper bound.",
         gain="compute",
         title="Equal compute",
         valley=True,

@@ -16,11 +16,20 @@ from dataclasses import replace
 from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
+from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """All robots at every point, judged on all; the last point has all trajectories."""
-    caps = (*study.designs.caps, None)
+    """All robots at every point, judged on all; the last point has all trajectories. Raises ConfigError without a cap
+    that takes some away."""
+    # A cap that takes some away would leave more if it were one higher.
+    cutting = [cap for cap in study.designs.caps if count_episodes(study, cap) < count_episodes(study, cap + 1)]
+    require(
+        bool(cutting),
+        f"the axis episodes needs a cap that takes trajectories from some robot; none of designs.caps {study.designs.caps} "
+        "does: --set designs.caps=...",
+    )
+    caps = (*cutting, None)
     budgets = sorted({study.train.steps // 4, study.train.steps // 2, study.train.steps} - {0})
 
     def point(seed: int, cap: int | None, steps: int) -> Point:
@@ -39,7 +48,7 @@ def plan(study: Study) -> Sweep:
         study.dataset_names(),
         tuple(points),
         question="What does more data per robot buy? Every robot has at most "
-        f"{', '.join(map(str, study.designs.caps))} or all of its trajectories, the same for all curves of a seed and "
+        f"{', '.join(map(str, cutting))} or all of its trajectories, the same for all curves of a seed and "
         "each lot inside the next; x is how many there are in all. All robots weigh the same everywhere.",
         gain="more data",
         title="Training trajectories",

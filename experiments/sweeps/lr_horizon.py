@@ -16,12 +16,20 @@ from experiments.program import run_sweep
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
+from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
-    """The reference trial at other rates, the study's own among them."""
-    rate = study.train.optimizer.learning_rate
-    shortest, longest = study.designs.budgets[0], study.train.steps
+    """The reference trial at other rates, the study's own among them. Raises ConfigError without rates, or without
+    budgets."""
+    rate, longest = study.train.optimizer.learning_rate, study.train.steps
+    for name in ("budgets", "rate_factors"):
+        require(
+            bool(getattr(study.designs, name)),
+            f"designs.{name} is empty; the axis lr_horizon tries designs.rate_factors at the first of designs.budgets: "
+            f"--set designs.{name}=...",
+        )
+    horizons = dict.fromkeys((study.designs.budgets[0], longest))  # one, where they are the same
 
     def trial(factor: float, steps: int, seed: int) -> Trial:
         whole = reference_trial(study, seed, steps)
@@ -35,7 +43,7 @@ def plan(study: Study) -> Sweep:
         study.dataset_names(),
         tuple(
             Point(rate * factor, trial(factor, steps, seed), series=f"{steps:,} steps")
-            for steps in (shortest, longest)
+            for steps in horizons
             for factor in study.designs.rate_factors
             for seed in study.seeds
         ),

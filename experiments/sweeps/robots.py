@@ -41,7 +41,7 @@ def plan_robots(
     """The sweep over numbers of robots, each trained for its `steps`, with controls at both ends."""
     counts = tuple(steps)
     require(
-        counts[0] == study.designs.judged and counts[-1] == len(study.dataset_names()),
+        counts[:1] == (study.designs.judged,) and counts[-1:] == (len(study.dataset_names()),),
         f"designs.counts {counts} must begin with designs.judged, {study.designs.judged}, and end with all "
         f"{len(study.dataset_names())} robots",
     )
@@ -50,7 +50,7 @@ def plan_robots(
         return Point(count, robots_trial(study, seed, count, steps[count]), scope=draw_judged(study, seed))
 
     points = [point(seed, count) for count in counts for seed in study.seeds]
-    for count in (counts[0], counts[-1]):
+    for count in sorted({counts[0], counts[-1]}):
         end = point(study.seeds[0], count)
         points.append(replace(end, trial=control_of(end.trial), role=CONTROL))
     scope = draw_judged(study, study.seeds[0])

@@ -14,6 +14,7 @@ from experiments.cost import plan_trials
 from experiments.preparing_cost import estimate_preparing
 from experiments.presets import CPU_FULL, PAPER
 from experiments.running.trial import training_of, trial_id
+from experiments.study import override
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.registry import AXES, find_axis, plan_sweeps
@@ -137,6 +138,38 @@ def test_few_shots_start_from_trials_of_other_axes():
     assert all(p.trial.train.only == CPU_FULL.unseen for p in adapted)
 
 
+@pytest.mark.parametrize(
+    ("axis", "setting", "words"),
+    [
+        ("dilution", "designs.counts=", r"designs.counts \(\) must begin with designs.judged, 5, and end with all 40"),
+        ("transfer", "designs.counts=", r"designs.counts \(\) must begin"),
+        ("fewshot", "designs.shots=", "designs.shots is empty"),
+        ("fewshot", "designs.shots_after=", "designs.shots_after is empty"),
+        ("lr_horizon", "designs.budgets=", "designs.budgets is empty"),
+        ("lr_horizon", "designs.rate_factors=", "designs.rate_factors is empty"),
+        ("episodes", "designs.caps=", r"none of designs.caps \(\) does"),
+        ("episodes", "designs.caps=5000", r"none of designs.caps \(5000,\) does"),
+        ("compute", "designs.compute=", r"designs.compute \(\)"),
+        ("compute", "designs.compute=30", r"designs.compute \(30,\): .*trains beyond train.optimizer.warmup_steps, 30"),
+    ],
+)
+def test_a_design_without_points_names_the_setting(axis, setting, words):
+    with pytest.raises(ConfigError, match=words):
+        plan_sweeps(override(CPU_FULL, [setting]), (axis,))
+
+
+def test_points_that_are_the_same_are_planned_once():
+    """Rows of one seed twice would look like seeds that agree."""
+    study = override(CPU_FULL, ["train.steps=500", "seeds=0"])
+    (sweep,) = plan_sweeps(study, ("lr_horizon",))
+    assert [p.x for p in sweep.points] == pytest.approx([0.004, 0.008, 0.016]) and sweep.base == sweep.points[0].series
+    (sweep,) = plan_sweeps(override(CPU_FULL, ["designs.caps=4,5000"]), ("episodes",))
+    assert len({p.x for p in sweep.points}) == 2 and "at most 4 or all" in sweep.question
+    alone = ["datasets=arm_night,rover_road", "designs.judged=2", "designs.counts=2"]
+    (sweep,) = plan_sweeps(override(CPU_FULL, alone), ("dilution",))
+    assert [p.role for p in sweep.points] == [POINT] * 3 + [CONTROL]
+
+
 def test_retrieval_among_sixteen_is_asked_of_the_reference_alone():
     """At any number of steps, and of its controls."""
     runs = [training_of(p.trial) for p in SWEEPS["horizon"].points]
@@ -150,6 +183,18 @@ def test_retrieval_among_sixteen_is_asked_of_the_reference_alone():
     assert {p.trial.eval.other_actions for s in plan_sweeps(none, ("width",)) for p in s.points} == {0}
     whole = replace(CPU_FULL, designs=replace(CPU_FULL.designs, other_actions=None))
     assert {p.trial.eval.other_actions for s in plan_sweeps(whole, CPU_FULL.axes) for p in s.points} == {15}
+
+
+def test_questions_say_what_the_study_does():
+    """Not what cpu-full does."""
+    few = replace(CPU_FULL, designs=replace(CPU_FULL.designs, judged=3, counts=(3, 40), budgets=(8000,), long=(8000, 9000)))
+    for axis in ("dilution", "transfer", "newcomers"):
+        question = find_axis(axis)(few).question
+        assert "3 robots, drawn anew" in question and "ive" not in question
+    branches = find_axis("horizon")(few).question
+    assert "one run, whose rate decays" in branches and "Those of 9,000 steps are of one seed" in branches
+    cosine = replace(few.train, optimizer=replace(few.train.optimizer, schedule="cosine"))
+    assert "one run" not in find_axis("horizon")(replace(few, train=cosine)).question
 
 
 def test_the_whole_fits_into_about_twelve_hours_of_two_cores():

@@ -89,6 +89,13 @@ def test_override_sets_nested_fields_and_lists():
     assert study.execution.dtype == "bfloat16" and study.model.mup.enabled is False
 
 
+def test_lists_of_names_are_written_without_quotes_wherever_they_are():
+    study = override(SMOKE, ["train.only=arm_sky,arm_plum", "model.mup.without=init", "unseen=arm_sand", "axes=width"])
+    assert (study.train.only, study.model.mup.without) == (("arm_sky", "arm_plum"), ("init",))
+    assert (study.unseen, study.axes) == (("arm_sand",), ("width",))
+    assert override(study, ["train.only="]).train.only == ()
+
+
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
@@ -110,6 +117,11 @@ def test_override_sets_nested_fields_and_lists():
         ("model.frames=null", "model.frames: expected int, got None"),
         ("widths=4,8.5", "widths: expected int, got 8.5"),
         ("ablation_seeds=2,1", "ablation_seeds must increase"),
+        ("tau=0", "tau must be positive, got 0"),
+        ("flops_per_second=0", "flops_per_second must be positive"),
+        ("trial_seconds=-1", "trial_seconds must not be negative"),
+        ("designs.rate_factors=2,1", "designs.rate_factors must increase and be positive"),
+        ("widths=a,b", "not a number"),
     ],
 )
 def test_wrong_override_names_the_field(setting, message):
