@@ -9,6 +9,7 @@ import difflib
 import importlib
 import importlib.util
 import sys
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -80,6 +81,7 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
         where = f"{axis}: plan(study)"
         require(isinstance(sweep, Sweep), f"{where} must return a Sweep, got {type(sweep).__name__}")
         require(bool(sweep.points), f"{where} returned a sweep without points")
+        _require_distinct(sweep, where)
         if is_file(axis):
             require(sweep.name not in AXES, f"{where}: the name {sweep.name!r} is taken; choose another")
             require(
@@ -89,6 +91,15 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
     names = [sweep.name for sweep in sweeps]
     require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
     return [judge_less(study, sweep) for sweep in sweeps]
+
+
+def _require_distinct(sweep: Sweep, where: str) -> None:
+    """Raises ConfigError for two points that differ in nothing that rows tell apart: their spread would be taken for
+    that of seeds."""
+    places = Counter((p.x, p.series, p.role, p.trial.train.seed) for p in sweep.points)
+    for (x, series, role, seed), count in places.items():
+        at = ", ".join(filter(None, (f"{x:g}", series, role, f"seed {seed}")))
+        require(count == 1, f"{where} returned {count} points at {at}; give each a position or a series of its own")
 
 
 def _load(path: Path) -> Plan:

@@ -89,12 +89,22 @@ def test_files_are_kept_by_the_names_of_their_axes(tmp_path):
     assert [min(p.x for p in s.points) for s in plan_sweeps(STUDY, axes, root)] == [8, 4, 16]
 
 
+TWICE = """
+from dataclasses import replace
+from experiments.sweeps import width
+def plan(study):
+    sweep = width.plan(study)
+    return replace(sweep, name="mine", points=(*sweep.points, sweep.points[0]))
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "has no function plan"),
         ("def plan(study): return 3", "must return a Sweep, got int"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
+        (TWICE, "returned 2 points at 8, point, seed 0; give each a position or a series of its own"),
     ],
 )
 def test_a_file_that_is_no_axis_is_refused(text, words, tmp_path):
