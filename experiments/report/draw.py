@@ -13,7 +13,7 @@ from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Busy, Record, Workspace, load_record
 from experiments.setting import short
-from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.registry import AXES, KEPT, plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError
@@ -68,18 +68,18 @@ def _draw(workspace: Workspace, record: Record) -> None:
     at_best = judge_at_best(sweeps, provenance, numbers.windows)
     episodes = {name: facts["episodes"] for name, facts in read_data(workspace.data_summary).items()}
     growth = find_growth(sweeps, provenance, numbers.windows, episodes)
+    optima = find_optima(rows, sweeps)
     for path, kind, found in (
         (workspace.changes, Change, changes),
         (workspace.best_steps, AtBest, at_best),
         (workspace.growth, Growth, growth),
+        (workspace.optima, Optimum, optima),
     ):
         if found:
             write_csv(path, kind, found)
             tables.append(path)
-    optima = find_optima(rows, sweeps)
-    if optima:
-        write_csv(workspace.optima, Optimum, optima)
-        tables.append(workspace.optima)
+        else:
+            path.unlink(missing_ok=True)  # of other trials, drawn before
     along = Along(changes, at_best, growth)
     write_report(workspace, record, sweeps, rows, optima, along, states, provenance, numbers, checked)
     wrote(*tables, workspace.figures, workspace.report)
@@ -88,11 +88,17 @@ def _draw(workspace: Workspace, record: Record) -> None:
 def draw_figures(
     workspace: Workspace, sweeps: Sequence[Sweep], rows: Sequence[Row], numbers: Numbers | None = None
 ) -> None:
-    """A figure for each sweep, one of the scaling ones together, and of fits, where there are `numbers` for them."""
+    """A figure for each sweep, one of the scaling ones together, and of fits, where there are `numbers` for them.
+
+    Those of axes that the study no longer has are removed.
+    """
     from experiments.report.plot_fits import plot_fits, plot_isoflop
     from experiments.report.plots import plot_overview, plot_sweep
 
     workspace.figures.mkdir(exist_ok=True)
+    own = [path.stem for path in (workspace.root / KEPT).glob("*.py")]
+    for name in {*AXES, *own} - {sweep.name for sweep in sweeps}:
+        (workspace.figures / f"{name}.png").unlink(missing_ok=True)
     for sweep in sweeps:
         plot_sweep(rows, sweep, workspace.figures / f"{sweep.name}.png")
     plot_overview(rows, [s for s in sweeps if s.scaling], workspace.figures / "scaling.png")

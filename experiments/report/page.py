@@ -9,8 +9,10 @@ from __future__ import annotations
 import html
 import json
 import math
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +37,14 @@ from experiments.running.ledger import FINISHED, name_within
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
-from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, titles
+from experiments.study import Study
+from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, reference_trial, titles
 from hma_jax.config.json import to_json
+
+REFERENCE = "reference"
+
+ONCE = {"--replace": True, "--accept-code": False, "--retry-failed": False}
+"""Flags that hold for one command, and whether a value follows: who repeats a study does not mean them."""
 
 
 def write_report(
@@ -52,28 +60,29 @@ def write_report(
     checked: Check,
 ) -> None:
     """Writes workspace.report from `rows`, `numbers` and the figures already drawn; `checked` is of `check_numbers`."""
-    shown_by = _showing_the_reference(sweeps)
-    reference = trial_id(_reference(shown_by), provenance) if shown_by else ""
+    shown = _choose_shown(sweeps, record.study)
+    first = trial_id(_defaults(shown.by)[0], provenance) if shown else ""
     finished = [id for id, state in states.items() if state.event == FINISHED]
-    shown = reference in finished
-    dated = reference if shown else next(iter(finished), None)
+    there = first in finished
+    dated = first if there else next(iter(finished), None)
     result = numbers.results[dated] if dated else None
-    robots = robots_of(rows, shown_by, provenance, numbers.windows) if shown_by else []
+    robots = robots_of(rows, shown.by, provenance, numbers.windows) if there else []
+    name, aside = (shown.name, shown.aside) if shown else (REFERENCE, "")
     model = record.study.model
     vocabulary = None if model.diffusion else model.vocab_size
-    checks = check_study(sweeps, rows, optima, states, robots if shown else [], numbers.outcomes, checked, vocabulary)
+    checks = check_study(sweeps, rows, optima, states, robots, name, numbers.outcomes, checked, vocabulary)
     findings = read_findings(workspace.findings, [s.name for s in sweeps])
     came = what_came(read_expected(workspace.predictions / PREREGISTERED), rows)
     body = [
-        _headline(workspace, record, sweeps, rows, states, shown_by, result),
+        _headline(workspace, record, sweeps, rows, states, shown, result),
         draw_box(checks),
         *_curves(workspace, sweeps, rows, optima, along, came, findings),
         _fits(workspace, numbers),
         findings.rest,
-        _clips(workspace.trials / reference / "samples.npz", record, robots) if shown else "",
-        section("Robots, the most controllable first", describe_robots(
-            rows, shown_by, robots, workspace.data_summary
-        )) if shown else "",
+        _clips(workspace.trials / first / "samples.npz", record, robots, aside) if there else "",
+        section(f"Robots, the most controllable first{aside}", describe_robots(
+            rows, shown.by, robots, workspace.data_summary
+        )) if there else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),
         section("How to repeat it", _origin(workspace, record, provenance, finished, numbers.results)),
     ]  # fmt: skip
@@ -83,22 +92,38 @@ def write_report(
         f"<title>HMA-JAX study: {html.escape(record.study.name)}</title><style>{CSS}</style></head>\n"
         f"<body><main>{''.join(body)}</main></body></html>\n"
     )
-    aside = workspace.report.with_suffix(".tmp")
-    aside.write_text(page, encoding="utf-8")
-    aside.replace(workspace.report)
+    unfinished = workspace.report.with_suffix(".tmp")
+    unfinished.write_text(page, encoding="utf-8")
+    unfinished.replace(workspace.report)
 
 
 # --- Parts -----------------------------------------------------------------------------------
 
 
-def _showing_the_reference(sweeps: Sequence[Sweep]) -> Sweep | None:
-    """The sweep by which the reference trial is shown: the widest scope on which it stands."""
-    those = [s for s in sweeps if s.reference_x is not None]
-    return max(those, key=lambda s: len(s.scope), default=None)
+@dataclass(frozen=True)
+class _Shown:
+    """The trials, one a seed, of which the page shows numbers, clips and robots: those at the default of a sweep."""
+
+    by: Sweep
+    name: str  # what they are
+
+    @property
+    def aside(self) -> str:
+        """What a heading adds where they are not what a reader takes them for."""
+        return "" if self.name == REFERENCE else f" ({self.name})"
 
 
-def _reference(shown_by: Sweep) -> Trial:
-    return next(p.trial for p in shown_by.points if p.x == shown_by.reference_x)
+def _choose_shown(sweeps: Sequence[Sweep], study: Study) -> _Shown | None:
+    """The reference trials, by the sweep of the widest scope in which they stand; where they stand in none, what the
+    widest has instead, by the name that it has."""
+    those = [s for s in sweeps if _defaults(s)]
+    true = [s for s in those if all(t == reference_trial(study, t.train.seed) for t in _defaults(s))]
+    by = max(true or those, key=lambda s: len(s.scope), default=None)
+    return by and _Shown(by, REFERENCE if true else f"default of {by.name}")
+
+
+def _defaults(sweep: Sweep) -> list[Trial]:
+    return [p.trial for p in sweep.points if p.role == POINT and p.x == sweep.reference_x]
 
 
 def _headline(
@@ -107,24 +132,24 @@ def _headline(
     sweeps: Sequence[Sweep],
     rows: Sequence[Row],
     states: dict[str, State],
-    shown_by: Sweep | None,
+    shown: _Shown | None,
     result: dict[str, Any] | None,
 ) -> str:
     study = record.study
     metrics = drawn_metrics(rows, [s.name for s in sweeps])
     cards = []
-    if shown_by and "perplexity" in metrics:
+    if shown and "perplexity" in metrics:
+        cards.append(
+            card(f"perplexity, {shown.name}", _at_default(rows, shown.by, "perplexity"), "s.e. over episodes and seeds")
+        )
+        untrained = _at_default(rows, shown.by, "perplexity", UNTRAINED)
+        if untrained or shown.name == REFERENCE:  # of others nobody asks it
+            cards.append(card("perplexity, untrained", untrained, f"vocabulary size is {study.model.vocab_size:,}"))
+    if shown and "delta_psnr" in metrics:
         cards += [
-            card("perplexity, reference", _at_reference(rows, shown_by, "perplexity"),
-                 "s.e. over episodes and seeds"),
-            card("perplexity, untrained", _at_reference(rows, shown_by, "perplexity", UNTRAINED),
-                 f"vocabulary size is {study.model.vocab_size:,}"),
-        ]  # fmt: skip
-    if shown_by and "delta_psnr" in metrics:
-        cards += [
-            card("ΔPSNR, reference", _at_reference(rows, shown_by, "delta_psnr"),
+            card(f"ΔPSNR, {shown.name}", _at_default(rows, shown.by, "delta_psnr"),
                  "dB, last frame: true minus random actions"),
-            card("ΔPSNR, shuffled actions", _at_reference(rows, shown_by, "delta_psnr", CONTROL),
+            card("ΔPSNR, shuffled actions", _at_default(rows, shown.by, "delta_psnr", CONTROL),
                  "dB, must vanish within its error"),
         ]  # fmt: skip
     cards.append(
@@ -145,9 +170,8 @@ def _headline(
     )
 
 
-def _at_reference(rows: Sequence[Row], shown_by: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
-    """The curve's point where the reference trial stands."""
-    return next((p for p in curve(rows, shown_by.name, metric, role) if p.x == shown_by.reference_x), None)
+def _at_default(rows: Sequence[Row], sweep: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
+    return next((p for p in curve(rows, sweep.name, metric, role) if p.x == sweep.reference_x), None)
 
 
 def _curves(
@@ -197,12 +221,12 @@ def _fits(workspace: Workspace, numbers: Numbers) -> str:
     return section("Fits", describe_fits(numbers.fits, numbers.isoflop, numbers.outcomes, drawn))
 
 
-def _clips(path: Path, record: Record, robots: Sequence[Robot]) -> str:
-    """Of the reference trial, the most controllable robots first; without samples there are none."""
+def _clips(path: Path, record: Record, robots: Sequence[Robot], aside: str) -> str:
+    """Of one trial, the most controllable robots first; without samples there are none."""
     if not path.exists():
         return ""
     order = [robot.name for robot in robots]
-    return section("What it predicts", describe_clips(path, record.study.eval.prompt_frames, order))
+    return section(f"What it predicts{aside}", describe_clips(path, record.study.eval.prompt_frames, order))
 
 
 def _trial_table(
@@ -241,7 +265,7 @@ def _origin(
     ran = group_by_sources(workspace.trials, finished)
     counted = f"{len(ran)} different ones, by hash: " if len(ran) > 1 else ""
     facts = {
-        "command": record.command,
+        "command": _repeatable(record.command),
         "data": ", ".join(record.data)
         or f"embedded suite, scale {suite.scale:g}, from {suite.fewest} episodes, seed {suite.seed}",
         "token store": provenance.store,
@@ -260,6 +284,19 @@ def _origin(
     )
     config = html.escape(to_json(record.study))
     return f"<dl>{items}</dl><details><summary>Configuration</summary><pre>{config}</pre></details>"
+
+
+def _repeatable(command: str) -> str:
+    """A command less what was meant for that one time: earlier versions recorded it as it was typed."""
+    kept, words = [], iter(shlex.split(command))
+    for word in words:
+        flag, _, value = word.partition("=")
+        takes_value = ONCE.get(flag)
+        if takes_value is None:
+            kept.append(word)
+        elif takes_value and not value:
+            next(words, None)
+    return shlex.join(kept)
 
 
 def _each(found: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""The reference trial robot by robot, the most controllable first."""
+"""One configuration robot by robot, the most controllable first."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ORDER = ("action_nats", "delta_psnr")
 
 @dataclass(frozen=True)
 class Robot:
-    """What the reference trials, of all seeds, say of one robot."""
+    """What the trials of one configuration, of all seeds, say of one robot."""
 
     name: str
     errors: float  # standard errors of ORDER from zero; nan if it was not measured
@@ -44,7 +44,7 @@ class Robot:
 def robots_of(
     rows: Sequence[Row], sweep: Sweep, provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[Robot]:
-    """Of the scope of the sweep that shows the reference trial, the most controllable first."""
+    """Of the scope of a sweep, by the trials at its default, the most controllable first."""
     tables = {}
     for p in sweep.points:
         id = trial_id(p.trial, provenance)

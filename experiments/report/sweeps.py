@@ -114,11 +114,12 @@ def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Chan
 def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series: str = "") -> str:
     """A line per point, and the change from end to end."""
     columns = _columns(sweep, rows)
-    points = next(iter(columns.values()))
     lines = []
-    for x, p in points.items():
-        values = [pm(column[x].mean, column[x].sem) for column in columns.values()]
-        lines.append([f"{x:,}", f"{p.parameters:,}", *values, str(len(p.seeds))])
+    for x in sorted({x for column in columns.values() for x in column}):
+        here = [column.get(x) for column in columns.values()]
+        known = next(p for p in here if p)
+        values = [pm(p.mean, p.sem) if p else "–" for p in here]
+        lines.append([f"{x:,}", f"{known.parameters:,}", *values, str(len(known.seeds))])
     numbers = table([sweep.axis, "parameters, all robots", *(HEADINGS[m] for m in columns), "seeds"], lines)
     return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
 

@@ -49,6 +49,7 @@ def write_tables(
         seeds = {judged.seed: judged.windows for judged in read_trials(workspace.trials, kept).values()}
         found += controllability(dict(sorted(seeds.items())), role) if seeds else []
     if not found:
+        workspace.controllability.unlink(missing_ok=True)  # of trials that are no longer the reference
         return [workspace.trial_table]
     write_csv(workspace.controllability, Controlled, found)
     return [workspace.trial_table, workspace.controllability]

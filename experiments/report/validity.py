@@ -68,15 +68,17 @@ def check_study(
     optima: Sequence[Optimum],
     states: Mapping[str, State],
     robots: Sequence[Robot],
+    whose: str,
     outcomes: Sequence[Outcome],
     numbers: Check,
     vocabulary: int | None,
 ) -> list[Check]:
-    """`numbers` is what `check_numbers` found; `vocabulary` V of a discrete model."""
+    """`robots` are those of the trials called `whose`; `numbers` is what `check_numbers` found; `vocabulary` V of a
+    discrete model."""
     checks = [_trials(states), _seeds(sweeps, states, rows), numbers]
     checks += _untrained(rows, vocabulary)
     checks += [_controls(rows, metric) for metric in CONTROLLED if any(r.metric == metric for r in rows)]
-    checks.append(_copying(robots))
+    checks.append(_copying(robots, whose))
     checks += _optima(optima) + [_prediction(o) for o in outcomes]
     return checks
 
@@ -210,16 +212,16 @@ def _errors(mean: float, sem: float) -> float:
     return 0.0 if mean == 0 else mean / sem if sem else math.inf
 
 
-def _copying(robots: Sequence[Robot]) -> Check:
-    """The reference trials against repeating the last frame that was given."""
+def _copying(robots: Sequence[Robot], whose: str) -> Check:
+    """The trials called `whose` against repeating the last frame that was given."""
     name = "Predicting beats copying the last frame."
     judged = [r for r in robots if not math.isnan(r.ahead)]
     if not judged:
-        return Check(name, "open", "The reference trial is not finished.")
+        return Check(name, "open", f"The {whose} is not finished.")
     better = [r for r in judged if r.ahead > 0]
     sure = [r for r in judged if r.ahead > 2 * r.ahead_sem]
     behind = ", ".join(r.name for r in judged if not r.ahead > 0)
-    text = f"On {len(better)} of {len(judged)} robots, on {len(sure)} by more than two standard errors"
+    text = f"On {len(better)} of {len(judged)} robots the {whose} does, on {len(sure)} by more than two standard errors"
     return Check(name, "bad" if behind else "good", text + (f". Not on {behind}." if behind else "."))
 
 

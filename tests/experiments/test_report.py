@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from experiments.analysis.scaling import trunk_parameters
-from experiments.report import plots
+from experiments.presets import CPU_FULL
+from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.plot_style import count
+from experiments.report.sweeps import Along, describe
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.running.workspace import Workspace
 from experiments.sweeps.datasets import plan as plan_datasets
+from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.width import plan as plan_width
 from hma_jax.config import ConfigError
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
@@ -110,6 +113,61 @@ def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
         assert len(labelled) >= 3
         trunks = [count(trunk_parameters(replace(STUDY.model, width=p.x))) for p in points]
         assert [t.get_text().split("\n")[1] for t in panel.get_xticklabels() if t.get_text()] == trunks
+
+
+@pytest.mark.parametrize("axes", [("settings", "width"), ("conditioning", "horizon"), ("newcomers", "horizon")])
+def test_the_page_shows_the_reference_in_whichever_order_axes_come(axes):
+    """The ablations of cpu-full have a default of their own, for fewer steps; where all robots are poor, so has that."""
+    for order in (axes, axes[::-1]):
+        shown = page._choose_shown(plan_sweeps(CPU_FULL, order), CPU_FULL)
+        assert (shown.by.name, shown.name) == (axes[1], "reference")
+    shown = page._choose_shown(plan_sweeps(CPU_FULL, axes[:1]), CPU_FULL)
+    assert shown.name == f"default of {axes[0]}"
+    assert page._choose_shown(plan_sweeps(CPU_FULL, ("lr",)), CPU_FULL) is None
+
+
+def test_what_is_not_the_reference_is_not_called_so(tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.report.draw.draw_figures", lambda *_: None)
+    study = replace(STUDY, designs=replace(STUDY.designs, ablation_steps=1))
+    workspace = finished_study(tmp_path, study, axes=("settings",))
+    draw(workspace, record_of(study, ("settings",)))
+    text = workspace.report.read_text().split("<details><summary>Configuration")[0]
+    for name in ("perplexity, {}", "ΔPSNR, {}", "What it predicts ({})", "first ({})", "robots the {} does"):
+        assert name.format("default of settings") in text, name
+    assert ", reference" not in text and "perplexity, untrained" not in text
+
+
+@pytest.mark.parametrize(
+    ("typed", "shown"),
+    [
+        ("hma study --preset cpu --replace study --accept-code --set 'axes=[\"lr\"]'", "hma study --preset cpu --set 'axes=[\"lr\"]'"),
+        ("hma sweep lr --retry-failed --replace=windows --out 'a b'", "hma sweep lr --out 'a b'"),
+    ],
+)  # fmt: skip
+def test_a_command_to_repeat_replaces_nothing(typed, shown):
+    assert page._repeatable(typed) == shown
+
+
+def test_what_is_not_found_any_more_does_not_stay_beside_new_results(tmp_path):
+    workspace = finished_study(tmp_path, axes=("trajectories",), broken={"": "failed"})
+    workspace.figures.mkdir()
+    (tmp_path / "axes").mkdir()
+    (tmp_path / "axes" / "own.py").touch()
+    tables = [workspace.changes, workspace.best_steps, workspace.growth, workspace.optima, workspace.controllability]
+    old = [*tables, *(workspace.figures / f"{name}.png" for name in ("lr", "own"))]
+    for path in (*old, workspace.figures / "of_mine.png"):
+        path.touch()
+    draw(workspace, record_of(axes=("trajectories",)))
+    assert not [path.name for path in old if path.exists()]
+    assert {path.name for path in workspace.figures.iterdir()} == {"trajectories.png", "scaling.png", "of_mine.png"}
+
+
+def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
+    sweep = plan_width(STUDY)
+    lost = {(8, "delta_psnr"), (16, "perplexity")}
+    rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
+    lines = re.findall(r"<tr><td class=text>(\d+)</td><td>([\d,]+)</td>(.*?)</tr>", describe(sweep, rows, [], Along()))
+    assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [("8", "6,400", 1), ("16", "25,600", 1)]
 
 
 def test_page_without_any_finished_trial(tmp_path):
