@@ -96,6 +96,11 @@ class FrameLoader(Iterator[np.ndarray]):
         """The episodes that batch `step` (from 0 on) takes frames of: dataset, file and episode."""
         return self.batches.describe(step)
 
+    def episodes(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """(dataset, episode as drawn, by numbers), int64 [B] each, of every frame of batch `step`: frames of one episode
+        are no independent ones. Under 'skip' a damaged episode keeps its number, though another is read for it."""
+        return self.batches.episodes(step)
+
 
 @dataclass(frozen=True)
 class _Stream:
@@ -119,8 +124,11 @@ class _Stream:
 
     def describe(self, i: int) -> str:
         """The i-th episode drawn, for people."""
-        number = int(self.source.numbers[self.episodes[self._drawn(i)]])
-        return f"{self.source.name}: {describe(self.source.runs, number)}"
+        return f"{self.source.name}: {describe(self.source.runs, self.number(i))}"
+
+    def number(self, i: int) -> int:
+        """Of the i-th episode drawn, among all that its files have."""
+        return int(self.source.numbers[self.episodes[self._drawn(i)]])
 
     def _drawn(self, i: int) -> int:
         return int(endless_shuffle(i, len(self.episodes), self.seed))
@@ -154,6 +162,12 @@ class _Batches:
 
     def describe(self, step: int) -> list[str]:
         return [self.streams[d].describe(i) for d, i in zip(*map(np.ndarray.tolist, self._chosen(step)), strict=True)]
+
+    def episodes(self, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """See `FrameLoader.episodes`."""
+        datasets, positions = self._chosen(step)
+        drawn = [self.streams[d].number(i) for d, i in zip(datasets.tolist(), positions.tolist(), strict=True)]
+        return np.repeat(datasets, self.group), np.repeat(np.asarray(drawn, np.int64), self.group)
 
     def _chosen(self, step: int) -> tuple[np.ndarray, np.ndarray]:
         """(dataset, how many were drawn of it before) of every group."""

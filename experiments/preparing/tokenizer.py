@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,6 +34,8 @@ from hma_jax.config import ConfigError, TokenizerConfig, require
 from hma_jax.config.json import to_dict
 
 if TYPE_CHECKING:
+    from data_pipelines.loading.frames import FrameLoader
+    from hma_jax.evaluation.statistics import Stat
     from hma_jax.tokenizers.base import Tokenizer
 
 QUALITY = "quality.json"
@@ -89,7 +92,7 @@ def make_tokenizer(
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there
     that was made from other inputs, unless `replace` allows it.
     """
-    from data_pipelines.loading.frames import FrameLoader, make_frame_loader
+    from data_pipelines.loading.frames import make_frame_loader
     from hma_jax.tokenizers.train import train_tokenizer
     from hma_jax.training.loop import LoopOptions
 
@@ -119,8 +122,8 @@ def make_tokenizer(
             records=lambda index: frames(0).describe(index),
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, frames(0, "val"))
-    console.print(f"its reconstruction of held-out frames: {quality['mean']:.2f} ± {quality['sem']:.2f} dB PSNR")
-    write_file(aside / QUALITY, json.dumps(quality))
+    console.print(f"its reconstruction of held-out frames: {quality.mean:.2f} ± {quality.sem:.2f} dB PSNR")
+    write_file(aside / QUALITY, json.dumps(dataclasses.asdict(quality)))
     made_from.save(aside)
     publish(aside, workspace.tokenizer)
 
@@ -173,13 +176,22 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
     publish(aside, place)
 
 
-def reconstruction_psnr(tokenizer: Tokenizer, batches: Iterator[np.ndarray]) -> dict[str, float]:
-    """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames: mean, sem, n."""
-    from hma_jax.evaluation.metrics import psnr
-    from hma_jax.evaluation.statistics import mean_and_sem
+def reconstruction_psnr(tokenizer: Tokenizer, frames: FrameLoader) -> Stat:
+    """PSNR in dB of encoding and decoding, over at least QUALITY_FRAMES frames from the first batch of `frames` on.
 
-    values: list[float] = []
-    while len(values) < QUALITY_FRAMES:
-        images = next(batches)
-        values += np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)).tolist()
-    return dataclasses.asdict(mean_and_sem(values))
+    Every frame counts equally; the error counts episodes, within each dataset.
+    """
+    from hma_jax.evaluation.metrics import psnr
+    from hma_jax.evaluation.statistics import mean_and_sem, stratified
+
+    values, datasets, episodes = [], [], []
+    for step in itertools.count():
+        images = next(frames)
+        values.append(np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)))
+        for column, own in zip((datasets, episodes), frames.episodes(step), strict=True):
+            column.append(own)
+        if sum(map(len, values)) >= QUALITY_FRAMES:
+            break
+    value, dataset, episode = (np.concatenate(parts) for parts in (values, datasets, episodes))
+    stats = [mean_and_sem(value[dataset == d], episode[dataset == d]) for d in np.unique(dataset)]
+    return stratified(stats, [s.n for s in stats])

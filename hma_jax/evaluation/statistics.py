@@ -97,8 +97,8 @@ def mean_and_sem(values: Any, episode_n: Any = None) -> Stat:
     return stat_of(estimate_mean(values), episode_n)
 
 
-def stratified(stats: Iterable[Stat]) -> Stat:
-    """Mean over datasets, every dataset counting equally: sem = sqrt(sum sem^2) / D.
+def stratified(stats: Iterable[Stat], weights: Iterable[float] | None = None) -> Stat:
+    """Mean over datasets, every dataset counting equally or by its weight w: sem = sqrt(sum w^2 sem^2) / sum w.
 
     The datasets are fixed, not a sample of possible datasets: only the episodes drawn within
     each contribute error. A dataset of one episode cannot know its own error; its mean is taken to
@@ -109,9 +109,10 @@ def stratified(stats: Iterable[Stat]) -> Stat:
     known = [s.sem**2 * s.clusters for s in stats if not math.isnan(s.sem)]  # variance of one episode
     typical = sum(known) / len(known) if known else math.nan
     squares = [typical / s.clusters if math.isnan(s.sem) else s.sem**2 for s in stats]
+    parts = [1.0] * len(stats) if weights is None else list(weights)
     return Stat(
-        mean=sum(s.mean for s in stats) / len(stats),
-        sem=math.sqrt(sum(squares)) / len(stats),
+        mean=sum(w * s.mean for w, s in zip(parts, stats, strict=True)) / sum(parts),
+        sem=math.sqrt(sum(w**2 * square for w, square in zip(parts, squares, strict=True))) / sum(parts),
         n=sum(s.n for s in stats),
         episodes=sum(s.episodes for s in stats),
     )

@@ -57,6 +57,12 @@ def hma(out, made, capsys):
     return run
 
 
+def test_the_quality_of_a_tokenizer_counts_held_out_episodes(out):
+    """Two are held out of each of two robots."""
+    quality = json.loads((out / "tokenizer" / tokenizer_step.QUALITY).read_text())
+    assert quality["n"] == 8 and 1 < quality["episodes"] <= 4
+
+
 # --- Nothing to ask ----------------------------------------------------------------------------
 
 

@@ -65,6 +65,19 @@ def test_the_records_of_a_batch_are_those_that_its_frames_were_read_from(rlds):
         assert loader.describe(step) == [f"toy: {describe(runs, int(e))}" for e in episodes]
 
 
+def test_every_frame_of_a_batch_has_its_dataset_and_episode(tmp_path, rlds):
+    """Episodes of the second dataset are longer than any of the first, whose frames say (episode, step)."""
+    other = make_spec("other")
+    loader = make_frame_loader([(SPEC, rlds), (other, write_rlds(tmp_path, other, [200] * 6))], 8, batch=6, seed=1)
+    seen = set()
+    for step in range(40):
+        frames, (dataset, episode) = next(loader), loader.episodes(step)
+        assert frames[:, 0, 0, 0].tolist() == episode.tolist()
+        assert dataset[frames[:, 0, 0, 1] > 24].all()
+        seen |= set(dataset.tolist())
+    assert seen == {0, 1}
+
+
 def test_number_of_threads_changes_no_frame(tmp_path, rlds):
     other = make_spec("other")
     datasets = [(SPEC, rlds), (other, write_rlds(tmp_path, other, [9] * 6))]

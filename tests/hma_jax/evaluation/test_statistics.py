@@ -82,9 +82,11 @@ def test_one_value_or_one_episode_has_an_unknown_error_not_zero():
     assert math.isnan(one.sem) and (one.n, one.episodes) == (3, 1)
 
 
-def test_stratified_mean_weighs_datasets_equally_and_combines_errors():
+def test_stratified_mean_weighs_datasets_equally_or_as_told_and_combines_errors():
     stats = [Stat(1.0, 0.3, 10, 5), Stat(3.0, 0.4, 1000, 50)]
     assert stratified(stats) == Stat(2.0, pytest.approx(0.25), 1010, 55)
+    weighed = Stat(pytest.approx(2.5), pytest.approx(math.hypot(0.25 * 0.3, 0.75 * 0.4)), 1010, 55)
+    assert stratified(stats, [1, 3]) == weighed
 
 
 def test_a_dataset_of_one_episode_takes_the_scatter_of_the_others():
