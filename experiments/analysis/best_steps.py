@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.analysis.bootstrap import bootstrap_intervals, make_panel
 from experiments.analysis.changes import METRICS
-from experiments.analysis.paired import agree, require_same_windows
+from experiments.analysis.paired import NotComparable, agree, require_same_windows
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Sweep
@@ -44,8 +44,8 @@ class AtBest:
 
 
 def judge_at_best(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[AtBest]:
-    """Of sweeps whose curves differ in nothing but steps: points and seeds that have at least two of them. Raises
-    NotComparable."""
+    """Of sweeps whose curves differ in nothing but steps: points and seeds that have at least two of them, on episodes
+    that can be halved. Raises NotComparable."""
     found = []
     for sweep in sweeps:
         if not (sweep.measured and sweep.several) or sweep.valley:
@@ -56,7 +56,7 @@ def judge_at_best(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapp
             if point.role == POINT and not point.scope and table is not None and LOSS in table.metrics:
                 there[point.x][point.trial.train.seed][point.trial.train.steps] = table
         for x, seeds in sorted(there.items()):
-            several = {seed: tables for seed, tables in sorted(seeds.items()) if len(tables) > 1}
+            several = {s: tables for s, tables in sorted(seeds.items()) if len(tables) > 1 and _halved(tables, sweep.scope)}
             if several:
                 found += _judge(sweep, x, several)
     return found
@@ -88,7 +88,7 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
     """({steps: table} as one table in which every window is judged at steps chosen without it, the steps chosen by each
     half of the episodes). The loss by which they are chosen is the mean over `robots` that the half has.
 
-    Raises NotComparable unless all tables are of the same windows.
+    Raises NotComparable unless all tables are of the same windows, of at least two episodes.
     """
     first = next(iter(tables.values()))
     first = first.among(robots)
@@ -99,6 +99,8 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
             require_same_windows(first, table)
         matched[steps] = own.matched_to(first)
     half = halves(first)
+    if not half.any():
+        raise NotComparable("steps are chosen on other episodes than those judged, and there is one; judge more")
     chosen = []
     for h in (0, 1):
         losses = {steps: _mean_of_robots(t, half == h) for steps, t in matched.items()}
@@ -110,16 +112,23 @@ def cross_fit(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> tuple
 
 
 def halves(table: WindowTable) -> np.ndarray:
-    """int [n], 0 or 1: every other episode of each robot, in the order of their numbers."""
-    half = np.zeros(len(table), int)
+    """int [n], 0 or 1: every other episode of each robot, in the order of their numbers. Robots of a single episode
+    take turns, or half 1 would be empty where no robot has two."""
+    half, alone = np.zeros(len(table), int), 0
     for robot in table.datasets:
         own = table.dataset == robot
-        half[own] = np.unique(table.episode[own], return_inverse=True)[1] % 2
+        names, which = np.unique(table.episode[own], return_inverse=True)
+        half[own] = which % 2 if len(names) > 1 else alone % 2
+        alone += len(names) == 1
     return half
 
 
+def _halved(tables: Mapping[int, WindowTable], robots: Sequence[str]) -> bool:
+    return bool(halves(next(iter(tables.values())).among(robots)).any())
+
+
 def _mean_of_robots(table: WindowTable, chosen: np.ndarray) -> float:
+    """Over those robots that `chosen` [n] has a window of."""
     loss = table.metrics[LOSS]
     own = [chosen & (table.dataset == robot) for robot in table.datasets]
-    means = [loss[rows].mean() for rows in own if rows.any()]
-    return float(np.mean(means)) if means else float("inf")
+    return float(np.mean([loss[rows].mean() for rows in own if rows.any()]))

@@ -53,6 +53,29 @@ def test_the_better_steps_are_found_and_every_window_is_judged_once():
         cross_fit({100: table, 200: replace(table, episode=table.episode + 1)}, ROBOTS)
 
 
+def test_robots_of_one_episode_take_turns_to_choose_and_to_judge():
+    """Of 500 steps and 1,000 the better are chosen, also where every robot has one episode."""
+    table = judged(np.random.default_rng(0), robots=2, episodes=1)
+    tables = {steps: with_loss(table, np.full(len(table), loss)) for steps, loss in ((500, 9.0), (1000, 1.0))}
+    whole, chosen = cross_fit(tables, ROBOTS)
+    assert chosen == (1000, 1000) and set(whole.metrics["cross_entropy"]) == {1.0}
+    with pytest.raises(NotComparable, match="there is one"):
+        cross_fit(tables, ROBOTS[:1])
+
+
+def test_a_point_that_one_episode_judges_is_left_out():
+    named = replace(WIDE, datasets=("pusher_sand", "arm_sand", "rover_road"))
+    study = replace(named, designs=replace(WIDE.designs, caps=(2,)), train=replace(WIDE.train, steps=8))
+    (sweep,) = plan_sweeps(study, ("episodes",))
+    tables = {trial_id(p.trial, PROVENANCE): windows_of(p.trial) for p in sweep.points}
+    assert judge_at_best([sweep], PROVENANCE, tables)
+    fewest = min(p.x for p in sweep.points)
+    for point in (p for p in sweep.points if p.x == fewest):
+        id = trial_id(point.trial, PROVENANCE)
+        tables[id] = tables[id].among(["pusher_sand"]).rows(np.arange(2))
+    assert fewest not in {row.x for row in judge_at_best([sweep], PROVENANCE, tables)}
+
+
 def test_the_axis_of_trajectories_is_judged_at_its_best_steps():
     named = replace(WIDE, datasets=("pusher_sand", "arm_sand", "rover_road"))
     study = replace(named, designs=replace(WIDE.designs, caps=(2,)), train=replace(WIDE.train, steps=8))
