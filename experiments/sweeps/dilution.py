@@ -24,8 +24,9 @@ def plan(study: Study) -> Sweep:
         name="dilution",
         axis="robots in the mixture, total windows fixed",
         steps={count: steps for count in study.designs.counts},
-        question="What do robots lose when others share their training? Five robots, drawn anew for every seed, are "
-        "judged; every point sees the same number of windows in all, so that the five see fewer as others join.",
+        question="What do robots lose when others share their training? Judged are "
+        f"{study.designs.judged} robots, drawn anew for every seed; every point sees the same number of windows in all, "
+        "so that they see fewer as others join.",
         gain="sharing a budget",
     )
 

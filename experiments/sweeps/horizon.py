@@ -26,14 +26,16 @@ def plan(study: Study) -> Sweep:
     points = [point(n, seed) for n in budgets for seed in study.seeds]
     points += [point(n, first) for n in study.designs.long if n not in budgets]
     points.append(Point(steps, control_of(reference_trial(study, first)), CONTROL))
-    beyond = [f"{n:,}" for n in study.designs.long]
+    beyond = [f"{n:,}" for n in study.designs.long if n not in budgets]
     alone = f" Those of {', '.join(beyond)} steps are of one seed." if beyond else ""
+    one_run = " The points of a seed are one run, whose rate decays at each."
+    shared = one_run if study.train.optimizer.schedule == "wsd" else ""
     return Sweep(
         "horizon",
         "training steps",
         study.dataset_names(),
         tuple(points),
-        question=f"What does training for longer buy? The points of a seed are one run, whose rate decays at each.{alone}",
+        question=f"What does training for longer buy?{shared}{alone}",
         gain="more steps",
         reference_x=steps,
     )

@@ -187,14 +187,16 @@ def test_retrieval_among_sixteen_is_asked_of_the_reference_alone():
 
 def test_questions_say_what_the_study_does():
     """Not what cpu-full does."""
-    few = replace(CPU_FULL, designs=replace(CPU_FULL.designs, judged=3, counts=(3, 40), budgets=(8000,), long=(8000, 9000)))
+    designs = replace(CPU_FULL.designs, judged=3, counts=(3, 40), kinship=9, budgets=(8000,), long=(8000, 9000))
+    few = replace(CPU_FULL, designs=designs)
     for axis in ("dilution", "transfer", "newcomers"):
         question = find_axis(axis)(few).question
-        assert "3 robots, drawn anew" in question and "ive" not in question
+        assert "3 robots, drawn anew" in question and "five" not in question.lower()
     branches = find_axis("horizon")(few).question
     assert "one run, whose rate decays" in branches and "Those of 9,000 steps are of one seed" in branches
     cosine = replace(few.train, optimizer=replace(few.train.optimizer, schedule="cosine"))
     assert "one run" not in find_axis("horizon")(replace(few, train=cosine)).question
+    assert "is too low" not in find_axis("compute")(few).question
 
 
 def test_the_whole_fits_into_about_twelve_hours_of_two_cores():
