@@ -75,8 +75,8 @@ def _same_chance(a: WindowTable, b: WindowTable, robots: Sequence[str]) -> bool:
     """Whether the true actions are told from as many others, in every window of `robots`."""
     if not all("retrieval_chance" in table.metrics for table in (a, b)):
         return True
-    (panel_a,), (panel_b,) = (make_panel([{0: table}], "retrieval_chance", robots).points for table in (a, b))
-    return np.array_equal(panel_a, panel_b, equal_nan=True)
+    of_a, of_b = make_panel([{0: a}, {0: b}], "retrieval_chance", robots).points
+    return np.array_equal(of_a, of_b, equal_nan=True)
 
 
 def overall_difference(a: Side, b: Side, metric: str, robots: Sequence[str]) -> Difference | None:
@@ -101,7 +101,10 @@ def _pairs(a: Side, b: Side) -> list[tuple[WindowTable, WindowTable]]:
 
 
 def _panels(pairs: Sequence[tuple[WindowTable, WindowTable]], metric: str, robots: Sequence[str]) -> list[Panel]:
-    return [make_panel([dict(enumerate(side))], metric, robots) for side in zip(*pairs, strict=True)]
+    """One of each side, of the same windows in the same order."""
+    both = make_panel([dict(enumerate(side)) for side in zip(*pairs, strict=True)], metric, robots)
+    sides = zip(both.points, both.seeds, strict=True)
+    return [Panel(both.robot, both.episode, (values,), (seeds,)) for values, seeds in sides]
 
 
 def _of_metric(metric: str, a: Panel, b: Panel, by_robot: bool = True) -> list[Difference]:

@@ -9,13 +9,12 @@ many as Satterthwaite 1946 approximates for a sum of variances that are themselv
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from scipy.special import stdtrit
 
 from hma_jax.evaluation.statistics import Stat, stratified
-from hma_jax.evaluation.summary import Summary
 
 OVERALL = "overall"
 """The scope that averages over all robots, each counting equally."""
@@ -75,18 +74,6 @@ def satterthwaite(estimates: Iterable[tuple[float, float]]) -> float:
     known = list(estimates)
     total, squares = sum(v for v, _ in known), sum(v**2 / df for v, df in known)
     return total**2 / squares if squares else math.inf
-
-
-def intervals(summary: Summary, level: float = LEVEL) -> dict[str, dict[str, Interval]]:
-    """{scope: {metric: interval}} of every robot and, under `OVERALL`, of the mean over those that have the metric."""
-    found = {robot: {m: interval_of(s, level) for m, s in stats.items()} for robot, stats in summary.datasets.items()}
-    return {OVERALL: over_robots(summary.datasets, level)} | found
-
-
-def over_robots(robots: Mapping[str, Mapping[str, Stat]], level: float = LEVEL) -> dict[str, Interval]:
-    """Each metric over the robots that have it."""
-    metrics = dict.fromkeys(m for stats in robots.values() for m in stats)
-    return {m: overall((stats[m] for stats in robots.values() if m in stats), level) for m in metrics}
 
 
 def nats_first(metrics: Iterable[str]) -> list[str]:

@@ -1,18 +1,14 @@
-"""Differences between trials that saw the same windows, taken window by window.
+"""Which trials saw the same windows, so that they may be told apart window by window.
 
-What makes a window hard for both models cancels: the error is that of the differences, clustered by episode
-(`hma_jax.evaluation.summary.paired_difference`; the paired t statistic of a stratified cluster sample). Trials are
-comparable if they have the same windows of a robot, with the same number of real frames and the same recorded
-images; anything else is refused.
+What makes a window hard for both models then cancels (`compare`). Trials are comparable if they have the same windows
+of a robot, with the same number of real frames and the same recorded images; anything else is refused.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from experiments.analysis.intervals import LEVEL, Interval, intervals
 from hma_jax.config import ConfigError
-from hma_jax.evaluation.summary import paired_difference
 from hma_jax.evaluation.windows import WindowTable
 
 TRUTH = "psnr_copy"
@@ -51,18 +47,6 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
         if TRUTH in mine.metrics and TRUTH in theirs.metrics:
             _require_equal(mine, theirs, mine.metrics[TRUTH], theirs.metrics[TRUTH], f"dB of {TRUTH}", SAME)
     return shared
-
-
-def paired(
-    a: WindowTable, b: WindowTable, perplexity_group: int, level: float = LEVEL
-) -> dict[str, dict[str, Interval]]:
-    """`a` minus `b`: {robot or OVERALL: {metric: interval}}, on the robots and metrics that both have.
-
-    Raises NotComparable.
-    """
-    shared = require_same_windows(a, b)
-    mine, theirs = (x.among(shared) for x in (a, b))
-    return intervals(paired_difference(mine, theirs, perplexity_group), level)
 
 
 def agree(a: WindowTable, b: WindowTable) -> bool:

@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from experiments.analysis.compare import Side
 from experiments.running.job import read_job
@@ -17,9 +16,6 @@ from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import FILE, WindowTable
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -56,13 +52,6 @@ def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, Jud
     """The finished ones among `ids` (None: all in the directory), by id and sorted by it. Raises ConfigError."""
     chosen = [p.name for p in trials.iterdir()] if ids is None else ids
     return {id: read_trial(trials / id) for id in sorted(chosen) if (trials / id / RESULT).exists()}
-
-
-def long_table(trials: Iterable[Judged]) -> pa.Table:
-    """Windows of all trials in one table of the columns of `hma_jax.evaluation.windows`, for any other program."""
-    import pyarrow as pa
-
-    return pa.concat_tables([judged.windows.to_arrow(judged.id) for judged in trials]).unify_dictionaries()
 
 
 def read_side(path: Path) -> Side:

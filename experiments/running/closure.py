@@ -63,14 +63,6 @@ def changed(old: Closure, new: Closure) -> list[str]:
     return [name for name in sorted(old.keys() & new.keys()) if old[name] != new[name]]
 
 
-def source_hash(text: str | bytes) -> str:
-    """Hash of what a file of Python means: equal for files that differ in comments, docstrings or layout alone.
-
-    The same under every version of Python that reads the file to the same syntax tree.
-    """
-    return _hash(ast.parse(text))
-
-
 # --- Reading a file ---------------------------------------------------------------------------
 
 
@@ -133,6 +125,8 @@ def _statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _hash(tree: ast.AST) -> str:
+    """Of what a file means: equal for files that differ in comments, docstrings or layout alone, and the same under
+    every version of Python that reads the file to the same syntax tree."""
     pieces: list[str] = []
     _write(tree, pieces)
     return hashlib.sha256("".join(pieces).encode()).hexdigest()[:16]

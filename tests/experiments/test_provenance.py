@@ -17,7 +17,7 @@ from experiments.rows import Row, read_csv, write_csv
 from experiments.running import provenance
 from experiments.running.agreement import check_finished, group_by_sources, require_one_closure
 from experiments.running.attempts import read_states
-from experiments.running.closure import ROOT, closure_hash, source_hash, trace
+from experiments.running.closure import ROOT, closure_hash, trace
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import REFUSED, Ledger
@@ -50,15 +50,28 @@ def area(r: float, *, n=2) -> float:
 # --- Sources --------------------------------------------------------------------------------------
 
 
+def write_modules(root: Path, **files: str) -> None:
+    for name, text in files.items():
+        path = root.joinpath(*name.split("__")).with_suffix(".py")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        (path.parent / "__init__.py").touch()
+        path.write_text(text)
+
+
+def hash_of(text: str, root: Path) -> str:
+    write_modules(root, experiments__plain=text)
+    return trace(["experiments.plain"], root)["experiments.plain"]
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [("# nothing", "# something else"), ("What it is.", "What it was."), ("Of what.", "Of that."), ("Of a circle.", "!"),
      ("    return math.pi * r**n if r > 0 else 0", "    return (\n        math.pi * r ** n  # why\n        if r > 0 else 0\n    )"),
      ('"""What it is."""\n', ""), ("import math\n", "import math\n\n\n\n")],
 )  # fmt: skip
-def test_comments_docstrings_and_layout_are_no_change(old, new):
+def test_comments_docstrings_and_layout_are_no_change(old, new, tmp_path):
     text = "# nothing\n" + PLAIN
-    assert old in text and source_hash(text.replace(old, new)) == source_hash(PLAIN)
+    assert old in text and hash_of(text.replace(old, new), tmp_path) == hash_of(PLAIN, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -66,16 +79,8 @@ def test_comments_docstrings_and_layout_are_no_change(old, new):
     [("0.5", "0.25"), ("r > 0", "r >= 0"), ("n=2", "n=3"), ("else 0", "else 0.0"), ("math.pi", "math.tau"),
      ("@cache\n", ""), ("*, n", "n"), ("if r > 0 else 0", ""), ("RATE", "RATES"), ("r**n", "n**r")],
 )  # fmt: skip
-def test_whatever_is_computed_is_a_change(old, new):
-    assert old in PLAIN and source_hash(PLAIN.replace(old, new)) != source_hash(PLAIN)
-
-
-def write_modules(root: Path, **files: str) -> None:
-    for name, text in files.items():
-        path = root.joinpath(*name.split("__")).with_suffix(".py")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        (path.parent / "__init__.py").touch()
-        path.write_text(text)
+def test_whatever_is_computed_is_a_change(old, new, tmp_path):
+    assert old in PLAIN and hash_of(PLAIN.replace(old, new), tmp_path) != hash_of(PLAIN, tmp_path)
 
 
 def test_the_closure_is_what_is_imported(tmp_path):
@@ -166,7 +171,7 @@ def test_a_start_is_recorded_once(tmp_path):
     record = provenance.read_record(tmp_path)
     assert [start.code for start in record.starts] == [closure_hash({"experiments.running.trial": str(i)}) for i in (1, 2)]
     assert record.code == record.starts[-1].code and len(record.closures) == 2
-    assert record.besides["experiments.words"] == source_hash((ROOT / "experiments" / "words.py").read_text())
+    assert record.besides["experiments.words"] == trace(["experiments.words"])["experiments.words"]
     machine = record.starts[0].machine
     assert {"jax", "jaxlib", "numpy"} <= machine["packages"].keys() and {"processor", "system", "commit"} <= machine.keys()
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, make_panel, resample
-from experiments.analysis.intervals import OVERALL, intervals
+from experiments.analysis.intervals import OVERALL
 from experiments.analysis.paired import NotComparable
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.summary import summarise
-from tests.experiments.analysis.worlds import judged, under_seeds, with_loss
+from tests.experiments.analysis.worlds import intervals, judged, under_seeds, with_loss
 
 LOSS = "cross_entropy"
 

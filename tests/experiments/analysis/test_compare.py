@@ -7,8 +7,9 @@ import pytest
 
 from experiments.analysis.compare import Side, compare
 from experiments.analysis.intervals import OVERALL
-from experiments.analysis.paired import NotComparable, paired
-from tests.experiments.analysis.worlds import judged, under_seeds, with_loss
+from experiments.analysis.paired import NotComparable
+from hma_jax.evaluation.summary import paired_difference
+from tests.experiments.analysis.worlds import intervals, judged, under_seeds, with_loss
 
 
 def sides(gain: float = 0.2, seeds: int = 1, robots: int = 3):
@@ -24,7 +25,7 @@ def sides(gain: float = 0.2, seeds: int = 1, robots: int = 3):
 def test_one_seed_is_the_paired_interval_clustered_by_episode():
     a, b = sides()
     rows = {(r.scope, r.metric): r for r in compare(a, b)}
-    want = paired(a.seeds[0], b.seeds[0], 1)
+    want = intervals(paired_difference(a.seeds[0], b.seeds[0], 1))
     for scope in (OVERALL, "r0", "r1", "r2"):
         row, interval = rows[scope, "cross_entropy"], want[scope]["cross_entropy"]
         assert (row.mean, row.sem, row.low, row.high) == pytest.approx(

@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from experiments.analysis.intervals import OVERALL, critical, interval_of, intervals, nats_first, overall
+from experiments.analysis.intervals import OVERALL, critical, interval_of, nats_first, overall
 from hma_jax.evaluation.statistics import Stat, mean_and_sem
 from hma_jax.evaluation.summary import summarise
-from tests.experiments.analysis.worlds import judged
+from tests.experiments.analysis.worlds import intervals, judged
 
 
 def held(interval, truth: float = 0.0) -> bool:

@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.analysis.compare import Difference, Side, compare
 from experiments.analysis.intervals import OVERALL
-from experiments.analysis.paired import NotComparable, paired
+from experiments.analysis.paired import NotComparable
 from hma_jax.evaluation.summary import summarise
 from tests.experiments.analysis.worlds import judged, with_loss
+
+
+def paired(a, b) -> dict[str, Difference]:
+    """{scope: a less b} in nats per token."""
+    sides = (Side(name, {0: table}, "") for name, table in (("a", a), ("b", b)))
+    return {row.scope: row for row in compare(*sides) if row.metric == "cross_entropy"}
 
 
 def better(table, seed: int, by: float = 0.1):
@@ -21,7 +28,7 @@ def test_a_small_difference_is_seen_where_both_find_the_same_windows_hard():
     hits = zero = 0
     for seed in range(300):
         table = judged(np.random.default_rng(seed), episodes=8)
-        found = paired(better(table, seed + 1000), table, 1)["r0"]["cross_entropy"]
+        found = paired(better(table, seed + 1000), table)["r0"]
         hits += found.low < -0.1 < found.high
         zero += found.low < 0 < found.high
     assert 0.92 * 300 <= hits <= 0.98 * 300 and zero < 0.15 * 300
@@ -33,7 +40,7 @@ def test_broken_pairing_loses_the_error():
     other = better(table, 1)
     order = np.concatenate([np.random.default_rng(2).permutation(48), 48 + np.random.default_rng(3).permutation(48)])
     mixed = with_loss(other, other.metrics["cross_entropy"][order])
-    honest, broken = (paired(x, table, 1)[OVERALL]["cross_entropy"] for x in (other, mixed))
+    honest, broken = (paired(x, table)[OVERALL] for x in (other, mixed))
     assert honest.mean == pytest.approx(broken.mean) and honest.sem < 0.2 * broken.sem
     assert honest.errors < -3 and abs(broken.errors) < 3
 
@@ -43,7 +50,7 @@ def test_the_difference_is_clustered_by_episode():
     rng = np.random.default_rng(5)
     table = judged(rng, episodes=10, each=6)
     gain = np.repeat(rng.normal(size=10), 6)
-    found = paired(with_loss(table, table.metrics["cross_entropy"] + gain), table, 1)["r0"]["cross_entropy"]
+    found = paired(with_loss(table, table.metrics["cross_entropy"] + gain), table)["r0"]
     assert found.sem == pytest.approx(np.std(gain.reshape(10, 6)[:, 0], ddof=1) / np.sqrt(10))
 
 
@@ -51,17 +58,17 @@ def test_order_of_windows_and_robots_does_not_matter():
     table = judged(np.random.default_rng(0), robots=3)
     other = better(table, 1)
     shuffled = other.rows(np.random.default_rng(2).permutation(len(other)))
-    straight, mixed = paired(other, table, 1), paired(shuffled, table, 1)
-    assert mixed["r2"]["cross_entropy"].mean == pytest.approx(straight["r2"]["cross_entropy"].mean)
-    assert mixed[OVERALL]["cross_entropy"].sem == pytest.approx(straight[OVERALL]["cross_entropy"].sem)
+    straight, mixed = paired(other, table), paired(shuffled, table)
+    assert mixed["r2"].mean == pytest.approx(straight["r2"].mean)
+    assert mixed[OVERALL].sem == pytest.approx(straight[OVERALL].sem)
 
 
 def test_robots_that_one_model_alone_was_judged_on_are_left_out():
     table = judged(np.random.default_rng(0), robots=3)
     part = table.rows(np.flatnonzero(table.dataset != "r1"))
-    assert list(paired(part, table, 1)) == [OVERALL, "r0", "r2"]
+    assert list(paired(part, table)) == [OVERALL, "r0", "r2"]
     with pytest.raises(NotComparable, match="no robot was judged in both: r1.* and r0, r2"):
-        paired(table.of("r1"), part, 1)
+        paired(table.of("r1"), part)
 
 
 def changed(table, column: str, row: int, value):
@@ -89,13 +96,11 @@ def test_other_windows_are_refused_by_the_name_of_the_first(column, value, why):
     table = judged(np.random.default_rng(0), robots=2)
     row = 48 + 4  # of the second robot, its second episode
     with pytest.raises(NotComparable, match=why):
-        paired(changed(table, column, row, value), table, 1)
+        paired(changed(table, column, row, value), table)
 
 
 def test_the_overall_difference_is_that_of_the_means():
     a, b = (judged(np.random.default_rng(s), robots=3, mean=s) for s in (0, 1))
     b = replace(b, metrics={**b.metrics, "psnr_copy": a.metrics["psnr_copy"]})
-    found = paired(a, b, 4)
-    for metric in ("cross_entropy", "perplexity_corpus"):
-        means = [summarise(x, 4).overall[metric].mean for x in (a, b)]
-        assert found[OVERALL][metric].mean == pytest.approx(means[0] - means[1])
+    means = [summarise(x, 4).overall["cross_entropy"].mean for x in (a, b)]
+    assert paired(a, b)[OVERALL].mean == pytest.approx(means[0] - means[1])

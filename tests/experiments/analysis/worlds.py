@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from experiments.analysis.intervals import OVERALL, Interval, interval_of, overall
+from hma_jax.evaluation.summary import Summary
 from hma_jax.evaluation.windows import WindowTable
+
+
+def intervals(summary: Summary) -> dict[str, dict[str, Interval]]:
+    """{robot or OVERALL: {metric: interval}} in closed form, where every robot has every metric."""
+    robots = summary.datasets
+    found = {robot: {m: interval_of(stat) for m, stat in stats.items()} for robot, stats in robots.items()}
+    metrics = next(iter(robots.values()))
+    return {OVERALL: {m: overall(stats[m] for stats in robots.values()) for m in metrics}} | found
 
 
 def judged(
