@@ -102,25 +102,36 @@ def test_the_model_that_is_driven_is_as_good_as_readme_says():
         sum(sum(robot[kind]) / len(robot[kind]) for robot in report["robots"].values()) / len(report["robots"])
         for kind in ("model", "still", "shuffled")
     )
-    said = (
-        f"{model:.1f} dB over {report['frames']} frames of held-out episodes, a still picture {still:.1f}, "
-        f"other actions {shuffled:.1f}; {report['frames_per_second']:.0f} frames a second "
-        f"on {('one core', 'two cores')[report['machine']['cores'] - 1]}"
-    )
-    assert said in " ".join(README.read_text().split())
+    cores = ("one core", "two cores")[report["machine"]["cores"] - 1]
+    text = " ".join(README.read_text().split())
+    assert f"{report['frames']} frames of held-out episodes" in text
+    assert f"| {model:.1f} dB | a still picture {still:.1f}, other actions {shuffled:.1f} |" in text
+    assert f"| {report['frames_per_second']:.0f} frames a second on {cores} |" in text
+
+
+JUDGED = {
+    "fifteen policies, a pusher reaches": ("pusher_sand-reach-grown", 15),
+    "eleven, an arm reaches": ("arm_chalk-reach-grown", 11),
+    "eleven, a MuJoCo arm opens a drawer": ("metaworld_drawer", 11),
+}
+"""Beginning of a row of README -> (what was judged, how many policies)."""
 
 
 def test_policies_and_plans_are_as_readme_says():
-    text = " ".join(README.read_text().split())
-    assert "Success of fifteen policies" in text and "of eleven where an arm does" in text
-    for task, policies in (("pusher_sand-reach-grown", 15), ("arm_chalk-reach-grown", 11), ("metaworld_drawer", 11)):
+    rows = table(README, "| | model |")
+    for said, (task, policies) in JUDGED.items():
         judged = json.loads((ROOT / f"experiments/results/judge-{task}/agreement.json").read_text())
-        r = judged["agreement"]["learned model"]["policies and starts"]["pearson"]
+        learned, control = (
+            judged["agreement"][world]["policies and starts"]["pearson"] for world in ("learned model", "control: actions of other episodes")
+        )
+        (cells,) = (cells for label, cells in rows.items() if label.startswith(said))
         assert len(judged["policies"]) == policies
-        assert f"r = {r['mean']:.2f} ({r['low']:.2f} to {r['high']:.2f})" in text
+        assert cells[0] == f"r = {learned['mean']:.2f} ({learned['low']:.2f} to {learned['high']:.2f})"
+        assert cells[1] in (f"other actions {control['mean']:.2f}", "without actions: none")
     success = {way: float(row["mean"]) for way, row in planned("planning").items()}
     plans, shooting = success["CEM in the model"], success["random shooting in the model"]
-    assert f"reach {100 * plans:.0f} % of marks, random shooting {100 * shooting:.0f} %" in text
+    (cells,) = (cells for label, cells in rows.items() if label.startswith("plans"))
+    assert cells == [f"{100 * plans:.0f} %", f"random shooting {100 * shooting:.0f} %"]
 
 
 def test_plans_in_either_model_are_as_their_page_says():
@@ -157,3 +168,11 @@ def test_the_page_of_simulators_gives_the_nats_of_its_table():
     widths = ", ".join(f"{nats['width', x, 'point']:.3f}" for x in (24, 32, 64, 96))
     assert f"({widths} at 24 to 96)" in page
     assert f"from {nats['datasets', 5, 'point']:.3f} nats alone to {nats['datasets', 40, 'point']:.3f} among" in page
+
+
+def test_what_the_table_of_claims_says_stands_on_the_pages_that_it_links():
+    for claim, (said, link) in table(RESULTS, "| the paper | here |").items():
+        page = (RESULTS.parent / re.search(r"\]\(([^)#]+)", link)[1]).resolve()
+        text = " ".join(page.read_text().split())
+        for figure in re.findall(r"\d+\.\d+", said):
+            assert figure in text, (claim, figure, page.name)

@@ -45,7 +45,7 @@ def test_ten_minutes_are_as_the_page_says():
     assert said in page
     assert "two cores train in {}, {} and {}.".format(*objects(small)) in page
     tools = f"{100 * mean('tool_found', 10):.0f}"
-    assert f"after ten minutes {last} % of objects are found, {tools} % of tools" in words_of(ROOT / "README.md")
+    assert f"| {last} % of objects, {tools} % of tools |" in words_of(ROOT / "README.md")
     assert f"Objects are found in {last} % of the frames of the last minute, not in all" in page
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
     assert f"commands by {mean('follows', 10):.2f} after {mean('follows', 1):.2f} in the first minute" in page
