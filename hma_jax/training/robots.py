@@ -16,7 +16,7 @@ from hma_jax.model.params import Params, ParamSpec, is_spec
 
 
 class Active(NamedTuple):
-    """The robots of one step: G = min(B, E) different ones, those of the batch among them."""
+    """The robots of one step: G = min(max(B, 2), E) different ones, those of the batch among them."""
 
     robots_G: jax.Array  # int32: their places on the embodiment axis
     slice_B: jax.Array  # int32: each example's robot, as a place in `robots_G`
@@ -24,7 +24,9 @@ class Active(NamedTuple):
 
 def choose(embodiment_B: jax.Array, embodiments: int) -> Active:
     """The robots of a batch, then as many others as make a fixed number."""
-    count = min(len(embodiment_B), embodiments)
+    # Two at least. What writes a single robot back XLA makes an update of a slice, puts off reading its old moments, and
+    # then has to copy all robots' arrays in each step. The second robot, without an example, stands still.
+    count = min(max(len(embodiment_B), 2), embodiments)
     if count == embodiments:
         return Active(jnp.arange(embodiments), embodiment_B)
     here_E = jnp.zeros(embodiments, bool).at[embodiment_B].set(True)
