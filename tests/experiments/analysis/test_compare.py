@@ -67,6 +67,10 @@ def test_retrieval_among_other_numbers_is_not_compared():
     a, b = sides()
     alike, other = compare(among(a, 4), among(b, 4)), compare(among(a, 4), among(b, 16))
     assert any(r.metric == "retrieval" for r in alike)
+    by_robot = np.where(a.seeds[0].dataset == "r0", 4, 16)
+    mine, theirs = among(a, by_robot), among(b, by_robot)
+    backwards = replace(theirs, seeds={0: theirs.seeds[0].rows(np.arange(len(by_robot))[::-1])})
+    assert any(r.metric == "retrieval" for r in compare(mine, backwards))
     assert not any(r.metric.startswith("retrieval") for r in other) and any(r.metric == "action_nats" for r in other)
 
 
