@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import DiffusionConfig, ModelConfig, MupConfig, OptimizerConfig, TrainConfig
+from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, MupConfig, OptimizerConfig, TrainConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 
@@ -54,6 +55,13 @@ def train_config(**changes) -> TrainConfig:
         steps=6, batch=8, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=2)
     )
     return TrainConfig(**(settings | changes))
+
+
+def in_float64(execution: ExecutionConfig = ExecutionConfig()) -> ExecutionConfig:
+    """The same in float64, which users cannot choose: for comparisons that rounding must not disturb."""
+    made = dataclasses.replace(execution)
+    object.__setattr__(made, "dtype", "float64")
+    return made
 
 
 def random_batch(seed: int, config: ModelConfig, batch: int = 8, table=TABLE) -> dict[str, np.ndarray]:

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import functools
+import types
+import typing
+from typing import Any, Literal
+
 
 class ConfigError(ValueError):
     """A configuration that cannot work; the message names the field and what to change."""
@@ -11,3 +16,39 @@ def require(condition: bool, message: str) -> None:
     """Raises ConfigError(message) unless `condition` holds."""
     if not condition:
         raise ConfigError(message)
+
+
+def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
+    """Raises ConfigError, which begins with `where`, unless `value` is one of `choices`."""
+    known = ", ".join(map(str, choices))
+    require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
+
+
+def check_choices(config: Any) -> None:
+    """Raises ConfigError for a field of a dataclass that is not among the choices of its type: a Literal, one or
+    None, or a tuple of such."""
+    for name, choices, several in _choices(type(config)):
+        value = getattr(config, name)
+        for one in value if several else (value,):
+            require_choice(one, choices, f"{type(config).__name__}.{name}")
+
+
+@functools.cache
+def _choices(cls: type) -> tuple[tuple[str, tuple[Any, ...], bool], ...]:
+    """(field, its choices, whether it is a tuple of them) of every field with choices."""
+    found = []
+    for name, hint in typing.get_type_hints(cls).items():
+        several = typing.get_origin(hint) is tuple
+        choices = _of_literals(typing.get_args(hint)[0] if several else hint)
+        if choices:
+            found.append((name, choices, several))
+    return tuple(found)
+
+
+def _of_literals(hint: Any) -> tuple[Any, ...]:
+    """What a Literal, or a Literal or None, allows; nothing of other types."""
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        options = [option for option in typing.get_args(hint) if option is not type(None)]
+        choices = _of_literals(options[0]) if len(options) == 1 else ()
+        return (*choices, None) if choices else ()
+    return typing.get_args(hint) if typing.get_origin(hint) is Literal else ()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import require
+from hma_jax.config.base import check_choices, require
 
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
 
@@ -31,6 +31,7 @@ class SamplerConfig:
     scale_initial_noise: bool = True
 
     def __post_init__(self):
+        check_choices(self)
         require(self.steps >= 2, f"sampler.steps must be at least 2, got {self.steps}")
         require(self.temperature >= 0, f"sampler.temperature must not be negative, got {self.temperature}")
         require(0.0 <= self.eta <= 1.0, f"sampler.eta must lie in [0, 1], got {self.eta}")
@@ -70,6 +71,7 @@ class DecodeConfig:
     slide: Literal["exact", "streaming"] = "exact"
 
     def __post_init__(self):
+        check_choices(self)
         require(self.unmask_steps >= 1, f"decode.unmask_steps must be at least 1, got {self.unmask_steps}")
         require(self.temperature >= 0, f"decode.temperature must not be negative, got {self.temperature}")
         require(self.top_k >= 0, f"decode.top_k must not be negative, got {self.top_k}")
@@ -93,10 +95,13 @@ class EvalConfig:
     seed: int = 0
 
     def __post_init__(self):
+        check_choices(self)
         require(self.windows_per_dataset >= 1, "eval.windows_per_dataset must be at least 1")
         require(self.prompt_frames >= 1, "eval.prompt_frames must be at least 1")
         require(self.random_actions >= 1, "eval.random_actions must be at least 1")
         require(self.other_actions >= 0, "eval.other_actions must not be negative")
+        require(self.batch >= 1, f"eval.batch must be at least 1, got {self.batch}")
+        require(self.perplexity_group >= 1, f"eval.perplexity_group must be at least 1, got {self.perplexity_group}")
 
     @property
     def first_predicted(self) -> int:

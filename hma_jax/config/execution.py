@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import require
+from hma_jax.config.base import check_choices, require
 
 Dtype = Literal["float32", "bfloat16"]
 
@@ -41,9 +41,11 @@ class MeshConfig:
     min_shard_size: int = 2**14  # smaller parameters stay whole on every device
 
     def __post_init__(self):
+        check_choices(self)
         sizes = (self.data, self.fsdp, self.tensor)
         require(sizes.count(-1) <= 1, f"mesh: only one axis may be -1, got {sizes}")
         require(all(s == -1 or s >= 1 for s in sizes), f"mesh axes must be -1 or at least 1, got {sizes}")
+        require(self.min_shard_size >= 0, f"mesh.min_shard_size must not be negative, got {self.min_shard_size}")
 
 
 @dataclass(frozen=True)
@@ -60,5 +62,6 @@ class ExecutionConfig:
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
     def __post_init__(self):
+        check_choices(self)
         require(self.accumulate >= 1, f"execution.accumulate must be at least 1, got {self.accumulate}")
         require(self.windows_at_once >= 1, f"execution.windows_at_once must be at least 1, got {self.windows_at_once}")

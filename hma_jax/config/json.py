@@ -13,7 +13,7 @@ import types
 import typing
 from typing import Any, Literal
 
-from hma_jax.config.base import require
+from hma_jax.config.base import require, require_choice
 
 
 def to_dict(config: Any) -> Any:
@@ -62,9 +62,7 @@ def _decode(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return from_dict(hint, value, where)
     if origin is Literal:
-        choices = typing.get_args(hint)
-        known = ", ".join(map(str, choices))
-        require(value in choices, f"{where}: {value!r} is not a choice; choose one of {known}")
+        require_choice(value, typing.get_args(hint), where)
         return value
     if origin is tuple:
         require(isinstance(value, (list, tuple)), f"{where}: expected a list, got {value!r}")

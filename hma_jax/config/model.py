@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import require
+from hma_jax.config.base import check_choices, require
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,11 @@ class MupConfig:
     base_width: int = 256
     attention_scale: float = 8.0
     without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()
+
+    def __post_init__(self):
+        check_choices(self)
+        require(self.base_width >= 1, f"mup.base_width must be at least 1, got {self.base_width}")
+        require(self.attention_scale > 0, f"mup.attention_scale must be positive, got {self.attention_scale}")
 
 
 @dataclass(frozen=True)
@@ -47,9 +52,11 @@ class DiffusionConfig:
     time_shift: float = 1.0
 
     def __post_init__(self):
-        for name in ("channels", "patch", "width", "depth", "steps", "repeats"):
+        check_choices(self)
+        for name in ("channels", "patch", "width", "depth", "repeats"):
             value = getattr(self, name)
             require(value >= 1, f"diffusion.{name} must be at least 1, got {value}")
+        require(self.steps >= 2, f"diffusion.steps must be at least 2, got {self.steps}")
         require(self.clip > 0, f"diffusion.clip must be positive, got {self.clip}")
         require(self.weight_cap >= 0, f"diffusion.weight_cap must not be negative, got {self.weight_cap}")
         require(self.time_shift > 0, f"diffusion.time_shift must be positive, got {self.time_shift}")
@@ -109,12 +116,17 @@ class ModelConfig:
     mup: MupConfig = field(default_factory=MupConfig)
 
     def __post_init__(self):
+        check_choices(self)
+        for name in ("width", "layers", "heads", "frames", "tokens", "factors", "action_tokens"):
+            require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
         require(
             self.width % self.heads == 0,
             f"model.width {self.width} is not a multiple of model.heads {self.heads}",
         )
-        for name in ("width", "layers", "heads", "frames", "tokens", "factors", "action_tokens"):
-            require(getattr(self, name) >= 1, f"model.{name} must be at least 1, got {getattr(self, name)}")
+        require(
+            self.width * self.mlp_ratio >= 1,
+            f"model.mlp_ratio {self.mlp_ratio} of model.width {self.width} leaves the MLP no width",
+        )
         require(self.factor_vocab >= 2, f"model.factor_vocab must be at least 2, got {self.factor_vocab}")
         require(
             not self.chain_factors or (self.factors > 1 and self.diffusion is None),

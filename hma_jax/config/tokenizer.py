@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hma_jax.config.base import require
+from hma_jax.config.base import check_choices, require
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class TokenizerConfig:
     latent_noise: float = 0.1
 
     def __post_init__(self):
+        check_choices(self)
         d = self.downsample
         require(d >= 2 and d & (d - 1) == 0, f"tokenizer.downsample must be a power of two, got {d}")
         require(
@@ -107,6 +108,7 @@ class TokenizerTrainConfig:
     seed: int = 0
 
     def __post_init__(self):
+        check_choices(self)
         require(self.steps >= 1, f"tokenizer training: steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"tokenizer training: batch must be at least 1, got {self.batch}")
         require(
@@ -115,6 +117,8 @@ class TokenizerTrainConfig:
         )
         require(self.warmup_steps >= 0, "tokenizer training: warmup_steps must not be negative")
         require(self.clip_norm > 0, "tokenizer training: clip_norm must be positive")
-
-
-# --- Model -----------------------------------------------------------------------------------
+        require(self.weight_decay >= 0, f"tokenizer training: weight_decay must not be negative, got {self.weight_decay}")
+        require(
+            0 <= self.final_fraction <= 1,
+            f"tokenizer training: final_fraction must lie in [0, 1], got {self.final_fraction}",
+        )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import require
+from hma_jax.config.base import check_choices, require
 
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
@@ -63,10 +63,17 @@ class MaskingConfig:
     action_leak: ActionLeak = "none"
 
     def __post_init__(self):
+        check_choices(self)
         shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain", "own_past")
         for name in (*shares, "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
+        require(
+            self.mask_angle_min < 1 or self.min_ratio > 0 or self.horizon_gain > 0,
+            "masking.mask_angle_min 1 masks no token, so that nothing is learned; set it below 1, or masking.min_ratio",
+        )
+        # The first frame is never masked: nothing comes before it.
+        require(self.prompt_frames >= 1, f"masking.prompt_frames must be at least 1, got {self.prompt_frames}")
         require(self.action_loss_weight >= 0, "masking.action_loss_weight must not be negative")
         require(self.own_past_rounds >= 1, f"masking.own_past_rounds must be at least 1, got {self.own_past_rounds}")
         require(self.change_weight > 0, f"masking.change_weight must be positive, got {self.change_weight}")
@@ -112,9 +119,16 @@ class OptimizerConfig:
     matrices: Literal["adamw", "muon"] = "adamw"
 
     def __post_init__(self):
+        check_choices(self)
         require(self.learning_rate > 0, f"optimizer.learning_rate must be positive, got {self.learning_rate}")
         require(self.warmup_steps >= 0, "optimizer.warmup_steps must not be negative")
         require(self.clip_norm > 0, f"optimizer.clip_norm must be positive, got {self.clip_norm}")
+        for name in ("beta1", "beta2"):
+            require(0 <= getattr(self, name) < 1, f"optimizer.{name} must lie in [0, 1), got {getattr(self, name)}")
+        for name in ("final_fraction", "decay_fraction"):
+            require(0 <= getattr(self, name) <= 1, f"optimizer.{name} must lie in [0, 1], got {getattr(self, name)}")
+        require(self.epsilon > 0, f"optimizer.epsilon must be positive, got {self.epsilon}")
+        require(self.weight_decay >= 0, f"optimizer.weight_decay must not be negative, got {self.weight_decay}")
 
 
 @dataclass(frozen=True)
@@ -131,6 +145,7 @@ class TrainConfig:
     action_scale: ActionScale = "deviation"  # of robots new to the model
 
     def __post_init__(self):
+        check_choices(self)
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"train.batch must be at least 1, got {self.batch}")
         require(0 <= self.ema_decay < 1, f"train.ema_decay must lie in [0, 1), got {self.ema_decay}")

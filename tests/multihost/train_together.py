@@ -32,7 +32,7 @@ from hma_jax.runtime.rows import own_rows
 from hma_jax.training.loop import Interrupted, LoopOptions
 from hma_jax.training.train import train_model
 from hma_jax.training.validation import Validation
-from tests.tiny import TABLE, model_config, random_batch, train_config
+from tests.tiny import TABLE, in_float64, model_config, random_batch, train_config
 
 
 def main(run_dir: str, text: str) -> None:
@@ -57,6 +57,7 @@ def train(run_dir: Path, asked: dict[str, Any]) -> dict[str, Any]:
     # Without action heads, of which a model so small has too many to be split.
     model, config = model_config(action_heads=False), train_config(steps=asked["steps"], ema_decay=asked["ema"])
     mesh = MeshConfig(*asked["mesh"], min_shard_size=64)
+    execution = ExecutionConfig(mesh=mesh)
     rows, seen = own_rows(mesh, config.batch), []
 
     def own(step: int) -> dict[str, np.ndarray]:
@@ -74,7 +75,7 @@ def train(run_dir: Path, asked: dict[str, Any]) -> dict[str, Any]:
 
     result = train_model(
         model, TABLE, config, batches, run_dir=run_dir, provenance={},
-        execution=ExecutionConfig(mesh=mesh, dtype="float64" if FLOAT64 else "float32"),
+        execution=in_float64(execution) if FLOAT64 else execution,
         options=LoopOptions(checkpoint_every=asked["every"], checkpoint_minutes=asked["minutes"], log_every=2),
         validation=Validation(2, lambda: map(own, range(100, 103))) if asked.get("validate") else None,
         progress=announce,

@@ -18,19 +18,19 @@ from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.model.hma import declare_model
 from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import CONTINUOUS, make_checkpoint
-from tests.tiny import DIFFUSION, TABLE, lively_params, model_config, random_batch, train_config
+from tests.tiny import DIFFUSION, TABLE, in_float64, lively_params, model_config, random_batch, train_config
 
 RELEASED = replace(DIFFUSION, steps=1000)
 """The process that the release has."""
 
 
 @contextmanager
-def in_float64():
+def computing_in_float64():
     """What is float32 otherwise is computed in float64: how products round depends on the processor, and only the
     float32 in which weights are written is left to tell two models apart."""
     with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
         patch.setattr(jnp, "float32", jnp.float64)
-        yield ExecutionConfig(dtype="float64")
+        yield in_float64()
 
 
 def everything(config, params, execution: ExecutionConfig) -> dict[str, np.ndarray]:
@@ -66,7 +66,7 @@ def written(config, params, folder: Path, step: int = 7) -> tuple[Run, dict, lis
 def same_numbers(config, params, back: Run) -> None:
     assert back.table.names == TABLE.names
     np.testing.assert_array_equal(back.table.statistics(), TABLE.statistics())
-    with in_float64() as execution:
+    with computing_in_float64() as execution:
         ours, theirs = everything(config, params, execution), everything(back.model, back.params, execution)
     for name, want in ours.items():
         np.testing.assert_allclose(theirs[name], want, rtol=0, atol=1e-6 * np.abs(want).max(), err_msg=name)

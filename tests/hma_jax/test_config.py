@@ -1,0 +1,91 @@
+"""Configurations that cannot work are refused when they are made."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from typing import Literal
+
+import pytest
+
+from hma_jax import config
+from hma_jax.config import (
+    ConfigError,
+    DiffusionConfig,
+    EvalConfig,
+    ExecutionConfig,
+    Magvit2Config,
+    MaskingConfig,
+    MeshConfig,
+    ModelConfig,
+    MupConfig,
+    OptimizerConfig,
+    TokenizerTrainConfig,
+)
+from hma_jax.config.base import check_choices
+
+CONFIGS = [found for found in map(config.__dict__.get, config.__all__) if dataclasses.is_dataclass(found)]
+
+
+def test_every_field_with_choices_is_compared_with_them():
+    fields = [
+        (cls, name, hint)
+        for cls in CONFIGS
+        for name, hint in typing.get_type_hints(cls).items()
+        if "Literal" in repr(hint)
+    ]
+    assert {cls for cls, _, _ in fields} >= {MaskingConfig, MupConfig, ModelConfig, Magvit2Config, ExecutionConfig}
+    for cls, name, hint in fields:
+        wrong = ("misspelt",) if typing.get_origin(hint) is tuple else "misspelt"
+        with pytest.raises(ConfigError, match=rf"^{cls.__name__}\.{name}: 'misspelt' is not a choice; choose one of \w"):
+            cls(**{name: wrong})
+
+
+def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
+    @dataclasses.dataclass
+    class Some:
+        one: Literal["a", "b"] | None = None
+        several: tuple[Literal[1, 2], ...] = ()
+        whatever: str | None = None
+
+    for accepted in (Some(), Some("a", (1, 2, 1), "c")):
+        check_choices(accepted)
+    with pytest.raises(ConfigError, match="Some.one: 'c' is not a choice; choose one of a, b, None"):
+        check_choices(Some("c"))
+    with pytest.raises(ConfigError, match="Some.several: 3 is not a choice; choose one of 1, 2"):
+        check_choices(Some(several=(1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("cls", "values", "message"),
+    [
+        (ModelConfig, {"heads": 0}, "model.heads must be at least 1, got 0"),
+        (ModelConfig, {"mlp_ratio": 0.0}, "model.mlp_ratio 0.0 of model.width 256 leaves the MLP no width"),
+        (ModelConfig, {"mlp_ratio": -1.0}, "model.mlp_ratio -1.0"),
+        (MupConfig, {"base_width": 0}, "mup.base_width must be at least 1, got 0"),
+        (MupConfig, {"attention_scale": 0.0}, "mup.attention_scale must be positive, got 0.0"),
+        (DiffusionConfig, {"steps": 1}, "diffusion.steps must be at least 2, got 1"),
+        (OptimizerConfig, {"beta1": 1.0}, r"optimizer.beta1 must lie in \[0, 1\), got 1.0"),
+        (OptimizerConfig, {"beta2": 1.5}, r"optimizer.beta2 must lie in \[0, 1\), got 1.5"),
+        (OptimizerConfig, {"final_fraction": 5.0}, r"optimizer.final_fraction must lie in \[0, 1\], got 5.0"),
+        (OptimizerConfig, {"decay_fraction": 2.0}, r"optimizer.decay_fraction must lie in \[0, 1\], got 2.0"),
+        (OptimizerConfig, {"epsilon": 0.0}, "optimizer.epsilon must be positive, got 0.0"),
+        (OptimizerConfig, {"weight_decay": -1.0}, "optimizer.weight_decay must not be negative, got -1.0"),
+        (TokenizerTrainConfig, {"weight_decay": -1.0}, "weight_decay must not be negative, got -1.0"),
+        (TokenizerTrainConfig, {"final_fraction": 5.0}, r"final_fraction must lie in \[0, 1\], got 5.0"),
+        (EvalConfig, {"batch": 0}, "eval.batch must be at least 1, got 0"),
+        (EvalConfig, {"perplexity_group": 0}, "eval.perplexity_group must be at least 1, got 0"),
+        (MeshConfig, {"min_shard_size": -1}, "mesh.min_shard_size must not be negative, got -1"),
+        (MaskingConfig, {"prompt_frames": 0}, "masking.prompt_frames must be at least 1, got 0"),
+        (MaskingConfig, {"mask_angle_min": 1.0}, "masking.mask_angle_min 1 masks no token"),
+    ],
+)
+def test_numbers_that_cannot_work_are_refused(cls, values, message):
+    with pytest.raises(ConfigError, match=message):
+        cls(**values)
+
+
+def test_limits_that_can_work_are_accepted():
+    OptimizerConfig(beta1=0.0, final_fraction=0.0, decay_fraction=1.0, weight_decay=0.0)
+    MaskingConfig(mask_angle_min=1.0, min_ratio=0.5)  # half of every frame
+    MeshConfig(min_shard_size=0)
