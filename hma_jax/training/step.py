@@ -60,6 +60,11 @@ def make_train_step(
         f"train.masking.setting {masking.setting!r} predicts actions from action tokens, of which "
         f"model.conditioning {model.conditioning!r} has none; choose one with concat",
     )
+    require(
+        model.frames > 1 or not masking.predicts_frames,
+        f"train.masking.setting {masking.setting!r} predicts frames from earlier ones, and model.frames 1 leaves none to "
+        "predict; set model.frames to at least 2",
+    )
     require(not (masking.own_past and model.diffusion), "train.masking.own_past draws ids; continuous tokens have none")
     require(
         masking.change_weight == 1 or not model.diffusion,

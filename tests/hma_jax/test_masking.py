@@ -179,6 +179,14 @@ def test_weights_of_change_are_of_ids():
         make_train_step(declare_model(config, TABLE), TABLE, config, train)
 
 
+@pytest.mark.parametrize("setting", ["forward", "passive", "full"])
+def test_a_window_of_one_frame_has_none_to_predict(setting: str):
+    config, declared = shallow_config(frames=1), declare_model(shallow_config(frames=1), TABLE)
+    with pytest.raises(ConfigError, match=f"'{setting}' predicts frames from earlier ones, and model.frames 1 leaves none"):
+        make_train_step(declared, TABLE, config, train_config(masking=MaskingConfig(setting=setting)))
+    make_train_step(declared, TABLE, config, train_config(masking=MaskingConfig(setting="policy")))
+
+
 def poison_hidden(data, masked):
     """Hidden chunks become nonsense, as the model would be given them; targets are not asked for."""
     nonsense = np.where(np.asarray(masked.hidden_T)[..., None], 1e3, data["actions"])
