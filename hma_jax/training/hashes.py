@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+from hma_jax.runtime.outputs import replace_file
 
 NAME = "sha256.json"
 
@@ -27,14 +28,9 @@ class Damaged(Exception):
 
 
 def write_list(checkpoint: Path) -> None:
-    """Lists every file under `checkpoint`: path, size in bytes, SHA-256. Written aside, then renamed."""
+    """Lists every file under `checkpoint`: path, size in bytes, SHA-256."""
     rows = [[name, path.stat().st_size, _sha256(path)] for name, path in _files(checkpoint)]
-    aside = checkpoint / f".{NAME}.tmp"
-    with open(aside, "w") as file:
-        file.write(json.dumps({"sha256": _hash_of(rows), "files": rows}, indent=0))
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, checkpoint / NAME)
+    replace_file(checkpoint / NAME, json.dumps({"sha256": _hash_of(rows), "files": rows}, indent=0))
 
 
 def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from hma_jax.config import ConfigError
+from hma_jax.runtime.outputs import replace_file
 from hma_jax.runtime.processes import is_writer
 from hma_jax.training.board import Board
 from hma_jax.training.checkpoints import SaveError
@@ -86,15 +87,16 @@ class RunLog:
             self.board = Board(run_dir / "tensorboard", start + 1)
 
     def _cut(self, name: str, step: int) -> list[dict[str, Any]]:
-        """Drops what comes after `step`. Returns the records kept."""
+        """Drops what comes after `step`, and a torn line. Returns the records kept."""
         path = self.run_dir / name
         if not path.exists():
             return []
-        kept = _read_until(path, step)
-        with self._writing(name):
-            aside = path.with_suffix(".tmp")
-            aside.write_text("".join(json.dumps(record) + "\n" for record in kept))
-            os.replace(aside, path)
+        before = path.read_text()
+        kept = _read_until(before, step)
+        after = "".join(json.dumps(record) + "\n" for record in kept)
+        if after != before:
+            with self._writing(name):
+                replace_file(path, after)
         return kept
 
     def start_clock(self, step: int) -> None:
@@ -175,10 +177,10 @@ class RunLog:
             ) from error
 
 
-def _read_until(path: Path, step: int) -> list[dict[str, Any]]:
-    """The records of a JSONL file up to `step`; the last line may be torn."""
+def _read_until(text: str, step: int) -> list[dict[str, Any]]:
+    """The records of JSON lines up to `step`; the last line may be torn."""
     kept: list[dict[str, Any]] = []
-    for line in path.read_text().splitlines():
+    for line in text.splitlines():
         try:
             record = json.loads(line)
         except json.JSONDecodeError:

@@ -203,6 +203,23 @@ def test_what_a_run_is_watched_on_survives_a_resume_and_is_shown(tmp_path: Path)
     assert (tmp_path / "broken" / "validation.jsonl").read_bytes() == whole
 
 
+def test_a_log_that_is_cut_is_on_the_disk_before_the_old_one_is_gone(tmp_path: Path, monkeypatch):
+    """Otherwise a loss of power leaves it empty, and a run without its log is refused."""
+    fit_toy(tmp_path, 3, options=EVERY_STEP)
+    log = tmp_path / "metrics.jsonl"
+    whole, place = log.read_bytes(), log.stat().st_ino
+    fit_toy(tmp_path, 3)
+    assert log.stat().st_ino == place, "nothing is cut, and the file stays as it is"
+
+    log.write_bytes(whole + b'{"step": 4, "loss": 1.0}\n')
+    sync, rename, synced, renamed = os.fsync, os.replace, [], []
+    monkeypatch.setattr(os, "fsync", lambda fd: (sync(fd), synced.append(os.fstat(fd).st_ino)))
+    monkeypatch.setattr(os, "replace", lambda old, new: (renamed.append((os.stat(old).st_ino, new)), rename(old, new)))
+    fit_toy(tmp_path, 3)
+    assert log.read_bytes() == whole
+    assert [inode for inode, new in renamed if new == log] and {inode for inode, _ in renamed} <= set(synced)
+
+
 # --- One process at a time -------------------------------------------------------------------
 
 
