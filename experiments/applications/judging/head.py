@@ -9,7 +9,8 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import jax
 import jax.numpy as jnp
@@ -166,25 +167,35 @@ def load_head(directory: Path) -> SuccessHead:
     return SuccessHead(config, unnamed(weights, like, directory), description["measured"])
 
 
+class _Begun(NamedTuple):
+    """The B episodes of one simulator."""
+
+    first: np.ndarray  # frames in which they began, uint8 [B, H, W, 3]
+    count: np.ndarray  # int [B]: frames in a row with success
+
+
 class HeadJudge:
     """A `Judge` of the simulators' Gymnasium environments: 1 and the end once the head has seen success at `hold`
-    frames in a row. The environment says when episodes begin."""
+    frames in a row. The environment says when episodes begin. Environments may share a judge: what it keeps is each
+    simulator's own."""
 
     def __init__(self, head: SuccessHead, hold: int = 1):
         self.head, self.hold = head, hold
-        self._count: np.ndarray | None = None
-        self._first: np.ndarray | None = None  # frames in which the episodes began
+        self._begun: WeakKeyDictionary[AnySimulator, _Begun] = WeakKeyDictionary()
 
     def begin(self, simulator: AnySimulator, episodes: Sequence[int]) -> None:
         """These episodes begin with the simulator's present frames."""
-        if self._first is None:
-            self._first, self._count = simulator.images.copy(), np.zeros(len(simulator.images), int)
-        self._first[list(episodes)], self._count[list(episodes)] = simulator.images[list(episodes)], 0
+        images, which = simulator.images, list(episodes)
+        if simulator not in self._begun:
+            self._begun[simulator] = _Begun(images.copy(), np.zeros(len(images), int))
+        begun = self._begun[simulator]
+        begun.first[which], begun.count[which] = images[which], 0
 
     def __call__(self, simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:
-        """Raises ConfigError before the first `begin`."""
-        require(self._first is not None, "no episode has begun: call `begin` after the simulator's reset")
-        reached = self.head.reached(simulator.images, self._first)
-        self._count = np.where(reached, self._count + 1, 0)
-        done = self._count >= self.hold
+        """Raises ConfigError before the first `begin` of this simulator."""
+        require(simulator in self._begun, "no episode has begun: call `begin` after the simulator's reset")
+        begun = self._begun[simulator]
+        reached = self.head.reached(simulator.images, begun.first)
+        begun.count[:] = np.where(reached, begun.count + 1, 0)
+        done = begun.count >= self.hold
         return done.astype(float), done

@@ -109,15 +109,42 @@ def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path):
 def test_the_head_judges_environments_and_forgets_with_them(judged):
     head = load_head(judged[0] / "out" / "head")
     assert set(head.measured) >= {"frame accuracy", "frame AUROC", "episode accuracy"}
-    judge = HeadJudge(head, hold=2)
-    head.reached = lambda images, first: images[:, 0, 0, 0] > first[:, 0, 0, 0]
-    frames = [[1, 0], [1, 1], [1, 0], [0, 1], [1, 1]]
-    images = [np.broadcast_to(np.array(f)[:, None, None, None], (2, 8, 8, 3)) for f in frames]
-    seen = [SimpleNamespace(images=each) for each in images]
+    judge, simulator = HeadJudge(head, hold=2), Showing(0, 0)
+    head.reached = brighter
     with pytest.raises(ConfigError, match="no episode has begun"):
-        judge(seen[0])
-    judge.begin(SimpleNamespace(images=np.zeros_like(images[0])), [0, 1])
-    done = [judge(each)[1].tolist() for each in seen]
+        judge(simulator)
+    judge.begin(simulator, [0, 1])
+    done = [judge(simulator.show(*f))[1].tolist() for f in ([1, 0], [1, 1], [1, 0], [0, 1], [1, 1])]
     assert done == [[False, False], [True, False], [True, False], [False, False], [False, True]]
-    judge.begin(seen[0], [0])  # which begins with a 1
-    assert judge(seen[1])[1].tolist() == [False, True] and judge(seen[4])[1].tolist() == [False, True]
+    judge.begin(simulator.show(1, 0), [0])
+    assert judge(simulator.show(1, 1))[1].tolist() == [False, True]
+    assert judge(simulator)[1].tolist() == [False, True]
+
+
+def brighter(images: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """What a head takes for reached."""
+    return images[:, 0, 0, 0] > first[:, 0, 0, 0]
+
+
+class Showing:
+    """A simulator that shows a grey level in each episode."""
+
+    def __init__(self, *levels: int):
+        self.show(*levels)
+
+    def show(self, *levels: int):
+        self.images = np.broadcast_to(np.array(levels)[:, None, None, None], (len(levels), 8, 8, 3))
+        return self
+
+
+def test_simulators_that_share_a_judge_do_not_disturb_each_other():
+    judge = HeadJudge(SimpleNamespace(reached=brighter), hold=2)
+    trained, evaluated = Showing(0, 3), Showing(2)
+    judge.begin(trained, [0, 1])
+    judge.begin(evaluated, [0])
+    judge(trained.show(1, 3))
+    assert judge(evaluated.show(1))[1].tolist() == [False]
+    judge.begin(evaluated.show(0), [0])
+    assert judge(trained)[1].tolist() == [True, False]
+    del evaluated
+    assert len(judge._begun) == 1, "what is kept of a simulator goes with it"
