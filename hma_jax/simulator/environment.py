@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
@@ -56,8 +57,15 @@ class _Task:
     ):
         require((run is None) != (simulator is None), "an environment needs either `run` or `simulator`")
         require(max_steps >= 1, f"an episode has at least 1 step, got max_steps={max_steps}")
+        told = ", ".join(options)
+        require(run is not None or not options, f"{told}: options of loading a `run`; a given simulator is as it is")
         if simulator is None:
             simulator = Simulator.load(run, episodes=episodes, **options)
+        require(
+            getattr(simulator, "rate", "model") == "model",
+            "an environment's steps, which `max_steps` and judges count, are frames of the model, not native actions: "
+            "a simulator of rate='model' is needed",
+        )
         require(len(simulator) == episodes, f"a simulator of {episodes} episodes is needed, not of {len(simulator)}")
         if starts is None:
             starts = getattr(simulator, "starts", ())
@@ -69,13 +77,16 @@ class _Task:
         self.robot = simulator.robots[robot]
         self.starts = [start for start in starts if start.robot == robot]
 
-    def begin(self, rng: np.random.Generator, episodes: Sequence[int], options: dict[str, Any] | None) -> np.ndarray:
-        """Starts and seeds drawn from `rng`, one pair for each of `episodes`; `options` may name the start."""
+    def begin(
+        self, rngs: Sequence[np.random.Generator], episodes: Sequence[int], options: dict[str, Any] | None
+    ) -> np.ndarray:
+        """Starts and seeds of `episodes`, a pair drawn from each of `rngs`; `options` may name the start."""
         chosen, seeds = [], []
-        for _ in episodes:
+        for rng in rngs:
             drawn = int(rng.integers(len(self.starts)))
-            number = int((options or {}).get("start", drawn))
-            require(0 <= number < len(self.starts), f"there are {len(self.starts)} starts, no {number}")
+            number = (options or {}).get("start", drawn)
+            usable = isinstance(number, (int, np.integer)) and 0 <= number < len(self.starts)
+            require(usable, f"there are {len(self.starts)} starts, counted from 0, no {number!r}")
             chosen.append(self.starts[number])
             seeds.append(int(rng.integers(2**32)))
         images = self.simulator.reset(chosen, seeds=seeds, episodes=episodes)
@@ -117,7 +128,7 @@ class RobotEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self._steps = 0
-        return self._task.begin(self.np_random, [0], options)[0].copy(), {}
+        return self._task.begin([self.np_random], [0], options)[0].copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         simulator = self._task.simulator
@@ -133,7 +144,11 @@ class RobotEnv(gymnasium.Env):
 
 class RobotVectorEnv(VectorEnv):
     """Many episodes of one robot in one batch. An episode that has ended begins anew with the next step, whose action
-    for it is ignored (Gymnasium's NEXT_STEP)."""
+    for it is ignored (Gymnasium's NEXT_STEP).
+
+    `reset(seed=[...])` seeds each episode by itself: it is then as in `RobotEnv` with that seed. None leaves one as it
+    is seeded. `reset(options={"reset_mask": mask})` begins anew those alone that a bool array [num_envs] marks.
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4, "autoreset_mode": AutoresetMode.NEXT_STEP}
 
@@ -147,9 +162,12 @@ class RobotVectorEnv(VectorEnv):
         starts: Sequence[Start] | None = None,
         judge: Judge = no_judge,
         max_steps: int = MAX_STEPS,
+        max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ):
+        """As `RobotEnv`. `max_episode_steps` is what `gymnasium.make_vec` calls `max_steps`."""
+        max_steps = max_steps if max_episode_steps is None else max_episode_steps
         self._task = _Task(num_envs, run, robot, simulator, starts, judge, max_steps, options)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.single_action_space = action_space(self._task.robot)
@@ -158,13 +176,38 @@ class RobotVectorEnv(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._steps = np.zeros(num_envs, int)
         self._over = np.zeros(num_envs, bool)
+        self._rngs: list[np.random.Generator] = []  # of each episode; one for all unless they are seeded by themselves
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._steps[:], self._over[:] = 0, False
-        return self._task.begin(self.np_random, range(self.num_envs), options).copy(), {}
+        which = self._marked(options)
+        self._seed(seed, which)
+        images = self._task.begin([self._rngs[b] for b in which], which, options).copy()
+        self._steps[which], self._over[which] = 0, False
+        return images, {}
+
+    def _marked(self, options: dict[str, Any] | None) -> list[int]:
+        """The episodes that a reset begins. Raises ConfigError for an unusable mask."""
+        if options is None or "reset_mask" not in options:
+            return list(range(self.num_envs))
+        mask = np.asarray(options["reset_mask"])
+        require(
+            mask.dtype == bool and mask.shape == (self.num_envs,) and bool(mask.any()),
+            f"reset_mask must be {self.num_envs} truth values, at least one true, got {options['reset_mask']!r}",
+        )
+        return np.flatnonzero(mask).tolist()
+
+    def _seed(self, seed: int | Sequence[int | None] | None, which: Sequence[int]) -> None:
+        """Of the episodes `which`, those that `seed` is of."""
+        if np.ndim(seed) == 0:
+            super().reset(seed=seed)
+            new = [None if seed is None else self.np_random] * self.num_envs
+        else:
+            require(len(seed) == self.num_envs, f"{self.num_envs} episodes need as many seeds, got {len(seed)}")
+            new = [None if number is None else np_random(number)[0] for number in seed]
+        known = self._rngs or [self.np_random] * self.num_envs
+        self._rngs = [new[b] if b in which and new[b] is not None else known[b] for b in range(self.num_envs)]
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         simulator, again = self._task.simulator, self._over.copy()
@@ -172,7 +215,8 @@ class RobotVectorEnv(VectorEnv):
         clipped = np.array([bool(names) for names in simulator.clipped])
         rewards, done = self._task.judge(simulator)  # before others begin: a start does not count, as after `reset`
         if again.any():
-            self._task.begin(self.np_random, np.flatnonzero(again).tolist(), None)
+            which = np.flatnonzero(again).tolist()
+            self._task.begin([self._rngs[b] for b in which], which, None)
         self._steps = np.where(again, 0, self._steps + 1)
         terminated = done & ~again
         truncated = ~again & (self._steps >= self._task.max_steps)

@@ -114,9 +114,63 @@ def test_each_of_a_vector_is_what_the_environment_alone_makes():
             np.testing.assert_array_equal(alone.step([actions[b]])[0], images[t][b])
 
 
+def vector(episodes: int = 3, **options):
+    return RobotVectorEnv(episodes, simulator=simulator(episodes=episodes), starts=STARTS, robot="arm", **options)
+
+
+def test_each_episode_of_a_vector_may_have_its_own_seed():
+    """It is then what the environment alone shows with that seed, also where it begins anew."""
+    env, seeds, low = vector(max_steps=1), [5, 9, 5], np.stack([np.array(ROBOTS[1].low, np.float32)] * 3)
+    shown = [env.reset(seed=seeds)[0], env.step(low)[0], env.step(low)[0]]
+    for b, seed in enumerate(seeds[:2]):
+        alone = RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
+        expected = [alone.reset(seed=seed)[0], alone.step(low[0])[0], alone.reset()[0]]
+        np.testing.assert_array_equal([images[b] for images in shown], expected)
+    np.testing.assert_array_equal([images[0] for images in shown], [images[2] for images in shown])
+    again, _ = env.reset(seed=[5, None, None])
+    np.testing.assert_array_equal(again[0], shown[0][0])
+    with pytest.raises(ConfigError, match="3 episodes need as many seeds, got 2"):
+        env.reset(seed=[1, 2])
+
+
+def test_a_part_of_a_vector_begins_anew_where_a_mask_says_so():
+    env, mask = vector(max_steps=3), np.array([False, True, False])
+    env.reset(seed=0)
+    before = env.step(np.stack([env.single_action_space.low] * 3))[0]
+    images, _ = env.reset(options={"reset_mask": mask, "start": 2})
+    assert env._task.simulator.counts == (3, 2, 3)
+    np.testing.assert_array_equal(images[[0, 2]], before[[0, 2]])
+    ends = [env.step(np.stack([env.single_action_space.low] * 3))[3].tolist() for _ in range(3)]
+    assert ends == [[False] * 3, [True, False, True], [False, True, False]]
+    for unusable in (np.zeros(3, bool), np.ones(2, bool), [0, 1, 0], "x"):
+        with pytest.raises(ConfigError, match="reset_mask must be 3 truth values"):
+            env.reset(options={"reset_mask": unusable})
+
+
+def test_a_vector_s_length_may_be_told_in_gymnasium_s_word():
+    env = gymnasium.make_vec(
+        NAME, num_envs=2, simulator=simulator(episodes=2), starts=STARTS, robot="arm", max_episode_steps=3
+    )
+    env.reset(seed=0)
+    assert [env.step(env.action_space.sample())[3].all() for _ in range(3)] == [False, False, True]
+
+
+@pytest.mark.parametrize("start_", ["x", None, 1.5, 3, -1])
+def test_a_start_that_is_none_is_refused(start_):
+    for env in (RobotEnv(simulator=simulator(), starts=STARTS, robot="arm"), vector(2)):
+        with pytest.raises(ConfigError, match=f"there are 3 starts, counted from 0, no {start_!r}"):
+            env.reset(options={"start": start_})
+
+
+def test_native_actions_are_no_steps_of_an_environment():
+    with pytest.raises(ConfigError, match="not native actions"):
+        RobotEnv(simulator=simulator(rate="native"), starts=STARTS, robot="arm")
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
+        ({"rate": "model", "history": 3}, "rate, history: options of loading a `run`"),
         ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
         ({"starts": []}, "there is no start to begin at"),
         ({"run": "somewhere"}, "either `run` or `simulator`"),
