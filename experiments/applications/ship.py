@@ -1,7 +1,8 @@
 """The model of `make play`, small enough for the repository, and what it is worth.
 
 Command: hma train --preset play --out runs/play
-         python -m experiments.applications.ship runs/play/model --unmask-steps 8 --temperature 0.7
+         python -m experiments.applications.ship runs/play/model --out runs/play/shipped --unmask-steps 8 \
+             --temperature 0.7
 Cost: the first an hour and a half of one core and its tokenizer, resumed where it was stopped; the second three minutes.
       Of the model that is served: docs/simulator.md.
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
@@ -20,8 +21,7 @@ import io
 import json
 import shutil
 import sys
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,8 +32,8 @@ from PIL import Image
 
 from data_pipelines.publishing.files import publish, write_file
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
-from experiments.applications import DRIVEN
-from experiments.applications.simulators import held_out, load_simulator, true_simulator
+from experiments.applications.simulators import held_out, in_suite, load_simulator, true_simulator
+from experiments.bench.simulate import time_simulator
 from experiments.boundary import guarded
 from experiments.running.machine import describe_machine
 from hma_jax.config import DecodeConfig, require
@@ -49,7 +49,6 @@ from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import write_list
 from hma_jax.training.runs import describe_run, load_run
 
-OUT = DRIVEN
 REPORT, CLIP = "report.json", "clip.gif"
 LARGEST = 10 * 2**20
 """Bytes of everything that is shipped."""
@@ -57,6 +56,9 @@ LARGEST = 10 * 2**20
 EPISODES = 8
 FRAMES = 24
 """Frames after the start that are compared."""
+
+TIMED = 60
+"""Frames by which frames per second are measured."""
 
 ZOOM, COLOURS = 2, 128  # of the clip
 
@@ -67,10 +69,17 @@ class Shipped(NamedTuple):
     params: Params
 
 
-def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
-    """Replaces `out`, whole or not at all. Raises ConfigError if it would be too large."""
+def ship(
+    source: Path, out: Path, decode: DecodeConfig | None = None, add: Callable[[Path], None] = lambda made: None
+) -> None:
+    """Replaces `out`, whole or not at all, by the model and by what `add` writes beside it.
+
+    Raises ConfigError for a robot outside the suite, and if it would be too large.
+    """
     run = load_run(source, "auto")
     simulator = load_simulator(source)
+    strange = [name for name, robot in simulator.robots.items() if not in_suite(robot)]
+    require(not strange, f"{', '.join(strange)}: not of the suite, so that there is no truth to compare with")
     aside = out.with_name(f".{out.name}.making")
     shutil.rmtree(aside, ignore_errors=True)
     aside.mkdir(parents=True)
@@ -84,6 +93,7 @@ def ship(source: Path, out: Path, decode: DecodeConfig | None = None) -> None:
         save_starts(simulator.starts, aside / STARTS)
         if decode is not None:
             save_decode(decode, aside / DECODE)
+        add(aside)
         size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())
         require(size <= LARGEST, f"{size:,} bytes are more than the {LARGEST:,} that a repository should carry")
         publish(aside, out)
@@ -132,7 +142,7 @@ def report_on(run: Path, simulator: Simulator, seen: Mapping[str, Seen]) -> dict
         "episodes": EPISODES,
         "frames": FRAMES,
         "robots": {name: compare(one) for name, one in seen.items()},
-        "frames_per_second": frames_per_second(run),
+        "frames_per_second": round(time_simulator(run, 1, TIMED).frames_per_second, 1),
         "machine": describe_machine(jax.devices()),
     }
 
@@ -168,39 +178,28 @@ def rolled(simulator: Simulator | SuiteSimulator, starts: Sequence[Start], futur
         yield simulator.step(list(futures[:, t]))
 
 
-def frames_per_second(run: Path, frames: int = 60) -> float:
-    """At batch 1, past the window, tokenizer included."""
-    simulator = load_simulator(run)
-    robot = next(iter(simulator.robots.values()))
-    simulator.reset(next(s for s in simulator.starts if s.robot == robot.name))
-    action = np.array(robot.rest, np.float32)
-    for _ in range(simulator.model.config.frames + 1):
-        simulator.step([action])
-    started = time.perf_counter()
-    for _ in range(frames):
-        simulator.step([action])
-    return round(frames / (time.perf_counter() - started), 1)
+def describe(run: Path) -> None:
+    """Writes report.json and clip.gif beside a model that is about to be shipped, and prints what they say."""
+    simulator = load_simulator(run, episodes=EPISODES)
+    seen = {name: look(simulator, robot) for name, robot in simulator.robots.items()}
+    report = report_on(run, simulator, seen)
+    write_file(run / REPORT, json.dumps(report, indent=1) + "\n")
+    write_clip(seen, run / CLIP, min(robot.hz / robot.stride for robot in simulator.robots.values()))
+    for name, by in report["robots"].items():
+        means = ", ".join(f"{kind} {np.mean(values):.2f}" for kind, values in by.items())
+        print(f"{name:16s} PSNR over {FRAMES} frames: {means} dB")
+    print(f"{report['frames_per_second']} frames/s at batch 1; step {report['step']:,}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--out", type=Path, required=True, help="directory that is replaced")
     parser.add_argument("--unmask-steps", type=int, default=USUAL.unmask_steps, help="looks at a frame")
     parser.add_argument("--temperature", type=float, default=USUAL.temperature, help="of drawing tokens")
     arguments = parser.parse_args()
     decode = replace(USUAL, unmask_steps=arguments.unmask_steps, temperature=arguments.temperature)
-    ship(arguments.run, arguments.out, decode)
-    simulator = load_simulator(arguments.out, episodes=EPISODES)
-    seen = {name: look(simulator, robot) for name, robot in simulator.robots.items()}
-    report = report_on(arguments.out, simulator, seen)
-    write_file(arguments.out / REPORT, json.dumps(report, indent=1) + "\n")
-    slowest = min(robot.hz / robot.stride for robot in simulator.robots.values())
-    write_clip(seen, arguments.out / CLIP, slowest)
-    for name, by in report["robots"].items():
-        means = ", ".join(f"{kind} {np.mean(values):.2f}" for kind, values in by.items())
-        print(f"{name:16s} PSNR over {FRAMES} frames: {means} dB")
-    print(f"{report['frames_per_second']} frames/s at batch 1; step {report['step']:,}")
+    ship(arguments.run, arguments.out, decode, describe)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,10 @@ TABLE = EmbodimentTable((
 ))  # fmt: skip
 
 
-def make_run(root: Path, train: TrainConfig = TrainConfig()) -> Path:
+def make_run(root: Path, train: TrainConfig = TrainConfig(), table: EmbodimentTable = TABLE) -> Path:
     """The run's directory, in `root`, said to be trained as `train`."""
     tokenizer = parts()[1]
     save_tokenizer(tokenizer, root / "tokenizer")
-    params = declare_model(CONFIG, TABLE).init(0)
-    write_run(Run(CONFIG, train, TABLE, params, 0, {"tokenizer": tokenizer.identity}), root / "model")
+    params = declare_model(CONFIG, table).init(0)
+    write_run(Run(CONFIG, train, table, params, 0, {"tokenizer": tokenizer.identity}), root / "model")
     return root / "model"

@@ -2,12 +2,14 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from experiments.applications import DRIVEN
 from experiments.applications import ship as ship_module
 from experiments.applications.ship import ship
 from experiments.applications.simulators import load_simulator, make_simulator
@@ -16,8 +18,9 @@ from experiments.cli.main import main
 from experiments.running.workspace import Workspace
 from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.folder import USUAL, find_decode
-from tests.experiments.applications.runs import make_run
+from tests.experiments.applications.runs import TABLE, make_run
 
 
 @pytest.fixture(scope="module")
@@ -69,11 +72,11 @@ def test_a_simulator_is_timed_as_its_users_step_it(run, tmp_path, capsys):
 @pytest.mark.slow
 def test_what_is_shipped_stands_alone_and_does_the_same(run, tmp_path):
     out, decode = tmp_path / "simulator", DecodeConfig(3, temperature=0.5)
-    ship(run, out, decode)
+    ship(run, out, decode, add=lambda made: (made / "report.json").write_text("{}"))
     (tmp_path / "elsewhere").mkdir()
     moved = out.rename(tmp_path / "elsewhere" / "model")  # nothing of the study is near
     shipped, known = Simulator.load(moved), load_simulator(run, decode=decode)
-    assert shipped.decode == decode
+    assert shipped.decode == decode and (moved / "report.json").exists()
     assert dict(shipped.robots) == dict(known.robots)
     assert len(shipped.starts) == len(known.starts)
     first = shipped.reset(shipped.starts[0])
@@ -92,6 +95,36 @@ def test_what_is_too_large_is_not_shipped(run, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_is_there_stays_until_all_of_the_new_one_is(run, tmp_path):
+    out = tmp_path / "simulator"
+    out.mkdir()
+    (out / "report.json").write_text("known")
+
+    def stop(made: Path) -> None:
+        (made / "report.json").write_text("half")
+        assert (made / "robots.json").exists()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ship(run, out, add=stop)
+    assert (out / "report.json").read_text() == "known"
+    assert [path.name for path in tmp_path.rglob("*")] == ["simulator", "report.json"]
+
+
+def test_a_robot_without_a_truth_to_be_compared_with_is_not_shipped(tmp_path):
+    table = EmbodimentTable((*TABLE.entries, Embodiment("stranger", 2, 1, (0.0, 0.0), (1.0, 1.0))))
+    with pytest.raises(ConfigError, match="stranger: not of the suite"):
+        ship(make_run(tmp_path / "study", table=table), tmp_path / "simulator")
+    assert [path.name for path in tmp_path.iterdir()] == ["study"]
+
+
+def test_nothing_is_replaced_that_was_not_named(run, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["ship", str(run)])
+    with pytest.raises(SystemExit) as stopped:
+        ship_module.main()
+    assert stopped.value.code == 2 and "--out" in capsys.readouterr().err
+
+
 def test_another_tokenizer_or_damaged_robots_are_refused(run, tmp_path):
     out = tmp_path / "simulator"
     ship(run, out)
@@ -108,7 +141,7 @@ def test_another_tokenizer_or_damaged_robots_are_refused(run, tmp_path):
 
 
 def test_the_model_of_this_repository_is_whole():
-    shipped = Path(ship_module.__file__).parents[2] / ship_module.OUT
+    shipped = Path(ship_module.__file__).parents[2] / DRIVEN
     simulator = Simulator.load(shipped)
     assert len(simulator.robots) == 8 == len({start.robot for start in simulator.starts})
     assert simulator.decode == find_decode(shipped) != USUAL
