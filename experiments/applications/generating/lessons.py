@@ -48,6 +48,14 @@ class Settings(Training):
     noise: float = 0.05  # of the expert
     starts: int = 200
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
+        require(
+            self.given < self.frames,
+            f"--given {self.given}: an episode has {self.frames} frames, of which at least the last must be generated",
+        )
+
     def make_task(self) -> Task:
         return find_task(self.robot, self.task, self.frames, self.hold)
 
