@@ -109,7 +109,7 @@ def main() -> None:
     simulator = load_simulator(asked.run, **options)
     robots, weights = chosen(known_robots(simulator.robots), asked.robots), asked.out / WEIGHTS
     settings = {"robots": sorted(robots)} if asked.robots else {}
-    claim(asked.out, asked.run, simulator.model.params, settings)  # a detector knows frames as one tokenizer shows them
+    claim(asked.out, asked.run, simulator, settings)  # a detector knows frames as one tokenizer shows them
     if not weights.exists():
         make_detector(list(robots), simulator.tokenizer, asked.out)
     detector, rows, short = Detector.load(weights), [], []
@@ -119,9 +119,10 @@ def main() -> None:
             short += [] if new else [robot.name]
             rows += new
             update(i + 1, len(robots), robot.name)
-    write_rows(asked.out / TABLE, rows)
     if short:
         console.print(f"left out, their episodes are too short or nothing is seen at the end: {', '.join(short)}")
+    require(bool(rows), "no robot is left to look at; watch others, or a model with a shorter window")
+    write_rows(asked.out / TABLE, rows)
     for kind, prefix in (("tools and objects", ""), ("tools", "tool"), ("objects", "colour")):
         mine = [row for row in rows if str(row["what"]).startswith(prefix)]
         shares = {view: in_place(mine, view) for view in VIEWS}

@@ -13,48 +13,66 @@ import numpy as np
 
 from data_pipelines.publishing.files import write_file
 from hma_jax.config import require
-from hma_jax.config.json import diff
+from hma_jax.config.json import diff, to_dict
 from hma_jax.model.params import Params
+from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"
+SIMULATOR = "simulator"
+"""What of a simulator is not in its weights."""
 
 
 def claim(
     out: Path,
     run: Path,
-    params: Params,
+    simulator: Simulator,
     settings: Mapping[str, Any],
     *,
     grows: Collection[str] = (),
     file: str = FILE,
 ) -> None:
-    """Makes `out` the directory of what the model of `run`, with these `params`, gives with `settings`. To be called
-    when both are known to be good. Fields that `grows` names say how many results there are: with others of these,
-    those that are kept stay what they are.
+    """Makes `out` the directory of what the `simulator` of `run` gives with `settings`. To be called when both are
+    known to be good. Fields that `grows` names say how many results there are: with others of these, those that are
+    kept stay what they are.
 
-    Raises ConfigError, naming the differences, where `out` holds what was made otherwise.
+    Raises ConfigError, naming the differences, where `out` holds what was made otherwise, and where its file is of a
+    time when it did not yet say how frames are filled.
     """
-    path, said = out / file, described(run, params, settings)
+    path, said = out / file, described(run, simulator, settings)
     if path.exists():
         known = json.loads(path.read_text())
-        differences = [line for line in diff(known, said) if line.split(":")[0] not in grows]
+        comparable = said if SIMULATOR in known else {name: x for name, x in said.items() if name != SIMULATOR}
+        differences = [line for line in diff(known, comparable) if line.split(":")[0] not in grows]
         require(
             not differences,
             f"{out} holds results of other settings ({'; '.join(differences)}); choose another --out or remove it",
         )
+        require(
+            SIMULATOR in known,
+            f"{path} does not say how frames were filled and what the robots' ranges were: choose another --out, or "
+            "remove that file if you know that nothing of this has changed",
+        )
         return
-    write_settings(out, run, params, settings, file)
+    write_settings(out, run, simulator, settings, file)
 
 
-def write_settings(out: Path, run: Path, params: Params, settings: Mapping[str, Any], file: str = FILE) -> None:
+def write_settings(out: Path, run: Path, simulator: Simulator, settings: Mapping[str, Any], file: str = FILE) -> None:
     """Where more results have been added."""
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / file, json.dumps(described(run, params, settings), indent=1) + "\n")
+    write_file(out / file, json.dumps(described(run, simulator, settings), indent=1) + "\n")
 
 
-def described(run: Path, params: Params, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """As it is read again. Runs of one name are told from each other by their weights."""
-    return json.loads(json.dumps({"run": run.resolve().name, "weights": hash_of(params), **settings}))
+def described(run: Path, simulator: Simulator, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """As it is read again. Runs of one name are told from each other by their weights, robots of one name by a hash of
+    all that is known of them."""
+    robots = {name: short_hash(json.dumps(to_dict(robot)).encode()) for name, robot in sorted(simulator.robots.items())}
+    besides = {"decode": to_dict(simulator.decode), "robots": robots}
+    said = {"run": run.resolve().name, "weights": hash_of(simulator.model.params), SIMULATOR: besides, **settings}
+    return json.loads(json.dumps(said))
+
+
+def short_hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def hash_of(params: Params) -> str:

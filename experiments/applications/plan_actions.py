@@ -13,7 +13,9 @@ the learned simulator; the ceiling is CEM that looks ahead in the true one. Succ
 simulator's state. The cloned policies were trained on trajectories of an expert at this task; they see the mark in the
 frame and are given no picture of the goal.
 
-Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png.
+Writes to OUT: trials.csv, a row per way of acting and start; summary.csv and table.md; planning.png. `distance` is from
+the goal at the end of an episode: a planner's ends once its outcome is decided, one of a cloned policy or of random
+actions with the last frame.
 """
 
 from __future__ import annotations
@@ -236,7 +238,7 @@ def main() -> None:
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
     seeds = start_seeds(settings.make_task(), settings.starts)
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
-    claim(out, run, simulator.model.params, asdict(settings))
+    claim(out, run, simulator, asdict(settings))
     (out / "trials").mkdir(exist_ok=True)
     trials: dict[str, list[dict]] = {}
     for way in (*CLONED, RANDOM):

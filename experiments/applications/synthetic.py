@@ -262,9 +262,9 @@ def main() -> None:
         f"{second} says that policies of a model without actions are here: give --without-actions again, or another --out",
     )
     settings, blind = lessons.settings, asked.without_actions and find_blind(asked.without_actions, lessons.robot)
-    claim(out, run, simulator.model.params, asdict(settings), grows=("seeds",))
+    claim(out, run, simulator, asdict(settings), grows=("seeds",))
     if blind:
-        claim(out, asked.without_actions, blind.model.params, {}, file=SECOND)
+        claim(out, asked.without_actions, blind, {}, file=SECOND)
     trials_dir = out / "trials"
     trials_dir.mkdir(exist_ok=True)
     data = make_data(lessons, simulator, out, blind)
@@ -281,7 +281,7 @@ def main() -> None:
                 write_file(path, json.dumps(run_trial(lessons, CONDITIONS[i], data, seed, report)))
             trials[i, seed] = json.loads(path.read_text())
     written = write_results(settings.seeds, trials, quality_of(data, settings.given), out)
-    write_settings(out, run, simulator.model.params, asdict(settings))
+    write_settings(out, run, simulator, asdict(settings))
     shortest = data["recorded"].lengths[:2].min()
     kinds = [kind for kind in data if kind != JUDGED_ON]
     draw_strips([data[kind].images[:2, :shortest] for kind in kinds], kinds, out / "frames.png")

@@ -11,7 +11,6 @@ truth above. A detector is needed (experiments.applications.detector).
 from __future__ import annotations
 
 import argparse
-import hashlib
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from experiments.applications.endurance.drives import Kind, make_drive, native_r
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
-from experiments.applications.made_with import claim
+from experiments.applications.made_with import claim, short_hash
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
@@ -90,8 +89,8 @@ def main() -> None:
     asked = parser.parse_args()
     require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
     detector, rows = Detector.load(asked.detector), []
-    watched = {"detector": hashlib.sha256(asked.detector.read_bytes()).hexdigest()[:16]}
-    claim(asked.out, asked.run, load_simulator(asked.run).model.params, watched, file=f"{asked.name}.json")
+    watched = {"detector": short_hash(asked.detector.read_bytes())}
+    claim(asked.out, asked.run, load_simulator(asked.run), watched, file=f"{asked.name}.json")
     for kind in asked.drives:
         for variant in asked.variants:
             new: list[Row] = []

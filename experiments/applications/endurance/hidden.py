@@ -1,13 +1,13 @@
 """Objects that are hidden or out of view for a while and come back: are they still what and where they were?
 
-Command: python -m experiments.applications.endurance.hidden RUN --out DIR
+Command: python -m experiments.applications.endurance.hidden RUN --name NAME --out DIR
 Cost: two minutes of one core, three for the model that is served.
 Expected: within the model's window what was hidden comes back as often as what was never hidden is still there. Found:
           it comes back less often; in small models the less the longer it was hidden (docs/endurance.md).
 
 Held-out episodes in which an object is covered by the robot or leaves the image, and is back within `HORIZON` frames
 after the start. Beside each stands a control: an object that is seen all the time, judged as long after the start.
-Writes DIR/hidden.csv, a row per event.
+Writes DIR/NAME_hidden.csv, a row per event.
 """
 
 from __future__ import annotations
@@ -29,13 +29,14 @@ from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.tables import Row
+from experiments.applications.made_with import claim, short_hash
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
 from experiments.progress import console, step
 from experiments.wrote import wrote
-from hma_jax.config import ExecutionConfig
+from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
@@ -139,12 +140,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
+    parser.add_argument("--name", default="model", help="of the run, in the table's name")
     parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
     asked = parser.parse_args()
-    detector, rows = Detector.load(asked.detector), []
+    detector, rows, table = Detector.load(asked.detector), [], asked.out / f"{asked.name}_hidden.csv"
     simulator = load_simulator(asked.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
+    robots = native_robots(simulator.robots)
+    watched = {"detector": short_hash(asked.detector.read_bytes())}
+    claim(asked.out, asked.run, simulator, watched, file=f"{asked.name}.json")  # as `endurance` does
     with step("objects that come back") as update:
-        robots = native_robots(simulator.robots)
         for i, name in enumerate(robots):
             spec, rng = SPECS[name], np.random.default_rng([0, i])
             rollout = simulate(spec, episode_seeds(spec, EPISODES, 0, "val"))
@@ -157,13 +161,14 @@ def main() -> None:
                 judged = (events * (2 * PER_ROBOT))[: 2 * PER_ROBOT]
                 rows += judge(simulator, detector, spec, rollout, judged)[: len(events)]
             update(i + 1, len(robots), name)
-    write_rows(asked.out / "hidden.csv", rows)
+    require(bool(rows), f"no object is hidden and comes back in held-out episodes of {', '.join(robots)}")
+    write_rows(table, rows)
     for kind in ("hidden", "control"):
         mine = [row for row in rows if row["kind"] == kind]
         names = ("gone", "lag", "found", "close", "true_found", "true_close")
         means = {k: np.mean([float(r[k]) for r in mine]) for k in names}
         console.print(f"{kind}: {len(mine)} events, " + ", ".join(f"{k} {v:.2f}" for k, v in means.items()))
-    wrote(asked.out / "hidden.csv")
+    wrote(table)
 
 
 if __name__ == "__main__":

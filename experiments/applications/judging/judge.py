@@ -78,7 +78,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     robot = simulator.robot(config.task.robot)
     require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
     policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads  # may refuse the ladder
-    claim(out, run_directory, simulator.model.params, {"config": to_dict(config)}, file="judge.json")
+    claim(out, run_directory, simulator, {"config": to_dict(config)}, file="judge.json")
     size, stride, task = simulator.tokenizer.image_size, robot.stride, config.task
 
     def demonstrations() -> Demonstrations:

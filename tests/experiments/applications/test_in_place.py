@@ -1,19 +1,23 @@
 """Where things stand at the end of a window, and a detector for frames of any size."""
 
+import sys
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications import detector as detector_module
+from experiments.applications import in_place as in_place_module
 from experiments.applications.detector import Detector, as_given, as_shown, enlarged, make_detector, shown_by
 from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, chosen, in_place, watch_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.evaluation.detector import Found
 from tests.experiments.applications.runs import make_run
-from tests.hma_jax.simulator.small import parts
+from tests.hma_jax.simulator.small import ROBOTS, parts
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +75,20 @@ def test_the_share_is_of_what_moved_and_a_mean_over_robots():
     share, half, robots = in_place(rows, "model")
     assert (round(share, 4), robots) == (0.6667, 3) and half > 0.5
     assert in_place([], "true")[2] == 0
+
+
+def test_where_all_episodes_are_too_short_that_is_said(tmp_path, monkeypatch, capsys):
+    known = SimpleNamespace(model=SimpleNamespace(params={}), decode=DecodeConfig(), robots={"r": ROBOTS[0]})
+    monkeypatch.setattr(in_place_module, "load_simulator", lambda *_, **__: known)
+    monkeypatch.setattr(in_place_module, "known_robots", lambda robots: robots)
+    monkeypatch.setattr(in_place_module.Detector, "load", lambda path: None)
+    monkeypatch.setattr(in_place_module, "watch_ends", lambda *_: [])
+    monkeypatch.setattr(sys, "argv", ["in_place", "RUN", "--out", str(tmp_path)])
+    (tmp_path / "detector.npz").touch()
+    with pytest.raises(ConfigError, match="no robot is left to look at"):
+        in_place_module.main()
+    said = capsys.readouterr().out
+    assert f"left out, their episodes are too short or nothing is seen at the end: {ROBOTS[0].name}" in said
 
 
 @pytest.mark.slow

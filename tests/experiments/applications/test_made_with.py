@@ -3,38 +3,74 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from experiments.applications.made_with import claim, hash_of
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.config.json import to_dict
+from hma_jax.simulator.robots import Robot
 
 PARAMS = {"trunk": {"w": np.arange(3.0)}}
 SETTINGS = {"robot": "arm", "seeds": (0, 1), "search": {"candidates": 4}}
+ARM = Robot("arm", 2, (-1.0,), (1.0,), (0.0,))
+
+
+def simulator(params=PARAMS, decode: DecodeConfig = DecodeConfig(8, temperature=0.7), robot: Robot = ARM):
+    return SimpleNamespace(model=SimpleNamespace(params=params), decode=decode, robots={robot.name: robot})
 
 
 def test_what_was_made_otherwise_is_refused_by_name(tmp_path):
-    out, run = tmp_path / "out", Path("runs/model")
-    claim(out, run, PARAMS, SETTINGS)
+    out, run, other = tmp_path / "out", Path("runs/model"), simulator({"trunk": {"w": np.zeros(3)}})
+    claim(out, run, simulator(), SETTINGS)
     before = (out / "settings.json").read_text()
-    kept = {"run": "model", "weights": hash_of(PARAMS), "robot": "arm", "seeds": [0, 1], "search": {"candidates": 4}}
-    assert json.loads(before) == kept
-    claim(out, run, PARAMS, SETTINGS)
+    kept = json.loads(before)
+    assert kept.pop("simulator")["decode"] == to_dict(DecodeConfig(8, temperature=0.7))
+    assert kept == {
+        "run": "model", "weights": hash_of(PARAMS), "robot": "arm", "seeds": [0, 1], "search": {"candidates": 4}
+    }  # fmt: skip
+    claim(out, run, simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="search.candidates: 4 -> 5.*another --out"):
-        claim(out, run, PARAMS, SETTINGS | {"search": {"candidates": 5}})
+        claim(out, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
     with pytest.raises(ConfigError, match="run: 'model' -> 'other'"):
-        claim(out, Path("runs/other"), PARAMS, SETTINGS)
-    claim(out, Path("runs/model/"), PARAMS, SETTINGS)
+        claim(out, Path("runs/other"), simulator(), SETTINGS)
+    claim(out, Path("runs/model/"), simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="weights: "):
-        claim(out, Path("elsewhere/model"), {"trunk": {"w": np.zeros(3)}}, SETTINGS)
+        claim(out, Path("elsewhere/model"), other, SETTINGS)
     assert (out / "settings.json").read_text() == before
 
 
+def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(tmp_path):
+    out, run = tmp_path / "out", Path("runs/model")
+    claim(out, run, simulator(), SETTINGS)
+    with pytest.raises(ConfigError, match="simulator.decode.temperature: 0.7 -> 0.0"):
+        claim(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS)
+    with pytest.raises(ConfigError, match="simulator.robots.arm: "):
+        claim(out, run, simulator(robot=replace(ARM, high=(2.0,))), SETTINGS)
+
+
+def test_results_that_do_not_say_how_frames_were_filled_are_not_gone_on_with(tmp_path):
+    """As settings.json was written before it said so. Whoever knows that nothing has changed removes the file."""
+    file, run = tmp_path / "settings.json", Path("runs/model")
+    claim(tmp_path, run, simulator(), SETTINGS)
+    known = json.loads(file.read_text())
+    del known["simulator"]
+    file.write_text(json.dumps(known))
+    with pytest.raises(ConfigError, match="settings.json does not say how frames were filled.*or remove that file"):
+        claim(tmp_path, run, simulator(), SETTINGS)
+    with pytest.raises(ConfigError, match="search.candidates: 4 -> 5"):
+        claim(tmp_path, run, simulator(), SETTINGS | {"search": {"candidates": 5}})
+    file.unlink()
+    claim(tmp_path, run, simulator(), SETTINGS)
+
+
 def test_more_of_the_same_is_not_otherwise(tmp_path):
-    claim(tmp_path, Path("model"), PARAMS, SETTINGS)
+    claim(tmp_path, Path("model"), simulator(), SETTINGS)
     more = SETTINGS | {"seeds": (0, 1, 2)}
-    claim(tmp_path, Path("model"), PARAMS, more, grows=("seeds",))
+    claim(tmp_path, Path("model"), simulator(), more, grows=("seeds",))
     with pytest.raises(ConfigError, match="seeds"):
-        claim(tmp_path, Path("model"), PARAMS, more)
+        claim(tmp_path, Path("model"), simulator(), more)

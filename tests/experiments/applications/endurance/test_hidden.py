@@ -1,0 +1,53 @@
+"""Tables of objects that come back: of one model each, and only where there are any."""
+
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from data_pipelines.suite.simulator import suite_robot
+from experiments.applications.endurance import hidden
+from hma_jax.config import ConfigError, DecodeConfig
+
+ROBOT = suite_robot("pusher_sand", (-8.0, -8.0), (8.0, 8.0), (0.0, 0.0), 1)
+FOUND = {"gone": 2, "lag": 4, "found": 1.0, "close": 1.0, "true_found": 1.0, "true_close": 1.0}
+
+
+@pytest.fixture
+def watch(tmp_path, monkeypatch):
+    """The program with a model that decodes at some temperature and whose objects all come back, or none."""
+    monkeypatch.setattr(hidden, "EPISODES", 2)
+    monkeypatch.setattr(hidden.Detector, "load", lambda path: None)
+    monkeypatch.setattr(hidden, "native_robots", lambda robots: robots)
+    rows = [{"robot": ROBOT.name, "kind": kind, **FOUND} for kind in ("hidden", "control")]
+    monkeypatch.setattr(hidden, "judge", lambda *_: rows)
+    (tmp_path / "detector.npz").touch()
+
+    def watched(run: str, *options: str, temperature: float = 0.0, some: bool = True) -> None:
+        decode = DecodeConfig(temperature=temperature)
+        known = SimpleNamespace(model=SimpleNamespace(params={}), decode=decode, robots={ROBOT.name: ROBOT})
+        monkeypatch.setattr(hidden, "load_simulator", lambda *_, **__: known)
+        monkeypatch.setattr(hidden, "find_events", lambda *_: rows if some else [])
+        told = ["hidden", run, "--out", str(tmp_path), "--detector", str(tmp_path / "detector.npz"), *options]
+        monkeypatch.setattr(sys, "argv", told)
+        hidden.main()
+
+    return watched
+
+
+def test_models_of_one_directory_have_their_own_tables(watch, tmp_path):
+    watch("first", "--name", "grown")
+    watch("second", "--name", "weighed")
+    tables = {path.name for path in tmp_path.glob("*.csv")}
+    assert tables == {"grown_hidden.csv", "weighed_hidden.csv"}
+    before = (tmp_path / "grown_hidden.csv").stat().st_mtime_ns
+    with pytest.raises(ConfigError, match="run: 'first' -> 'second'"):
+        watch("second", "--name", "grown")
+    with pytest.raises(ConfigError, match="temperature: 0.0 -> 1.0"):
+        watch("first", "--name", "grown", temperature=1.0)
+    assert (tmp_path / "grown_hidden.csv").stat().st_mtime_ns == before
+
+
+def test_where_nothing_is_hidden_that_is_said(watch):
+    with pytest.raises(ConfigError, match="no object is hidden and comes back in held-out episodes of pusher_sand"):
+        watch("first", some=False)
