@@ -57,8 +57,9 @@ KEPT = {
     "hma_jax.tokenizers.train": "_jitted_step",
     "hma_jax.training.state": "_jitted_zeros",
     "hma_jax.training.train": "_jitted_step",
+    "hma_jax.training.validation": "_jitted_sums",
 }
-"""What a process remembers: declarations, and steps that it has traced."""
+"""What a process remembers: declarations, and what it has traced of steps and held-out losses."""
 
 
 PROGRAM = ("hma_jax", "jax", "jaxlib", "flax", "optax", "numpy")

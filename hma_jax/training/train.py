@@ -95,7 +95,7 @@ def train_model(
                 peak_flops=peak_flops(execution.dtype),
                 may_change=extendable,
             ),
-            watch=validation and make_watch(validation, declared, table, model, config.masking, put),
+            watch=validation and make_watch(validation, model, table, config.masking, execution, put),
             progress=progress,
         )
 

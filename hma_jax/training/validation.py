@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hma_jax.config import MaskingConfig, ModelConfig, require
+from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, require
 from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
 from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import mask_batch
@@ -40,16 +42,14 @@ class Validation:
 
 def make_watch(
     validation: Validation,
-    declared: Declared,
-    table: EmbodimentTable,
     model: ModelConfig,
+    table: EmbodimentTable,
     masking: MaskingConfig,
+    execution: ExecutionConfig,
     put_batch: Callable[[Any], Any],
 ) -> Watch:
     """Measures `loss` (and its parts) of the parameters, and of their average as `ema_loss`, if there is one."""
-    mesh = jax.sharding.get_mesh()
-    everywhere = None if mesh.empty else NamedSharding(mesh, PartitionSpec())
-    compute = jax.jit(make_sums(declared, table, model, masking), out_shardings=everywhere)
+    compute = _jitted_sums(model, table, masking, execution, jax.sharding.get_mesh())
     held: list[dict[str, np.ndarray]] = []
 
     def mean(params: Params) -> dict[str, float]:
@@ -68,6 +68,15 @@ def make_watch(
         return values
 
     return Watch(validation.every, measure)
+
+
+@lru_cache(maxsize=4)
+def _jitted_sums(
+    model: ModelConfig, table: EmbodimentTable, masking: MaskingConfig, execution: ExecutionConfig, device_mesh: Mesh
+) -> Callable:
+    """`make_sums` on a mesh, which may be empty; kept for the next run of the same process, as its step is."""
+    everywhere = None if device_mesh.empty else NamedSharding(device_mesh, PartitionSpec())
+    return jax.jit(make_sums(declare_model(model, table, execution), table, model, masking), out_shardings=everywhere)
 
 
 def make_sums(

@@ -10,8 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, MaskingConfig
-from hma_jax.model.hma import declare_model
+from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig
 from hma_jax.training.loop import LoopOptions
 from hma_jax.training.train import train_model
 from hma_jax.training.validation import Validation, make_sums, make_watch
@@ -56,6 +55,19 @@ def test_validation_changes_nothing_of_the_run_and_is_no_part_of_it(tmp_path: Pa
     assert again.resumed_from == 6
 
 
+def test_the_next_run_of_a_process_is_watched_by_the_same_program(tmp_path: Path):
+    """Runs of a sweep over seeds, and a run that goes on, do not compile the held-out loss again."""
+    run(tmp_path / "one", Validation(3, held_out))
+    compiled: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, _, **more: compiled.append(name) if name.endswith("backend_compile_duration") else None
+    )
+    run(tmp_path / "two", Validation(3, held_out))
+    assert not compiled, f"{len(compiled)} programs were compiled again"
+    jax.jit(lambda x: x + len(compiled))(np.float32(1))
+    assert compiled, "the listener hears nothing"
+
+
 @pytest.mark.parametrize(
     ("changes", "masking"),
     [
@@ -89,8 +101,7 @@ def test_points_are_comparable_and_rows_that_fill_up_do_not_count(changes, maski
 
 
 def test_a_validation_without_windows_is_refused_by_words(tmp_path: Path):
-    declared = declare_model(MODEL, TABLE)
-    watch = make_watch(Validation(1, list), declared, TABLE, MODEL, MaskingConfig(), lambda batch: batch)
+    watch = make_watch(Validation(1, list), MODEL, TABLE, MaskingConfig(), ExecutionConfig(), lambda batch: batch)
     with pytest.raises(ConfigError, match="no window to validate on"):
         watch.measure(None)
     with pytest.raises(ConfigError, match="every step or more rarely, got 0"):
