@@ -35,7 +35,7 @@ def test_each_of_eight_devices_stores_an_eighth_whatever_the_number_of_robots(na
 
 @pytest.mark.parametrize("diffusion", [None, DiffusionConfig()], ids=["ids", "latents"])
 @pytest.mark.parametrize("mesh", [(2, 4, 2), (1, 8, 1), (1, 64, 1)], ids=str)
-@pytest.mark.parametrize("conditioning", ["concat_modulate", "cross_attention"])
+@pytest.mark.parametrize("conditioning", ["concat+modulate", "cross_attention"])
 def test_no_large_parameter_of_the_base_model_is_left_whole(diffusion, mesh, conditioning):
     declared = declare_model(ModelConfig(diffusion=diffusion, conditioning=conditioning), make_table(40))
     decisions = plan_sharding(declared, fake_mesh(*mesh), MeshConfig())
