@@ -18,8 +18,9 @@ from hma_jax.model.params import layer_for_compute, stack
 from hma_jax.runtime.sharding import constrain
 
 UNROLLED = 4
-"""Trunks of up to so many layers are not scanned but written out: without slices of stacked arrays their steps
-are a seventh faster on CPU, and so few layers compile as fast."""
+"""Trunks of up to so many layers are not scanned but written out: without slices of stacked arrays the steps of small
+models are a seventh faster on CPU, and so few layers compile as fast. At width 256 it gains nothing: four layers take
+4.45 s a step written out and 4.20 s scanned."""
 
 
 class TemporalCache(NamedTuple):
