@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,7 +41,8 @@ class Simulator:
     decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
     frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
     says. A model trained on passive video is shown no action: it goes on as if none was known. ConfigError is raised
-    for whatever cannot be done; nothing has changed then.
+    for whatever cannot be done; nothing has changed then. After a fault of
+    the device every episode may have to begin again (`counts` is 0 then).
     """
 
     def __init__(
@@ -148,12 +150,14 @@ class Simulator:
         at = self._blank((*self.tokenizer.image_shape, 3), np.uint8)
         for b, start in zip(which, each, strict=True):
             at.place(b, new[b], start.images[-self.room :])
-        self._state, tokens, seen = self._programs.begin(self._programs.weights, self._state, at)
-        tokens = np.asarray(tokens)
+        with self._giving_the_state():
+            state, *made = self._programs.begin(self._programs.weights, self._state, at)
+            tokens, seen = map(np.asarray, made)
+            self._state = state
         for b, episode in new.items():
             episode.frames.extend(tokens[b, : at.given[b]])
             self._episodes[b] = episode
-        return self._show(which, np.asarray(seen)[which])
+        return self._show(which, seen[which])
 
     def _episode(self, start: Start, seed: int) -> Episode:
         robot, table = self.robot(start.robot), self.model.table
@@ -231,14 +235,29 @@ class Simulator:
         for i, b in enumerate(rows):
             chunk_nU[i, : chunks[b].size] = chunks[b].ravel()
         seeds = np.array([self._begun(b).seed for b in rows], np.uint32)
-        called = (self._programs.weights, self._state, np.array(rows, np.int32), chunk_nU, seeds)
-        self._state, tokens, seen = self._programs.advance(*called)
-        for b, frame, chunk in zip(chunks, np.asarray(tokens), chunk_nU, strict=False):
+        asked = np.array(rows, np.int32), chunk_nU, seeds
+        with self._giving_the_state():
+            state, *made = self._programs.advance(self._programs.weights, self._state, *asked)
+            tokens, seen = map(np.asarray, made)
+            self._state = state
+        for b, frame, chunk in zip(chunks, tokens, chunk_nU, strict=False):
             episode = self._begun(b)
             episode.frames.append(frame)
             episode.chunks.append(chunk)
             episode.count += 1
-        return self._show(list(chunks), np.asarray(seen)[: len(chunks)])
+        return self._show(list(chunks), seen[: len(chunks)])
+
+    @contextmanager
+    def _giving_the_state(self) -> Iterator[None]:
+        """Around a program that uses the state's memory again, until what it made has arrived. If the program fails
+        after it took the memory, what the episodes were is lost: none has begun then, and all can begin again."""
+        try:
+            yield
+        except BaseException:  # an interrupt by the user too
+            if any(x.is_deleted() for x in jax.tree.leaves(self._state)):
+                self._episodes, self._images = [None] * len(self), np.zeros_like(self._images)
+                self._state = self._programs.empty()
+            raise
 
     def compile(self, together: int) -> None:
         """What so many episodes that advance at once need, before somebody waits for it. From any thread: the episodes
@@ -286,14 +305,25 @@ class Simulator:
             require(frames <= reach, f"episode {b} can be taken back by {reach} frames, not by {frames}")
             episode = new[b] = self._begun(b).earlier(frames)
             at.place(b, episode, np.stack(list(episode.frames)[-min(episode.count, self.room) :]))
-        self._state, seen = self._programs.again(self._programs.weights, self._state, at)
+        with self._giving_the_state():
+            state, made = self._programs.again(self._programs.weights, self._state, at)
+            seen = np.asarray(made)
+            self._state = state
         for b, episode in new.items():
             self._episodes[b] = episode
-        return self._show(which, np.asarray(seen)[which])
+        return self._show(which, seen[which])
 
     def reach(self, b: int) -> int:
         """By how many frames episode b can be taken back."""
         return self._begun(b).reach(self.room)
+
+    def last_action(self, b: int) -> np.ndarray | None:
+        """The native action [A] just before the present frame of episode b; None if that is its first."""
+        episode = self._begun(b)
+        robot = episode.robot
+        if not episode.chunks:
+            return None
+        return episode.chunks[-1][: robot.stride * robot.action_dim].reshape(robot.stride, -1)[-1]
 
     def _copied(self, state: Episodes) -> Episodes:
         return self._programs.take(state, np.arange(len(self), dtype=np.int32))

@@ -24,13 +24,18 @@ def warm_up(simulator: Simulator, together: int | None = None) -> None:
 
 
 def warm_up_more(
-    simulator: Simulator, above: int, most: int | None = None, ended: Callable[[], bool] = lambda: False
+    simulator: Simulator,
+    above: int,
+    most: int | None = None,
+    ended: Callable[[], bool] = lambda: False,
+    reached: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Compiles for more than `above` episodes that advance together, up to `most` or all, unless it is `ended` before;
-    from any thread."""
+    from any thread. `reached` is told of each number up to which it is done."""
     for together in sizes(len(simulator)):
         if above < together <= (most or len(simulator)) and not ended():
             simulator.compile(together)
+            reached(together)
 
 
 def sizes(episodes: int) -> list[int]:

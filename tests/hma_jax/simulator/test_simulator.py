@@ -1,6 +1,7 @@
 """The simulator against `rollout`, and everything that may be done to its episodes."""
 
 import logging
+from copy import copy
 from dataclasses import replace
 
 import jax
@@ -226,6 +227,62 @@ def test_an_action_of_another_shape_or_that_is_not_finite_is_refused():
             sim.step([action])
 
 
+DEEDS = {
+    "begin": lambda sim: sim.reset(start(0, 2), episodes=[0]),
+    "again": lambda sim: sim.rewind(1, [0]),
+    "advance": lambda sim: sim.step([chunks_of(0, 1)[0], None]),
+}
+
+
+@pytest.mark.parametrize("name", DEEDS)
+def test_a_program_that_fails_with_the_state_in_its_hands_ends_all_episodes_and_no_more(monkeypatch, name: str):
+    sim, plan = simulator(episodes=2), chunks_of(0, 3)
+    sim.reset([start(0, 2), start(1, 2)])
+    made = run(sim, plan)
+
+    def failing(weights, state, *_):
+        jax.tree.map(lambda x: x.delete(), state)  # as donating does
+        raise RuntimeError("RESOURCE_EXHAUSTED")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(sim, "_programs", copy(sim._programs))  # others share them
+        broken.setattr(sim._programs, name, failing)
+        with pytest.raises(RuntimeError, match="RESOURCE_EXHAUSTED"):
+            DEEDS[name](sim)
+    assert sim.counts == (0, 0) and not sim.images.any()
+    with pytest.raises(ConfigError, match="episode 1 has not begun"):
+        sim.step([None, np.zeros(7)])
+    sim.reset([start(0, 2), start(1, 2)])
+    np.testing.assert_array_equal(run(sim, plan), made)
+
+
+def test_a_program_that_fails_before_it_has_the_state_changes_nothing(monkeypatch):
+    sim, plan = simulator(), chunks_of(0, 3)
+    sim.reset(start(0, 2))
+    made = run(sim, plan)
+    sim.rewind(1)
+
+    def failing(*_):
+        raise RuntimeError("it could not be compiled")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(sim, "_programs", copy(sim._programs))
+        broken.setattr(sim._programs, "advance", failing)
+        with pytest.raises(RuntimeError, match="could not be compiled"):
+            sim.step([plan[2]])
+    np.testing.assert_array_equal(sim.step([plan[2]])[0], made[2])
+
+
+def test_the_last_action_is_the_one_before_the_present_frame():
+    sim, plan = simulator(), chunks_of(1, 2)
+    sim.reset(start(1, 1))
+    assert sim.last_action(0) is None
+    run(sim, plan)
+    np.testing.assert_array_equal(sim.last_action(0), plan[1, -1])
+    sim.rewind(1)
+    np.testing.assert_array_equal(sim.last_action(0), plan[0, -1])
+
+
 def test_a_window_of_the_model_is_all_of_a_start_that_is_seen():
     """So the frames before it cannot matter."""
     sim, long = simulator(), start(0, CONFIG.frames + 3)
@@ -241,8 +298,9 @@ def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
             compiled.append(together)
 
     compiled: list[int] = []
-    warm_up_more(Compiling(range(16)), 1, ended=lambda: len(compiled) == 2)
-    assert compiled == [n for n in sizes(16) if n > 1][:2] and len(sizes(16)) > 3
+    reached: list[int] = []
+    warm_up_more(Compiling(range(16)), 1, ended=lambda: len(compiled) == 2, reached=reached.append)
+    assert compiled == reached == [n for n in sizes(16) if n > 1][:2] and len(sizes(16)) > 3
 
 
 def test_a_model_trained_without_actions_goes_on_alike_under_all_of_them():
