@@ -46,7 +46,7 @@ def play(
         tokenizer: That the model was trained with, if it is not beside the run.
     """
     try:
-        from experiments.applications.play.server import make_app, serve
+        from experiments.applications.play.server import CROWD, make_app, serve
     except ModuleNotFoundError as error:
         if error.name != "aiohttp":
             raise
@@ -74,14 +74,20 @@ def play(
         # What draws a physics simulator belongs to one thread; turns are taken in several.
         return true_simulator(simulator, [robot]) if in_suite(robot) else None
 
-    app, ended = make_app(simulator, truth), threading.Event()
+    app, ended = make_app(simulator, truth, together=1), threading.Event()
+
+    def reached(together: int) -> None:
+        app[CROWD].together = together
+
     # Waited for at the end, one program at most: the interpreter cannot end beside a compiling thread.
-    compiling = threading.Thread(target=warm_up_more, args=(simulator, 1, None, ended.is_set))
+    compiling = threading.Thread(
+        target=warm_up_more, args=(simulator, 1), kwargs={"ended": ended.is_set, "reached": reached}
+    )
 
     def say(actual: int) -> None:
         shown = "localhost" if host == "127.0.0.1" else host
         console.print(f"drive it at http://{shown}:{actual} (end with Ctrl-C)", soft_wrap=True)
-        if visitors > 1:  # the first one need not wait until it is compiled for all
+        if visitors > 1:  # nobody waits for it: as long as it is not compiled for several, they take turns
             compiling.start()
 
     try:

@@ -44,6 +44,9 @@ IDLE_SECONDS = 900.0
 FAULTS = 20
 """Messages of one connection that make no sense, until it is closed."""
 
+FAILED = "the simulator failed, as the server's log says; start again if it no longer moves"
+"""What visitors are told whose wishes are lost by a fault of ours."""
+
 
 class Full(Exception):
     """There is no free seat."""
@@ -61,6 +64,7 @@ class Visitor:
     socket: web.WebSocketResponse | None = None
     transport: asyncio.Transport | None = None  # of the socket
     active: float = field(default_factory=time.monotonic)
+    acted: int = 0  # the newest round in which an action of it was taken
 
     def tell(self, message: Message) -> None:
         """Leaves a message to be sent. One who lets so many wait that there is no room is disconnected."""
@@ -91,13 +95,16 @@ async def _say_goodbye(socket: web.WebSocketResponse, transport: asyncio.Transpo
 class Crowd:
     """The visitors of one simulator."""
 
-    def __init__(self, simulator: Simulator, truth: Truth):
+    def __init__(self, simulator: Simulator, truth: Truth, together: int | None = None):
+        """`together`: who can act in one round, as far as programs are compiled (default: all). May grow meanwhile."""
         self.simulator, self.truth = simulator, truth
+        self.together = len(simulator) if together is None else together
         self.visitors: dict[str, Visitor] = {}
         self._free = list(range(len(simulator)))
         self._wanted = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "simulator")
         self._ending: set[asyncio.Task[None]] = set()
+        self._rounds = 0
 
     # --- Coming and going --------------------------------------------------------------------------
 
@@ -117,12 +124,15 @@ class Crowd:
         return visitor
 
     def _part(self, visitor: Visitor, why: str) -> None:
-        """Tells a visitor's page, if one is connected, that it has no seat any more, and ends its connection."""
+        """Tells a visitor's page, if one is connected, that it has no seat any more, and ends its connection,
+        with what was asked through it."""
         if visitor.socket is not None:
             ending = asyncio.create_task(_say_goodbye(visitor.socket, visitor.transport, why))
             self._ending.add(ending)
             ending.add_done_callback(self._ending.discard)
         visitor.socket = visitor.transport = visitor.replies = None
+        visitor.wishes.clear()
+        visitor.answered.set()  # whoever listens to that connection waits for this
 
     def _make_room(self, now: float) -> None:
         """Frees the seat of whoever is away for the longest, if anybody is."""
@@ -143,8 +153,6 @@ class Crowd:
     def dismiss(self, visitor: Visitor) -> None:
         if self.visitors.pop(visitor.token, None) is not None:
             self._free.append(visitor.seat.episode)
-            visitor.wishes.clear()
-            visitor.answered.set()
 
     def tidy(self) -> None:
         """Frees the seats of those who were away for too long."""
@@ -172,27 +180,46 @@ class Crowd:
             await visitor.answered.wait()
 
     async def serve(self) -> None:
-        """Answers wishes, a round of all visitors' oldest ones at a time, until cancelled."""
+        """Answers wishes, a round of visitors' oldest ones at a time, until cancelled. Each has one answer, through the
+        connection that it came through or, if that has ended, none."""
         loop = asyncio.get_running_loop()
         while True:
             await self._wanted.wait()
             self._wanted.clear()
-            asking = [v for v in self.visitors.values() if v.wishes]
+            asking = self._round()
             if not asking:
                 continue
+            connections = [v.replies for v in asking]
             wishes = {i: (v.seat, v.wishes.popleft()) for i, v in enumerate(asking)}
             try:
                 replies = await loop.run_in_executor(self._thread, answer, self.simulator, self.truth, wishes)
             except Exception:  # a fault of ours: this round's wishes are lost, the server is not
                 log.exception("a round of wishes could not be answered")
-                replies = {i: [{"type": "error", "message": "the simulator failed; see the server's log"}] for i in wishes}
-            for i, messages in replies.items():
+                self._forget_lost()
+                replies = {i: {"type": "error", "message": FAILED} for i in wishes}
+            for i, message in replies.items():
                 asking[i].answered.set()
-                for message in messages:
+                if asking[i].replies is connections[i]:  # another window has not asked
                     asking[i].tell(message)
             if any(v.wishes for v in self.visitors.values()):
                 self._wanted.set()
             self.tidy()
+
+    def _round(self) -> list[Visitor]:
+        """Whose oldest wish is answered next: all, but of those who act no more than `together`, who take turns."""
+        self._rounds += 1
+        asking = [v for v in self.visitors.values() if v.wishes]
+        acting = sorted((v for v in asking if v.wishes[0].kind == "act"), key=lambda v: v.acted)
+        for visitor in acting[: self.together]:
+            visitor.acted = self._rounds
+        waiting = acting[self.together :]
+        return [v for v in asking if v not in waiting]
+
+    def _forget_lost(self) -> None:
+        """After a failure: visitors whose episode went with it have to begin one."""
+        for visitor in self.visitors.values():
+            if not self.simulator.counts[visitor.seat.episode]:
+                visitor.seat.robot = None
 
     async def send(self, visitor: Visitor, socket: web.WebSocketResponse, replies: asyncio.Queue[str]) -> None:
         """Sends a connection's messages until it is cancelled or takes too long."""

@@ -10,11 +10,10 @@ from collections.abc import AsyncIterator, Callable
 from importlib.resources import files
 from urllib.parse import urlsplit
 
-import numpy as np
 from aiohttp import WSMsgType, web
 
 from experiments.applications.play.crowd import FAULTS, REPLIES, Crowd, Full, Visitor
-from experiments.applications.play.turn import Truth, picture
+from experiments.applications.play.turn import Truth, command, picture
 from hma_jax.config.json import to_dict
 from hma_jax.simulator.simulator import Simulator
 
@@ -38,11 +37,12 @@ HEADERS = {
 }
 
 
-def make_app(simulator: Simulator, truth: Truth) -> web.Application:
-    """The application; it serves as many visitors at once as the simulator has episodes."""
+def make_app(simulator: Simulator, truth: Truth, together: int | None = None) -> web.Application:
+    """The application; it serves as many visitors at once as the simulator has episodes. Of those, `together` (default:
+    all) act at once, until its crowd is told that more can."""
     app = web.Application(client_max_size=LARGEST_MESSAGE)
     app[SOCKETS] = set()
-    app.cleanup_ctx.append(lambda app: _crowd(app, simulator, truth))
+    app.cleanup_ctx.append(lambda app: _crowd(app, simulator, truth, together))
     about = json.dumps(describe(simulator, truth))
     page = files("experiments.applications.play").joinpath("page.html").read_text()
 
@@ -71,8 +71,10 @@ async def serve(app: web.Application, host: str, port: int, ready: Callable[[int
         await runner.cleanup()
 
 
-async def _crowd(app: web.Application, simulator: Simulator, truth: Truth) -> AsyncIterator[None]:
-    crowd = app[CROWD] = Crowd(simulator, truth)
+async def _crowd(
+    app: web.Application, simulator: Simulator, truth: Truth, together: int | None
+) -> AsyncIterator[None]:
+    crowd = app[CROWD] = Crowd(simulator, truth, together)
     serving = asyncio.create_task(crowd.serve())
     yield
     serving.cancel()
@@ -90,11 +92,10 @@ def describe(simulator: Simulator, truth: Truth) -> list[dict]:
         starts = [start for start in simulator.starts if start.robot == robot.name]
         if not starts:
             continue
-        first = [s.actions[-1] if robot.keeps and len(s.actions) else np.array(robot.rest) for s in starts]
         described.append({
             **to_dict(robot),
             "starts": [picture(start.images[-1]) for start in starts],
-            "first": [np.clip(a, robot.low, robot.high).tolist() for a in first],
+            "first": [command(robot, s.actions[-1] if len(s.actions) else None) for s in starts],
             "truth": truth(robot) is not None and all(start.seed is not None for start in starts),
         })  # fmt: skip
     return described

@@ -26,7 +26,10 @@ Truth = Callable[[Robot], TrueSimulator | None]
 
 
 LARGEST = 3e38
-"""Number of an action that single precision holds."""
+"""Number of an action: single precision holds it."""
+
+VALUES = 4096
+"""Of an action, at most."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,9 @@ class Seat:
     recorded: bool = False  # frames are being added to it
 
 
-def answer(simulator: Simulator, truth: Truth, wishes: Mapping[int, tuple[Seat, Wish]]) -> dict[int, list[Message]]:
+def answer(simulator: Simulator, truth: Truth, wishes: Mapping[int, tuple[Seat, Wish]]) -> dict[int, Message]:
     """What each visitor is told. A wish that cannot be granted is an error of that visitor's alone."""
-    replies: dict[int, list[Message]] = {visitor: [] for visitor in wishes}
+    replies: dict[int, Message] = {}
     acting: dict[int, np.ndarray] = {}
     for visitor, (seat, wish) in wishes.items():
         try:
@@ -61,13 +64,13 @@ def answer(simulator: Simulator, truth: Truth, wishes: Mapping[int, tuple[Seat, 
                 acting[visitor] = seat.robot.chunk(numbers(wish.values.get("action")))
             else:
                 CHANGES[wish.kind](simulator, truth, seat, wish.values)
-                replies[visitor].append(frame_of(simulator, seat, wish))
+                replies[visitor] = frame_of(simulator, seat, wish)
         except ConfigError as error:
-            replies[visitor].append(error_of(error, wish))
+            replies[visitor] = error_of(error, wish)
     if acting:
         _act(simulator, wishes, acting)
         for visitor in acting:
-            replies[visitor].append(frame_of(simulator, *wishes[visitor]))
+            replies[visitor] = frame_of(simulator, *wishes[visitor])
     return replies
 
 
@@ -125,7 +128,7 @@ def _rewind(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> 
 def _record(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> None:
     del truth, simulator
     require(seat.robot is not None, "begin an episode first")
-    seat.recorded = bool(values.get("on"))
+    seat.recorded = switch(values.get("on"))
     if seat.recorded:
         seat.recording = Recording(seat.robot)
 
@@ -133,8 +136,9 @@ def _record(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> 
 def _truth(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> None:
     """Both begin anew at the same start: a true state is not known of frames that the model made."""
     require(seat.robot is not None, "begin an episode first")
+    on = switch(values.get("on"))
     seat.truth = None
-    if not values.get("on"):
+    if not on:
         return
     starts = [start for start in simulator.starts if start.robot == seat.robot.name]
     seat.truth = _begun(truth, seat.robot, starts[seat.start])
@@ -167,7 +171,15 @@ def frame_of(simulator: Simulator, seat: Seat, wish: Wish) -> Message:
     if seat.truth is not None:
         true = seat.truth.images[0]
         message |= {"true": picture(true), "psnr": round(float(psnr(image[None], true[None])[0]), 2)}
+    if wish.kind == "rewind" or (wish.kind == "truth" and seat.truth is not None):  # it stands elsewhere now
+        message["command"] = command(seat.robot, simulator.last_action(seat.episode))
     return message
+
+
+def command(robot: Robot, last: np.ndarray | None) -> list[float]:
+    """The action [A] that a page goes on with after a robot's `last`: where that was a place to go to, it stays."""
+    action = last if robot.keeps and last is not None else robot.rest
+    return np.clip(action, robot.low, robot.high).tolist()
 
 
 def error_of(error: Exception, wish: Wish) -> Message:
@@ -180,10 +192,17 @@ def picture(image: np.ndarray) -> str:
 
 
 def numbers(value: Any) -> np.ndarray:
-    """ConfigError for what is no list of numbers."""
+    """ConfigError for what is no list of finite numbers."""
     flat = isinstance(value, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
-    require(flat and len(value) <= 4096, "an action is a list of numbers")
-    return np.array([min(max(v, -LARGEST), LARGEST) for v in value], np.float32)  # ints may have any number of digits
+    fits = flat and len(value) <= VALUES and all(abs(v) <= LARGEST for v in value)  # ints may have any number of digits
+    require(fits, f"an action is a list of at most {VALUES} finite numbers, from {-LARGEST:g} to {LARGEST:g}")
+    return np.array(value, np.float32)
+
+
+def switch(value: Any) -> bool:
+    """ConfigError for what is neither true nor false."""
+    require(isinstance(value, bool), f'"on" must be true or false, got {value!r:.80}')
+    return value
 
 
 def whole(value: Any) -> int:

@@ -23,15 +23,20 @@ def no_truth(_: Any) -> None:
     return None
 
 
-def serving(test: Callable[[TestClient], Awaitable[None]], *, visitors: int = 2, truth: Truth = no_truth) -> None:
-    """Runs `test` with a client of a server for so many visitors."""
-
+def serving(
+    test: Callable[[TestClient], Awaitable[None]],
+    *,
+    visitors: int = 2,
+    truth: Truth = no_truth,
+    together: int | None = None,
+) -> None:
+    """Runs `test` with a client of a server for so many visitors, `together` of whom act at once."""
     sim = simulator(episodes=visitors)
     warm_up(sim)  # nobody waits for the compiler
     sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
 
     async def main() -> None:
-        async with TestClient(TestServer(make_app(sim, truth)), connector=TCPConnector(limit=0)) as client:
+        async with TestClient(TestServer(make_app(sim, truth, together)), connector=TCPConnector(limit=0)) as client:
             await asyncio.wait_for(test(client), 4 * SECONDS)
 
     asyncio.run(main())

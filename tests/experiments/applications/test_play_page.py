@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import os
 import shutil
+import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +18,9 @@ playwright = pytest.importorskip("playwright.async_api", reason="needs the extra
 
 from PIL import Image  # noqa: E402
 
+from experiments.applications.play.server import CROWD  # noqa: E402
 from tests.experiments.applications.serving import serving  # noqa: E402
-from tests.experiments.applications.test_play_server import shared_programs  # noqa: E402, F401
+from tests.experiments.applications.test_play_server import FakeTruth, shared_programs, until  # noqa: E402, F401
 
 CHROMIUM = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 PATIENCE = 60_000
@@ -68,8 +72,6 @@ async def picture(page) -> np.ndarray:
 
 async def actions(client) -> list[list[float]]:
     """The chunks of every visitor's newest frame."""
-    from experiments.applications.play.server import CROWD
-
     simulator = client.server.app[CROWD].simulator
     return [e.chunks[-1].tolist() for e in simulator._episodes if e is not None and e.chunks]
 
@@ -156,6 +158,94 @@ def test_two_visitors_do_not_mix_and_a_third_is_told():
         await third.wait_for_function("document.getElementById('status').textContent.includes('seats')", timeout=PATIENCE)
 
     browsing(test)
+
+
+def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_ones_later():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        simulator = client.server.app[CROWD].simulator
+        step = simulator.step
+        simulator.step = lambda actions: (time.sleep(0.05), step(actions))[-1]
+        talk = await overheard(page)
+        first = len(talk)
+        for button in ("#again", "#record", "#again", "#robots button[data-name=arm]", "#starts button", "#record"):
+            await page.evaluate(f"document.querySelector('{button}').click()")
+        await page.wait_for_function("document.body.dataset.count > 5")
+        asked = [(talk[:i].count("<") - 1, i - talk[:i].count("<")) for i in range(first, len(talk)) if talk[i] == "act"]
+        assert len(asked) > 3 and all(a == b for a, b in asked), f"(answers but for the greeting, questions): {asked}"
+        await page.wait_for_function("+document.getElementById('latency').textContent >= 50")
+        assert not page.faults
+
+    browsing(test)
+
+
+async def overheard(page) -> list[str]:
+    """Of the page's present connection from now on: types of what it says, "<" for each answer. A new connection."""
+    talk: list[str] = []
+
+    def listen(socket) -> None:
+        socket.on("framesent", lambda text: talk.append(json.loads(text)["type"]))
+        socket.on("framereceived", lambda _: talk.append("<"))
+
+    page.on("websocket", listen)
+    await page.evaluate("state.socket.close()")
+    await page.wait_for_function("state.socket.readyState == 1 && !state.pending?.length")
+    return talk
+
+
+def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_robot():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        talk = await overheard(page)
+        for key in ("r", "Space"):
+            for _ in range(5):  # the first presses it, the others are repeats
+                await page.keyboard.down(key)
+            await page.keyboard.up(key)
+        assert await page.inner_text("#run") == "Go on"
+        await until(lambda: "start" in talk)
+        await page.wait_for_function("!state.pending.length")
+        await page.wait_for_timeout(100)
+        assert talk.count("start") == 1
+        await page.route("**/robots", lambda route: None)  # the answer does not come
+        await page.reload()
+        await page.keyboard.press("r")
+        await page.click("#again")
+        assert not page.faults
+
+    browsing(test)
+
+
+def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_rewind():
+    async def test(browser, address, client):
+        simulator = client.server.app[CROWD].simulator
+        simulator.describe([replace(simulator.robots["arm"], keeps=True)])
+        page = await opened(browser, address)
+        await page.click("#robots button[data-name=arm]")
+        await page.evaluate("state.robot.keeps = true")
+        await page.evaluate("document.getElementById('truth').click()")
+        await page.wait_for_function("state.truth")
+        await page.evaluate("state.action.fill(0.7)")
+        here = await count(page)
+        await page.wait_for_function(f"document.body.dataset.count > {here + 1}")
+        await page.evaluate("document.getElementById('truth').click()")
+        await page.wait_for_function("!state.truth")
+        assert await page.evaluate("state.action[0]") == pytest.approx(0.7)
+        await page.click("#run")
+        await page.wait_for_function("!state.pending.length")
+        here = await count(page)
+        await page.evaluate("state.action.fill(0.3)")
+        await page.click("#run")
+        await page.wait_for_function(f"document.body.dataset.count > {here}")
+        await page.click("#run")
+        for _ in range(100):
+            if await count(page) <= here:
+                break
+            await page.click("#back")
+            await page.wait_for_function("!state.pending.length")
+        assert await page.evaluate("state.action[0]") == pytest.approx(0.7), "where it was sent before that frame"
+        assert not page.faults
+
+    browsing(test, truth=FakeTruth)
 
 
 def test_it_fits_a_phone():

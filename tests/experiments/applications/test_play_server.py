@@ -5,12 +5,19 @@ import contextlib
 import io
 import json
 import resource
+import threading
+import time
 import zipfile
+from copy import copy
+from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
+
+from aiohttp.test_utils import TestServer
 
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from experiments.applications.play import crowd as crowd_module
@@ -18,7 +25,8 @@ from experiments.applications.play import server
 from experiments.applications.play.crowd import REPLIES, Visitor
 from experiments.applications.play.turn import Seat
 from hma_jax.config import require
-from tests.experiments.applications.serving import Player, ask, hear, serving
+from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving
+from tests.hma_jax.simulator.small import simulator
 
 
 @pytest.fixture(autouse=True)
@@ -87,6 +95,105 @@ def test_a_second_window_takes_over_and_the_first_is_told():
     serving(test)
 
 
+async def until(true) -> None:
+    """Waits for it, not forever."""
+    for _ in range(int(SECONDS * 100)):
+        if true():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("it never was")
+
+
+def test_what_the_first_window_asked_for_is_not_answered_to_the_second():
+    async def test(client):
+        first, second = Player(client), Player(client)
+        await first.enter()
+        crowd, begun, go_on = client.server.app[server.CROWD], threading.Event(), threading.Event()
+        step, wishes = crowd.simulator.step, crowd.visitors[first.token].wishes
+        crowd.simulator.step = lambda actions: (begun.set(), go_on.wait(SECONDS), step(actions))[-1]
+        for _ in range(2 * crowd_module.WISHES):  # one under way, some that wait, the rest unread
+            await first.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
+        await until(lambda: begun.is_set() and len(wishes) >= crowd_module.WISHES - 1)
+        await second.enter(token=first.token, begin=False)
+        await until(lambda: len(client.server.app[server.SOCKETS]) == 1)  # nobody listens to the first window any more
+        go_on.set()
+        frame = await ask(second.socket, type="rewind", frames=0)
+        assert frame["after"] == "rewind" and frame["count"] == 3, "the one under way was made, for nobody"
+
+    serving(test)
+
+
+def test_as_many_act_at_once_as_programs_are_compiled_for_and_all_take_turns():
+    async def test(client):
+        crowd, at_once = client.server.app[server.CROWD], []
+        step = crowd.simulator.step
+
+        def counted(actions):
+            at_once.append(sum(a is not None for a in actions))
+            time.sleep(0.05)
+            return step(actions)
+
+        crowd.simulator.step = counted
+        greedy, player = Player(client), Player(client)
+        await greedy.enter()
+        await player.enter()
+        for _ in range(40):
+            await greedy.socket.send_str(json.dumps({"type": "act", "action": [0.5] * 7}))
+        await player.drive(0.5, 3)
+        assert set(at_once) == {1} and len(at_once) < 30, "the greedy one waits for its turn too"
+        crowd.together = 2
+        await player.drive(0.5, 3)
+        assert max(at_once) == 2
+
+    serving(test, together=1)
+
+
+def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp_path):
+    from experiments.applications import simulators
+    from experiments.cli.play import play
+
+    first = []
+
+    async def serve(app, host, port, ready):
+        async with TestServer(app):
+            first.append(app[server.CROWD].together)
+            ready(port)
+            await until(lambda: app[server.CROWD].together == 2)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    play(tmp_path, visitors=2)
+    assert first == [1]
+
+
+def test_after_a_fault_of_the_device_all_begin_again_and_drive_on(monkeypatch):
+    async def test(client):
+        first, second = Player(client), Player(client)
+        await first.enter()
+        await second.enter()
+        simulator = client.server.app[server.CROWD].simulator
+
+        def failing(weights, state, *_):
+            jax.tree.map(lambda x: x.delete(), state)  # as donating does
+            raise RuntimeError("RESOURCE_EXHAUSTED")
+
+        with monkeypatch.context() as broken:
+            broken.setattr(simulator, "_programs", copy(simulator._programs))  # other tests share them
+            broken.setattr(simulator._programs, "advance", failing)
+            told = await ask(first.socket, type="act", action=[0.5] * 7)
+        assert told["type"] == "error" and "start again" in told["message"]
+        await ask(first.socket, type="start", robot="arm")
+        told = await asyncio.gather(
+            ask(first.socket, type="act", action=[0.5] * 7), ask(second.socket, type="act", action=[0.5] * 7)
+        )
+        assert [t["type"] for t in told] == ["frame", "error"] and "begin an episode" in told[1]["message"]
+        again = Player(client)
+        assert (await again.enter(token=second.token))["robot"] is None, "the page begins one by itself then"
+        assert len(await again.drive(0.5, 1)) == 1
+
+    serving(test)
+
+
 class FakeTruth:
     """A true simulator whose frames are as bright as the steps it made; a pusher's cannot begin."""
 
@@ -144,6 +251,28 @@ def test_rewinding_and_the_same_actions_give_the_same_frames():
     serving(test)
 
 
+def test_a_robot_that_went_back_is_told_where_it_was_sent_then():
+    async def test(client):
+        crowd, player = client.server.app[server.CROWD], Player(client)
+        crowd.simulator.describe([replace(crowd.simulator.robots["arm"], keeps=True)])
+        await player.enter()
+        for value in (0.4, 0.5, 0.6):
+            frame = await ask(player.socket, type="act", action=[value] * 7)
+        assert "command" not in frame
+        back = await ask(player.socket, type="rewind", frames=1)
+        assert back["command"] == pytest.approx([0.5] * 7)
+        begun = await ask(player.socket, type="truth", on=True)
+        (arm, _) = [s.actions[-1] for s in crowd.simulator.starts if s.robot == "arm"]
+        assert begun["command"] == pytest.approx(arm, abs=1e-6)
+        await player.drive(0.6, 1)
+        assert "command" not in await ask(player.socket, type="truth", on=False), "it stays where it is"
+        await player.enter(robot="pusher", token=player.token)
+        await player.drive(0.6, 1, dim=2)
+        assert (await ask(player.socket, type="rewind", frames=0))["command"] == [0.0, 0.0], "its rest"
+
+    serving(test, truth=FakeTruth)
+
+
 def test_a_full_house_says_so_and_an_abandoned_seat_is_given_away():
     async def test(client):
         first, second, third = Player(client), Player(client), Player(client)
@@ -166,7 +295,8 @@ NONSENSE = [
     '{"type": "start"}', '{"type": "start", "robot": "walker"}', '{"type": "start", "robot": {}}',
     '{"type": "start", "robot": "arm", "start": 99}', '{"type": "start", "robot": "arm", "start": -1}',
     '{"type": "start", "robot": "arm", "seed": 1e300}', '{"type": "rewind", "frames": -5}', '{"type": "rewind", "frames": "x"}',
-    '{"type": "truth", "on": true}', '{"type": "act", "action": [1' + "0" * 400 + ", 0, 0, 0, 0, 0, 0]}",
+    '{"type": "truth", "on": true}', '{"type": "truth"}', '{"type": "truth", "on": "no"}', '{"type": "record", "on": 0}',
+    '{"type": "act", "action": [1' + "0" * 400 + ", 0, 0, 0, 0, 0, 0]}",
 ]  # fmt: skip
 
 
@@ -180,9 +310,11 @@ def test_malformed_messages_are_errors_of_their_sender_alone(monkeypatch):
         for text in NONSENSE:
             await hostile.socket.send_str(text)
             answer = await hear(hostile.socket)
-            assert answer["type"] in ("error", "frame") and len(json.dumps(answer)) < 5000, (text, answer)
-            if answer["type"] == "frame":
-                assert ("1e999" in text or len(text) > 400) and answer["clipped"], text
+            assert answer["type"] == "error" and len(json.dumps(answer)) < 5000, (text, answer)
+            if "0, 0, 0]" in text and "true" not in text:
+                assert "finite numbers, from -3e+38 to 3e+38" in answer["message"], (text, answer)
+            if '"on"' in text and "true}" not in text:
+                assert '"on" must be true or false' in answer["message"], (text, answer)
         await hostile.socket.send_bytes(b"\0" * 100)
         assert (await hear(hostile.socket))["type"] == "error"
         assert len(await player.drive(0.5, 2)) == len(await hostile.drive(0.5, 2)) == 2
