@@ -122,27 +122,32 @@ def test_policies_and_plans_are_as_readme_says():
     for said, (task, policies) in JUDGED.items():
         judged = json.loads((ROOT / f"experiments/results/judge-{task}/agreement.json").read_text())
         learned, control = (
-            judged["agreement"][world]["policies and starts"]["pearson"] for world in ("learned model", "control: actions of other episodes")
+            judged["agreement"][world]["policies and starts"]["pearson"]
+            for world in ("learned model", "control: actions of other episodes")
         )
         (cells,) = (cells for label, cells in rows.items() if label.startswith(said))
         assert len(judged["policies"]) == policies
         assert cells[0] == f"r = {learned['mean']:.2f} ({learned['low']:.2f} to {learned['high']:.2f})"
         assert cells[1] in (f"other actions {control['mean']:.2f}", "without actions: none")
-    success = {way: float(row["mean"]) for way, row in planned("planning").items()}
-    plans, shooting = success["CEM in the model"], success["random shooting in the model"]
+    success = {way: float(row["mean"]) for way, row in planned("planning_grown").items()}
     (cells,) = (cells for label, cells in rows.items() if label.startswith("plans"))
-    assert cells == [f"{100 * plans:.0f} %", f"random shooting {100 * shooting:.0f} %"]
+    plans, shooting = (f"{100 * success[f'{way} in the model']:.0f} %" for way in ("MPPI", "random shooting"))
+    assert cells == [plans, f"random shooting {shooting}"]
 
 
-def test_plans_in_either_model_are_as_their_page_says():
-    text = " ".join((ROOT / "docs" / "planning.md").read_text().split())
-    assert (ROOT / "experiments/results/planning/table.md").read_text().strip() in (ROOT / "docs/planning.md").read_text()
-    first, served = planned("planning"), planned("planning_weighed")
-    assert all(first[way] == served[way] for way in first if not way.endswith("in the model"))
-    for way in ("CEM", "MPPI", "random shooting"):
-        row = served[f"{way} in the model"]
-        mean, low, high = (float(row[key]) for key in ("mean", "low", "high"))
-        assert f"{mean:.2f} ({low:.2f} to {high:.2f}) for {way}" in text
+MODELS = {"first": "planning", "weighed": "planning_weighed", "grown, served": "planning_grown"}
+
+
+def test_plans_in_each_model_are_as_their_page_says():
+    page = ROOT / "docs" / "planning.md"
+    assert (ROOT / "experiments/results/planning_grown/table.md").read_text().strip() in page.read_text()
+    served = planned("planning_grown")
+    for label, cells in table(page, "| model | CEM |").items():
+        rows = planned(MODELS[label.split(" ([")[0]])
+        assert all(rows[way] == served[way] for way in rows if not way.endswith("in the model"))
+        for way, cell in zip(("CEM", "MPPI", "random shooting"), cells, strict=True):
+            mean, low, high = (float(rows[f"{way} in the model"][key]) for key in ("mean", "low", "high"))
+            assert cell == f"{mean:.2f} ({low:.2f} to {high:.2f})"
 
 
 def planned(name: str) -> dict[str, dict[str, str]]:
