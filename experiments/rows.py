@@ -11,14 +11,12 @@ import csv
 import dataclasses
 import io
 import math
-import os
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from data_pipelines.publishing.files import write_file
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
@@ -26,6 +24,7 @@ from experiments.running.trial import last_loss, trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ConfigError
+from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from hma_jax.evaluation.statistics import Stat
@@ -169,12 +168,11 @@ def read_rows(workspace: Workspace) -> list[Row]:
 
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
     """A line for each of `rows`, dataclasses of one `kind`."""
-    aside = path.with_suffix(".csv.tmp")
-    with open(aside, "w", newline="") as file:
-        writer = csv.DictWriter(file, [f.name for f in dataclasses.fields(kind)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(vars(row) for row in rows)
-    os.replace(aside, path)
+    content = io.StringIO()
+    writer = csv.DictWriter(content, [f.name for f in dataclasses.fields(kind)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(vars(row) for row in rows)
+    write_file(path, content.getvalue())
 
 
 def read_csv(path: Path) -> list[Row]:

@@ -1,20 +1,12 @@
-"""Files and directories that are never seen half written, nor lost with the power once they are seen."""
+"""Directories that are never seen half written, nor lost with the power once they are seen."""
 
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 from pathlib import Path
 
-
-def sync(path: Path) -> None:
-    """What was written to a file, or renamed within a directory, survives a loss of power."""
-    fd = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)
+from hma_jax.runtime.files import sync
 
 
 def sync_tree(directory: Path) -> None:
@@ -23,21 +15,6 @@ def sync_tree(directory: Path) -> None:
         for name in files:
             sync(Path(root, name))
         sync(Path(root))
-
-
-def write_file(path: Path, data: bytes | str) -> None:
-    """A reader sees the old content or the new one, also after a crash."""
-    content = data.encode() if isinstance(data, str) else data
-    making = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        with open(making, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(making, path)
-    finally:
-        making.unlink(missing_ok=True)
-    sync(path.parent)
 
 
 def publish(made: Path, final: Path) -> None:

@@ -13,9 +13,9 @@ import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from data_pipelines.publishing.files import write_file
 from data_pipelines.simulators.embodiments import get_embodiment
 from data_pipelines.simulators.packages import prepare_process
+from hma_jax.runtime.files import write_file
 
 
 @dataclass(frozen=True)

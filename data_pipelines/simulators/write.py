@@ -16,13 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.publishing.claims import Claim
-from data_pipelines.publishing.files import publish, write_file
+from data_pipelines.publishing.files import publish
 from data_pipelines.simulators.record import build_features
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.simulators.worker import facts_path, record_path
 from data_pipelines.sources.rlds.tfrecord import write_shard
 from data_pipelines.sources.rlds.writer import VERSION, shard_name, write_info
 from data_pipelines.suite.write import SHARD_FRAMES
+from hma_jax.runtime.files import write_file
 
 STATS = "stats.json"
 

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.publishing.files import write_file
 from data_pipelines.registry import FRAME_RATE
 from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.tokens.store import TokenStore
@@ -24,6 +23,7 @@ from data_pipelines.windows.windows import require_windows, val_windows
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.runtime.files import write_file
 
 
 @dataclass(frozen=True)

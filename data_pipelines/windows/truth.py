@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from data_pipelines.publishing.files import write_file
+from hma_jax.runtime.files import write_file
 
 META = "made_for"
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.analysis.fits import DRAWS, LEVEL, interval
 from experiments.analysis.measured import Place, measure
 from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_near
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.evaluation.windows import WindowTable
+from hma_jax.runtime.files import write_file
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.publishing.files import write_file
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, trajectories_of
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.summary import Summary
+from hma_jax.runtime.files import write_file
 
 
 def trial_row(

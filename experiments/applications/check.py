@@ -11,12 +11,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches
 from experiments.running.workspace import Workspace
 from hma_jax.config import require
 from hma_jax.evaluation.effects import Effect, find_effects, make_loss
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.training.runs import Model, load_model

@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from data_pipelines.publishing.files import write_file
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
@@ -37,6 +36,7 @@ from experiments.progress import step
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
 
 OUT = Path("experiments/results/detector")

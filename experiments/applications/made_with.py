@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from hma_jax.config import require
 from hma_jax.config.json import diff, to_dict
 from hma_jax.model.params import Params
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.simulator import Simulator
 
 FILE = "settings.json"

@@ -25,7 +25,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications import FIRST
 from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.made_with import claim
@@ -51,6 +50,7 @@ from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.training.runs import Model, load_model

@@ -31,7 +31,6 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.spec import EmbodimentSpec
@@ -60,6 +59,7 @@ from experiments.boundary import guarded
 from experiments.progress import Pace, step
 from experiments.wrote import wrote
 from hma_jax.config import require
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_decode
 from hma_jax.simulator.robots import Robot
 

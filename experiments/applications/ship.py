@@ -30,7 +30,7 @@ import jax
 import numpy as np
 from PIL import Image
 
-from data_pipelines.publishing.files import publish, write_file
+from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
 from experiments.applications.simulators import held_out, in_suite, load_simulator, true_simulator
 from experiments.bench.simulate import time_simulator
@@ -39,6 +39,7 @@ from experiments.running.machine import describe_machine
 from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, USUAL, save_decode, save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator

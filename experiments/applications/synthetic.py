@@ -32,7 +32,6 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.applications import FIRST
 from experiments.applications.generating.conditions import (
@@ -83,6 +82,7 @@ from experiments.setting import use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.evaluation.metrics import psnr
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 

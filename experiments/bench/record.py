@@ -11,11 +11,11 @@ from typing import Any
 
 import jax
 
-from data_pipelines.publishing.files import write_file
 from experiments.bench.timing import Compiled, Timing, peak_memory_bytes
 from experiments.running.machine import describe_machine
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.runtime.files import write_file
 
 FORMAT = 1
 

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from data_pipelines.publishing.files import write_file
 from experiments.cli.hosts import Hosts
 from experiments.progress import console, step, tidy_table
 from experiments.setting import Setting, StudyArguments, make_setting, short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict
+from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from experiments.running.trial import Materials

@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from data_pipelines.publishing.files import write_file
 from experiments.progress import console
 from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
+from hma_jax.runtime.files import write_file
 
 Step = Literal["suite", "tokenizer", "tokens", "windows", "study"]
 """In the order in which one is made of the other."""

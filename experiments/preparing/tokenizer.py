@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from data_pipelines.publishing.files import publish, write_file
+from data_pipelines.publishing.files import publish
 from experiments.preparing.made_from import (
     OLD_STAMP,
     ORIGIN,
@@ -32,6 +32,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import Study
 from hma_jax.config import ConfigError, TokenizerConfig, require
 from hma_jax.config.json import to_dict
+from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from data_pipelines.loading.frames import FrameLoader
@@ -185,10 +186,10 @@ def reconstruction_psnr(tokenizer: Tokenizer, frames: FrameLoader) -> Stat:
     from hma_jax.evaluation.statistics import mean_and_sem, stratified
 
     values, datasets, episodes = [], [], []
-    for step in itertools.count():
+    for number in itertools.count():
         images = next(frames)
         values.append(np.asarray(psnr(tokenizer.decode(tokenizer.encode(images)), images)))
-        for column, own in zip((datasets, episodes), frames.episodes(step), strict=True):
+        for column, own in zip((datasets, episodes), frames.episodes(number), strict=True):
             column.append(own)
         if sum(map(len, values)) >= QUALITY_FRAMES:
             break

@@ -6,7 +6,6 @@ import json
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
-from data_pipelines.publishing.files import write_file
 from experiments.preparing.made_from import Step, dataset_differences, require_same
 from experiments.progress import console
 from experiments.running.provenance import Provenance
@@ -14,6 +13,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
 from experiments.words import few
 from hma_jax.config import require
+from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore

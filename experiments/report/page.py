@@ -40,6 +40,7 @@ from experiments.running.workspace import Record, Workspace
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, reference_trial, titles
 from hma_jax.config.json import to_json
+from hma_jax.runtime.files import write_file
 
 REFERENCE = "reference"
 
@@ -92,9 +93,7 @@ def write_report(
         f"<title>HMA-JAX study: {html.escape(record.study.name)}</title><style>{CSS}</style></head>\n"
         f"<body><main>{''.join(body)}</main></body></html>\n"
     )
-    unfinished = workspace.report.with_suffix(".tmp")
-    unfinished.write_text(page, encoding="utf-8")
-    unfinished.replace(workspace.report)
+    write_file(workspace.report, page)
 
 
 # --- Parts -----------------------------------------------------------------------------------

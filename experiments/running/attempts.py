@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.publishing.claims import Claim, claim, living_claim
-from data_pipelines.publishing.files import write_file
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
+from hma_jax.runtime.files import write_file
 
 JOB, STARTED, PROGRESS = "job.json", "started.json", "progress.json"
 RESULT, FAILURE, OUTPUT = "result.json", "failure.json", "output.txt"

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.publishing.files import write_file
 from experiments.running.attempts import (
     FAILURE,
     JOB,
@@ -33,6 +32,7 @@ from experiments.running.attempts import (
 )
 from experiments.running.launchers.base import Launcher
 from experiments.running.ledger import DIVERGED, FAILED, LOST, MISSING, PREEMPTED, REFUSED, RUNNING, Ledger
+from hma_jax.runtime.files import write_file
 
 TRIES = 3
 """How often in one command a trial may be lost: what kills it may be its own size."""

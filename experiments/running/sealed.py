@@ -11,11 +11,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from data_pipelines.publishing.files import write_file
 from experiments.running import provenance
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import stable_hash
 from hma_jax.evaluation.windows import FILE as WINDOWS
+from hma_jax.runtime.files import write_file
 
 RESULT, SAMPLES = "result.json", "samples.npz"
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
+import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +27,7 @@ from experiments.running.run_options import UNWATCHED, RunOptions
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, TrainConfig
 from hma_jax.config.json import stable_hash, to_dict
+from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from data_pipelines.loading.selection import LoaderConfig
@@ -415,8 +416,8 @@ def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:
     """Stores {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}} as '<dataset>/<kind>'."""
     import numpy as np
 
-    aside = path.with_suffix(".tmp.npz")
+    content = io.BytesIO()
     np.savez_compressed(
-        aside, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
+        content, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
     )
-    os.replace(aside, path)
+    write_file(path, content.getvalue())

@@ -43,7 +43,6 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         return Exit.REFUSED
 
     from data_pipelines.errors import DataError
-    from data_pipelines.publishing.files import write_file
     from experiments.running.job import read_job
     from experiments.running.ledger import DIVERGED, FAILED
     from experiments.running.newcomers import begin_from_trial
@@ -52,6 +51,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from experiments.running.trial import run_trial, trial_id
     from experiments.running.workspace import Workspace
     from hma_jax.config import ConfigError
+    from hma_jax.runtime.files import write_file
     from hma_jax.training.divergence import DivergedError
     from hma_jax.training.loop import Interrupted
 
@@ -88,9 +88,9 @@ class TakenOver(Exception):
 
 def _load_sources(directory: Path, given: dict[str, str] | None) -> dict[str, str] | None:
     """The closure of what is run, imported; None if it is not what was given, of which failure.json is left."""
-    from data_pipelines.publishing.files import write_file
     from experiments.running.ledger import REFUSED
     from experiments.running.provenance import CodeChanged, load_sources
+    from hma_jax.runtime.files import write_file
 
     try:
         return load_sources(given)

@@ -9,13 +9,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from data_pipelines.publishing.files import write_file
 from experiments.program import PROGRAM
 from experiments.running.former import modernise
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
 from hma_jax.config import ConfigError
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held, exclusive
 from hma_jax.runtime.outputs import unwritable
 

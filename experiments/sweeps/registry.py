@@ -13,10 +13,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from data_pipelines.publishing.files import write_file
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, judge_less
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import write_file
 
 SCALING = ("datasets", "trajectories", "width")
 """The demonstration: what `hma study` runs, unless its preset says otherwise."""

@@ -18,7 +18,6 @@ other datasets there are. Within a metric, rows stand in the order of the frozen
 from __future__ import annotations
 
 import io
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -157,14 +157,9 @@ class WindowTable:
         """Writes the Parquet file; whole or not at all, and the same bytes for the same numbers."""
         import pyarrow.parquet as pq
 
-        path, content = Path(path), io.BytesIO()
+        content = io.BytesIO()
         pq.write_table(self.to_arrow(trial), content, compression="zstd", write_page_checksum=True)
-        aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-        with open(aside, "wb") as file:
-            file.write(content.getvalue())
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
+        write_file(Path(path), content.getvalue())
 
     @classmethod
     def load(cls, path: str | Path) -> WindowTable:

@@ -1,7 +1,4 @@
-"""Directories that commands write into: made before any work, or refused in words that say what to do.
-
-And files in them that are written anew in one go.
-"""
+"""Directories that commands write into: made before any work, or refused in words that say what to do."""
 
 from __future__ import annotations
 
@@ -23,16 +20,6 @@ def make_directory(directory: Path, option: str = "--out") -> None:
             pass
     except OSError as error:
         raise unwritable(directory, error, option) from error
-
-
-def replace_file(path: Path, text: str) -> None:
-    """A reader sees the old text or the new one, also after a crash or a loss of power. Raises OSError."""
-    aside = path.with_name(f".{path.name}.tmp")
-    with open(aside, "w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
 
 
 def unwritable(directory: Path, error: OSError, option: str = "--out") -> ConfigError:

@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import FILE as STARTS
 from hma_jax.simulator.starts import Start, load_starts
@@ -94,9 +94,4 @@ def _read(path: Path) -> Any:
 
 
 def _write(path: Path, content: Any) -> None:
-    aside = path.with_name(f".{path.name}.tmp")
-    with open(aside, "w") as file:
-        file.write(json.dumps(content, indent=1) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
+    write_file(path, json.dumps(content, indent=1) + "\n")

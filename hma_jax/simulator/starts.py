@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import write_file
 
 FILE = "starts.npz"
 
@@ -42,12 +43,9 @@ def save_starts(starts: Sequence[Start], path: Path) -> None:
         seed = [] if start.seed is None else [start.seed]
         for name, value in (("images", start.images), ("actions", start.actions), ("seed", np.array(seed, np.int64))):
             arrays[f"{i:04d}/{start.robot}/{name}"] = value
-    aside = path.with_name(f".{path.name}.tmp")
-    with open(aside, "wb") as file:
-        np.savez_compressed(file, **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(aside, path)
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    write_file(path, content.getvalue())
 
 
 def load_starts(path: Path) -> tuple[Start, ...]:

@@ -6,8 +6,8 @@ scale of latents. It is written last, so a directory holds a whole tokenizer or 
 
 from __future__ import annotations
 
+import io
 import json
-import os
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,6 +21,7 @@ from flax import nnx
 from hma_jax.config import AnyTokenizerConfig, ConfigError, require
 from hma_jax.config.json import diff, from_dict, to_dict
 from hma_jax.model.params import Params, path_name
+from hma_jax.runtime.files import write_file
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
@@ -52,13 +53,10 @@ def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         (directory / DESCRIPTION).unlink(missing_ok=True)
-        aside = directory / f"{WEIGHTS}.tmp"
-        with open(aside, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(aside, directory / WEIGHTS)
-        aside = directory / f"{DESCRIPTION}.tmp"
-        aside.write_text(json.dumps(description, indent=2, sort_keys=True) + "\n")
-        os.replace(aside, directory / DESCRIPTION)
+        content = io.BytesIO()
+        np.savez(content, **arrays)
+        write_file(directory / WEIGHTS, content.getvalue())
+        write_file(directory / DESCRIPTION, json.dumps(description, indent=2, sort_keys=True) + "\n")
     except OSError as error:
         raise ConfigError(
             f"cannot write the tokenizer to {directory}: {error.strerror}; choose another directory"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from hma_jax.runtime.files import write_file
 from hma_jax.training.state import FINITE
 
 FILE = "diverged.json"
@@ -49,9 +49,7 @@ def require_finite(step: int, values: Mapping[str, float], run_dir: Path | None,
 
 
 def _write(path: Path, record: Mapping[str, object]) -> None:
-    aside = path.with_suffix(".tmp")
     try:
-        aside.write_text(json.dumps(record, indent=1))
-        os.replace(aside, path)
+        write_file(path, json.dumps(record, indent=1))
     except OSError as error:  # that the step diverged is the news
         log.warning("%s could not be written: %s", path, error.strerror)

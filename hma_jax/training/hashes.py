@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from hma_jax.runtime.outputs import replace_file
+from hma_jax.runtime.files import write_file
 
 NAME = "sha256.json"
 
@@ -30,7 +30,7 @@ class Damaged(Exception):
 def write_list(checkpoint: Path) -> None:
     """Lists every file under `checkpoint`: path, size in bytes, SHA-256."""
     rows = [[name, path.stat().st_size, _sha256(path)] for name, path in _files(checkpoint)]
-    replace_file(checkpoint / NAME, json.dumps({"sha256": _hash_of(rows), "files": rows}, indent=0))
+    write_file(checkpoint / NAME, json.dumps({"sha256": _hash_of(rows), "files": rows}, indent=0))
 
 
 def verify(checkpoint: Path, chosen: Chosen = lambda name: True, share: tuple[int, int] = (0, 1)) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from hma_jax.config import ConfigError
-from hma_jax.runtime.outputs import replace_file
+from hma_jax.runtime.files import write_file
 from hma_jax.runtime.processes import is_writer
 from hma_jax.training.board import Board
 from hma_jax.training.checkpoints import SaveError
@@ -96,7 +96,7 @@ class RunLog:
         after = "".join(json.dumps(record) + "\n" for record in kept)
         if after != before:
             with self._writing(name):
-                replace_file(path, after)
+                write_file(path, after)
         return kept
 
     def start_clock(self, step: int) -> None:

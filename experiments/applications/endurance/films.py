@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications.detector import Detector
 from experiments.applications.endurance.drives import Drive
 from hma_jax.evaluation.metrics import psnr
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.simulator import Simulator
 
 BLOCK = 64

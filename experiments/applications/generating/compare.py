@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from experiments.analysis.intervals import Interval, interval_of
 from experiments.applications.generating.source import ACTION, IMAGE
@@ -17,6 +16,7 @@ from experiments.applications.generating.trajectories import Trajectories
 from experiments.applications.play.recording import encode_video
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.evaluation.statistics import mean_and_sem
+from hma_jax.runtime.files import write_file
 
 ORIGIN_KEY = "episode_metadata/file_path"
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data_pipelines.publishing.files import write_file
 from experiments.analysis.intervals import Interval
 from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, Outcome
 from experiments.report.pieces import data_uri
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import write_file
 
 ENLARGED = 3
 SHOW_MS, HOLD_MS = 200, 1200

@@ -19,7 +19,6 @@ import optax
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.policies.files import named, unnamed
 from experiments.applications.policies.learning import FitConfig, Report, fit
@@ -37,6 +36,7 @@ from experiments.applications.policies.network import (
 )
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.interface import AnySimulator
 
 DESCRIPTION, WEIGHTS = "head.json", "head.safetensors"

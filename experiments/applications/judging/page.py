@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, successes
 from experiments.applications.judging.summary import COLUMNS, shown
@@ -20,6 +19,7 @@ from experiments.report.clips import animate
 from experiments.report.pieces import data_uri, picture, section, table
 from experiments.report.plot_style import INK, MUTED, STYLE, save
 from experiments.report.style import CSS
+from hma_jax.runtime.files import write_file
 
 CLIPS = 6
 """Episodes that are shown."""

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from data_pipelines.suite.simulator import SuiteSimulator
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, reached
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import write_file
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start

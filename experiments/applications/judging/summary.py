@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.analysis.intervals import Interval
 from experiments.applications.judging.agreement import agree, rate_interval, share
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
+from hma_jax.runtime.files import write_file
 
 COLUMNS = {
     "true, by state": (TRUE, STATE),

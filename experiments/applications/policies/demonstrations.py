@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from data_pipelines.publishing.files import write_file
 from experiments.applications.policies.driving import Driven, drive, new_episodes
 from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import write_file
 
 SPLIT = "demonstrations"
 """Their seeds are those of no episode that a world model is trained or judged on."""

@@ -12,12 +12,12 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from data_pipelines.publishing.files import write_file
 from experiments.cli.data.next_command import no_window, tokenize_command
 from experiments.progress import console, step, tidy_table
 from experiments.setting import use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError
+from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
