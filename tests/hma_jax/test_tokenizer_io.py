@@ -103,7 +103,7 @@ def test_a_save_that_is_cut_short_leaves_no_tokenizer(copy, monkeypatch, replace
         calls.append(target)
         os.rename(source, target)
 
-    monkeypatch.setattr("hma_jax.tokenizers.io.os.replace", die)
+    monkeypatch.setattr("hma_jax.runtime.files.os.replace", die)
     with pytest.raises(KeyboardInterrupt):
         save_tokenizer(make(seed=1), copy)
     assert "no tokenizer at" in refusal(copy)
