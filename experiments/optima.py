@@ -17,6 +17,7 @@ import scipy.stats
 from experiments.rows import LOSS, OVERALL, TRAINING, CurvePoint, Row, all_series, curve, difference, of_sweep
 from experiments.running.ledger import DIVERGED, FINISHED
 from experiments.sweeps.sweep import Sweep
+from hma_jax.evaluation.sums import add_up
 
 LOSSES = {"cross_entropy": OVERALL, LOSS: TRAINING}
 """What optima are taken of, with scopes: nats per held-out token, and the training objective."""
@@ -136,10 +137,10 @@ def chosen_by_others(
     lost_by = []
     for seed in sorted(shared):
         others = shared - {seed}
-        best, transferred = (min(c, key=lambda x, c=c: sum(c[x][s] for s in others)) for c in (own, base))
+        best, transferred = (min(c, key=lambda x, c=c: add_up(c[x][s] for s in others)) for c in (own, base))
         lost_by.append(own[transferred][seed] - own[best][seed])
-    mean = sum(lost_by) / len(lost_by)
-    spread = sum((d - mean) ** 2 for d in lost_by) / (len(lost_by) - 1)
+    mean = add_up(lost_by) / len(lost_by)
+    spread = add_up((d - mean) ** 2 for d in lost_by) / (len(lost_by) - 1)
     return mean, math.sqrt(spread / len(lost_by))
 
 

@@ -24,6 +24,7 @@ from experiments.running.trial import last_loss, trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ConfigError
+from hma_jax.evaluation.sums import add_up
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -235,9 +236,9 @@ def curve(
     points = []
     for x, group in sorted(groups.items()):
         means = [r.mean for r in group]
-        mean = sum(means) / len(means)
-        spread = sum((m - mean) ** 2 for m in means) / max(len(means) - 1, 1) / len(means)
-        episodes = sum(r.sem**2 for r in group) / len(group)
+        mean = add_up(means) / len(means)
+        spread = add_up((m - mean) ** 2 for m in means) / max(len(means) - 1, 1) / len(means)
+        episodes = add_up(r.sem**2 for r in group) / len(group)
         points.append(
             CurvePoint(
                 x, mean, sem=math.sqrt(spread + episodes),
@@ -256,10 +257,10 @@ def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
     pairs = [a.seeds[seed] - b.seeds[seed] for seed in a.seeds if seed in b.seeds]
     if not pairs:
         return math.nan, math.nan
-    mean = sum(pairs) / len(pairs)
+    mean = add_up(pairs) / len(pairs)
     if len(pairs) == 1:
         return mean, math.nan
-    return mean, math.sqrt(sum((d - mean) ** 2 for d in pairs) / (len(pairs) - 1) / len(pairs))
+    return mean, math.sqrt(add_up((d - mean) ** 2 for d in pairs) / (len(pairs) - 1) / len(pairs))
 
 
 def all_series(rows: Iterable[Row], sweep: str) -> dict[str, list[str]]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from scipy.special import stdtrit
 
 from hma_jax.evaluation.statistics import Stat, stratified
+from hma_jax.evaluation.sums import add_up
 
 OVERALL = "overall"
 """The scope that averages over all robots, each counting equally."""
@@ -72,7 +73,7 @@ def overall(stats: Iterable[Stat], level: float = LEVEL) -> Interval:
 def satterthwaite(estimates: Iterable[tuple[float, float]]) -> float:
     """Degrees of freedom of a sum of (variance, its own degrees of freedom); infinite where nothing varies."""
     known = list(estimates)
-    total, squares = sum(v for v, _ in known), sum(v**2 / df for v, df in known)
+    total, squares = add_up(v for v, _ in known), add_up(v**2 / df for v, df in known)
     return total**2 / squares if squares else math.inf
 
 

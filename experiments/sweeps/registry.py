@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import importlib.util
 import sys
+import types
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -103,13 +103,15 @@ def _require_distinct(sweep: Sweep, where: str) -> None:
 
 
 def _load(path: Path) -> Plan:
-    """`plan` of a file, which is run. What it raises is its author's, and not caught."""
+    """`plan` of a file, which is run. What it raises is its author's, and not caught.
+
+    Compiled anew each time: Python's cached bytecode cannot tell a file from what it was in the same second.
+    """
     require(path.is_file(), f"{path}: no such file; an axis is a Python file with plan(study) (docs/own_axis.md)")
-    name = f"axis_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses of the file look themselves up there
-    spec.loader.exec_module(module)
+    module = types.ModuleType(f"axis_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses of the file look themselves up there
+    exec(compile(path.read_bytes(), path, "exec"), vars(module))
     plan = getattr(module, "plan", None)
     require(callable(plan), f"{path}: has no function plan(study) (docs/own_axis.md)")
     return plan

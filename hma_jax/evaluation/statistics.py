@@ -17,6 +17,7 @@ import numpy as np
 
 from hma_jax.config import require
 from hma_jax.evaluation.metrics import group_means, official_perplexity
+from hma_jax.evaluation.sums import add_up
 
 
 @dataclass(frozen=True)
@@ -107,12 +108,12 @@ def stratified(stats: Iterable[Stat], weights: Iterable[float] | None = None) ->
     stats = list(stats)
     require(len(stats) > 0, "no datasets to average over")
     known = [s.sem**2 * s.clusters for s in stats if not math.isnan(s.sem)]  # variance of one episode
-    typical = sum(known) / len(known) if known else math.nan
+    typical = add_up(known) / len(known) if known else math.nan
     squares = [typical / s.clusters if math.isnan(s.sem) else s.sem**2 for s in stats]
     parts = [1.0] * len(stats) if weights is None else list(weights)
     return Stat(
-        mean=sum(w * s.mean for w, s in zip(parts, stats, strict=True)) / sum(parts),
-        sem=math.sqrt(sum(w**2 * square for w, square in zip(parts, squares, strict=True))) / sum(parts),
+        mean=add_up(w * s.mean for w, s in zip(parts, stats, strict=True)) / add_up(parts),
+        sem=math.sqrt(add_up(w**2 * square for w, square in zip(parts, squares, strict=True))) / add_up(parts),
         n=sum(s.n for s in stats),
         episodes=sum(s.episodes for s in stats),
     )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.embodiments import TRAINED
+from experiments.analysis.compare import Side, compare
 from experiments.analysis.preregistered import FILE, Expected, read_expected, what_came
 from experiments.applications.detector import CLOSE
 from experiments.applications.in_place import in_place
@@ -388,6 +389,25 @@ def test_the_reference_on_latents_is_as_its_findings_say():
         (point,) = curve(rows_of(study), "horizon", e.metric)
         came = f"{point.mean:.2f}" if e.low <= point.mean <= e.high else f"**{point.mean:.2f}**"
         assert f"| {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.metric, came)
+
+
+SIXTEEN_BITS = {0: "87031510e024dba4", 1: "e0ed9450a3926807", 2: "5be8301a53ed7f53"}
+"""Seed -> the trial of the ladder with recall and Muon, 4,000 steps."""
+
+
+@pytest.mark.parametrize("bits", [8, 24])
+def test_what_tokens_of_other_bits_give_is_as_findings_of_the_ladder_say(bits):
+    folder = RESULTS / "tokenizers" / f"bits{bits}"
+    other = Side(folder.name, {s: WindowTable.load(folder / f"seed{s}" / WINDOWS) for s in SIXTEEN_BITS}, f"{bits} bits")
+    trials = RESULTS / "ladder" / "trials"
+    usual = Side("bits16", {s: WindowTable.load(trials / id / WINDOWS) for s, id in SIXTEEN_BITS.items()}, "16 bits")
+    found = {(d.scope, d.metric): d for d in compare(other, usual)}
+    quality = json.loads((folder / "quality.json").read_text())["mean"]
+    cells = [str(bits), f"{quality:.1f}"]
+    for metric in ("psnr", "delta_psnr"):
+        d = found[OVERALL, metric]
+        cells += [f"{d.a:.2f}", f"{d.mean:+.2f} ({d.low:+.2f} to {d.high:+.2f})"]
+    assert f"| {' | '.join(cells)} |" in findings("ladder")
 
 
 def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
