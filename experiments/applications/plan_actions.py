@@ -2,8 +2,8 @@
 
 Question: does a planner that looks ahead in the model reach goals in the true simulator?
 Paper: left for later there.
-Command: python -m experiments.applications.plan_actions
-Cost: half an hour of one core; goes on where it was stopped.
+Command: python -m experiments.applications.plan_actions RUN
+Cost: half an hour of one core, an hour for the model that is served; goes on where it was stopped.
 Expected: planning in the model comes near to planning in the true simulator, and both are above cloned and random
           actions.
 

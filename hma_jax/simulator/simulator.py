@@ -41,8 +41,8 @@ class Simulator:
     decodes them, the first ones too. What an episode shows depends on its start, its actions and its seed alone:
     frame t is drawn from fold_in(key(seed), t). Past the model's window of T frames it goes on as `decode.slide`
     says. A model trained on passive video is shown no action: it goes on as if none was known. ConfigError is raised
-    for whatever cannot be done; nothing has changed then. After a fault of
-    the device every episode may have to begin again (`counts` is 0 then).
+    for whatever cannot be done; nothing has changed then. After a fault of the device every episode may have to begin
+    again (`counts` is 0 then).
     """
 
     def __init__(

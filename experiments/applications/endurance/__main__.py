@@ -19,11 +19,11 @@ from typing import Any
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.detector import WEIGHTS, Detector
+from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
 from experiments.applications.endurance.films import Film, load_films, make_films, save_films
 from experiments.applications.endurance.tables import Row, over_robots, rows_of
-from experiments.applications.made_with import claim, short_hash
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
@@ -89,8 +89,7 @@ def main() -> None:
     asked = parser.parse_args()
     require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
     detector, rows = Detector.load(asked.detector), []
-    watched = {"detector": short_hash(asked.detector.read_bytes())}
-    claim(asked.out, asked.run, load_simulator(asked.run), watched, file=f"{asked.name}.json")
+    claim_name(asked.out, asked.name, asked.run, load_simulator(asked.run), asked.detector)
     for kind in asked.drives:
         for variant in asked.variants:
             new: list[Row] = []

@@ -27,9 +27,9 @@ from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
 from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector
 from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.tables import Row
-from experiments.applications.made_with import claim, short_hash
 from experiments.applications.scenes import SEEN, points_of
 from experiments.applications.simulators import START_FRAMES, load_simulator
 from experiments.applications.tables import write_rows
@@ -146,8 +146,7 @@ def main() -> None:
     detector, rows, table = Detector.load(asked.detector), [], asked.out / f"{asked.name}_hidden.csv"
     simulator = load_simulator(asked.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)
     robots = native_robots(simulator.robots)
-    watched = {"detector": short_hash(asked.detector.read_bytes())}
-    claim(asked.out, asked.run, simulator, watched, file=f"{asked.name}.json")  # as `endurance` does
+    claim_name(asked.out, asked.name, asked.run, simulator, asked.detector)
     with step("objects that come back") as update:
         for i, name in enumerate(robots):
             spec, rng = SPECS[name], np.random.default_rng([0, i])
