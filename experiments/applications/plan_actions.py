@@ -86,19 +86,26 @@ class Settings:
     frames: int = 16
     hold: int = 6  # frames in a row at the goal, for success
     starts: int = 30
+    skip: int = 0  # starts of the task before the first that is taken: others than an earlier run's
     execute: int = 2  # frames from one plan to the next
     unmask_steps: int = 2  # looks at a frame: fewer than for eyes, and as many times cheaper
     search: SearchConfig = field(default_factory=SearchConfig)
     steps: int = 2000  # of training of the cloned policies
     batch: int = 32
     learning_rate: float = 2e-3
+    seed: int = 0  # of the training of the cloned policies
 
     def __post_init__(self):
         require(self.execute >= 1, f"--execute must be at least 1 frame, got {self.execute}")
         require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
+        require(self.skip >= 0, f"--skip must not be negative, got {self.skip}")
 
     def make_task(self) -> Task:
         return find_task(self.robot, self.task, self.frames, self.hold)
+
+    def start_seeds(self) -> np.ndarray:
+        """int64 [starts]: of starts that no recording has."""
+        return start_seeds(self.make_task(), self.skip + self.starts)[self.skip :]
 
 
 def goal_picture(task: Task, seed: int, size: int) -> np.ndarray:
@@ -152,7 +159,7 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     if way in CLONED:
         demos = record(task, CLONED[way], stride=robot.stride, image_size=size, only_successes=True)
         fit = FitConfig(settings.steps, settings.batch, settings.learning_rate, ema=0.98)
-        policy = clone(demos, BcConfig(frames=1, fit=fit), 0, report)
+        policy = clone(demos, BcConfig(frames=1, fit=fit), settings.seed, report)
     found = run_policy(task, policy, seeds, size, robot.stride)
     return [
         {"success": bool(s), "distance": float(d), "seconds": 0.0}
@@ -225,29 +232,39 @@ def main() -> None:
     parser.add_argument("--task", default=Settings.task, help="reach, or own: what the robot's own recordings do")
     parser.add_argument("--frames", type=int, default=Settings.frames, help="of an episode")
     parser.add_argument("--starts", type=int, default=Settings.starts)
+    parser.add_argument("--skip", type=int, default=Settings.skip, help="starts before the first that is taken")
+    parser.add_argument("--seed", type=int, default=Settings.seed, help="of the training of the cloned policies")
+    parser.add_argument(
+        "--ways", nargs="+", default=WAYS, choices=WAYS, metavar="WAY", help=f"of acting, of: {', '.join(WAYS)}"
+    )
     parser.add_argument("--execute", type=int, default=Settings.execute, help="frames from one plan to the next")
     parser.add_argument("--candidates", type=int, default=SearchConfig.candidates)
     parser.add_argument("--iterations", type=int, default=SearchConfig.iterations)
     parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
     asked = vars(parser.parse_args())
-    run, out = asked.pop("run"), asked.pop("out")
+    run, out, wanted = asked.pop("run"), asked.pop("out"), asked.pop("ways")
     search = SearchConfig(candidates=asked.pop("candidates"), iterations=asked.pop("iterations"))
     settings = Settings(search=search, **asked)
     decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)
     simulator = load_simulator(run, episodes=search.candidates, decode=decode, history=1)
     robot, size = simulator.robot(settings.robot), simulator.tokenizer.image_size
-    seeds = start_seeds(settings.make_task(), settings.starts)
+    seeds = settings.start_seeds()
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
     claim(out, run, simulator, asdict(settings))
     (out / "trials").mkdir(exist_ok=True)
     trials: dict[str, list[dict]] = {}
-    for way in (*CLONED, RANDOM):
+    for way in (name for name in (*CLONED, RANDOM) if name in wanted):
         path = out / "trials" / f"{way.replace(' ', '_')}.json"
         with step(way) as update:
             if not path.exists():
                 write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
         trials[way] = json.loads(path.read_text())
-    for ways in (tuple(PLANNERS)[:3], tuple(PLANNERS)[3:]):  # those that are compared, start by start; then MPPI
+    if trials:
+        write_results(trials, out)
+    compared, last = tuple(PLANNERS)[:3], tuple(PLANNERS)[3:]  # these start by start, then MPPI
+    for ways in ([name for name in turn if name in wanted] for turn in (compared, last)):
+        if not ways:
+            continue
         trials, pace = trials | {way: [] for way in ways}, Pace()
         with step(f"{', '.join(ways)}: {settings.starts} episodes each") as update:
             for k, seed in enumerate(seeds.tolist()):
