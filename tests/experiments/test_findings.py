@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from data_pipelines.suite.embodiments import TRAINED
 from experiments.analysis.compare import Side, compare
@@ -248,6 +249,20 @@ def exponents() -> list[float]:
                 as_far = np.exp(np.interp(-r.mean, means, np.log(along)))
                 found.append(np.log(as_far / steps[r.sweep](r.x)) / np.log(40 / r.x))
     return found
+
+
+def test_how_many_robots_a_deaf_model_has_far_from_zero_is_as_findings_say():
+    with open(RESULTS / "cpu-full" / "controllability.csv", newline="") as file:
+        rows = [r for r in csv.DictReader(file) if (r["role"], r["metric"]) == (CONTROL, "action_nats")]
+    rows = [r for r in rows if float(r["sem"]) > 0]
+    chance = [2 * stats.t.sf(3, int(r["episodes"]) - 1) for r in rows]  # of one robot, either side
+    none = np.prod([1 - p for p in chance])
+    one = sum(none * p / (1 - p) for p in chance)
+    found = sum(abs(float(r["errors"])) > 3 for r in rows)
+    page = " ".join(findings().split())
+    assert len(rows) == 36 and f"action-nats beyond 3 of them on {found} of the 36" in page
+    assert f"has {sum(chance):.1f} of them beyond 3 standard errors, either side" in page
+    assert f"two or more come in {100 * (1 - none - one):.0f} of 100 cases" in page
 
 
 def test_what_sharing_and_company_cost_is_as_findings_say():
