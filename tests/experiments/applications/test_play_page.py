@@ -140,6 +140,26 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again():
     browsing(test, visitors=1)
 
 
+def test_nothing_is_sent_before_the_greeting():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.evaluate("""window.sent = []; window.WebSocket = class {
+            static OPEN = 1;
+            readyState = 1;
+            constructor() { setTimeout(() => { this.onopen?.(); window.open_ = true; }); }
+            send(text) { sent.push(JSON.parse(text).type); }
+        }; state.socket.close()""")
+        await page.keyboard.down("ArrowUp")
+        await page.wait_for_function("window.open_")
+        await page.wait_for_timeout(200)
+        assert await page.evaluate("sent") == []
+        await page.evaluate("hear({type: 'hello', token: token(), robot: state.robot.name, start: 0})")
+        assert (await page.evaluate("sent"))[:1] == ["rewind"]
+        assert not page.faults
+
+    browsing(test)
+
+
 def test_two_visitors_do_not_mix_and_a_third_is_told():
     async def test(browser, address, client):
         first = await opened(browser, address)
