@@ -65,7 +65,8 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
     weighed = sets
     if config.weighed == "all" and config.max_trajectories is not None:
         weighed = {name: _windows(store, name, config, None) for name in names}
-    counts = {name: len(s) for name, s in weighed.items()}
+    # Nothing can be drawn of a dataset whose trajectories under the cap were all lost, whatever else it has.
+    counts = {name: len(weighed[name]) if len(s) else 0 for name, s in sets.items()}
     return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.shortage() for n, s in sets.items()}))
 
 

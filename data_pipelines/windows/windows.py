@@ -84,6 +84,8 @@ class WindowSet:
         """Why there are no windows, for a message."""
         if not self.longest:
             return f"it has no {self.split} episode"
+        if self.longest >= self.needed:
+            return "the trajectories that were drawn of it are all lost: raise max_trajectories"
         return (
             f"{self.least} frames, the least there may be, need {self.needed} native frames at stride "
             f"{self.cut.stride}; the longest of its {self.too_short} {self.split} episodes has {self.longest}"

@@ -277,6 +277,26 @@ def test_dataset_without_windows_is_dropped_and_reported(tmp_path):
         make_loader(store, table, LoaderConfig(frames=6, batch=4, datasets=("short",)))
 
 
+@pytest.mark.parametrize("weighed", ["used", "all"])
+def test_a_dataset_whose_drawn_trajectories_are_all_lost_is_dropped_and_reported(tmp_path, weighed):
+    """It has other windows, so that it weighs something by all there are: an order of nothing would never end."""
+    spec, damaged = make_spec("whole"), make_spec("damaged")
+
+    def spoil(episode, features):
+        if episode % 2:
+            features["steps/action"][3, 0] = np.nan
+
+    tokenize_dataset(spec, write_rlds(tmp_path, spec, [30] * 6), FakeTokenizer(), tmp_path / "store")
+    source = write_rlds(tmp_path, damaged, [30] * 20, change=spoil)
+    tokenize_dataset(damaged, source, FakeTokenizer(), tmp_path / "store", corrupt="skip")
+    store, lost = TokenStore(tmp_path / "store"), []
+    for seed in range(8):
+        mixture = select_windows(store, LoaderConfig(frames=4, max_trajectories=1, seed=seed, weighed=weighed)).mixture
+        assert mixture.names == ("whole",) if mixture.dropped else {"whole", "damaged"} == set(mixture.names)
+        lost += mixture.dropped.items()
+    assert set(lost) == {("damaged", "the trajectories that were drawn of it are all lost: raise max_trajectories")}
+
+
 # --- order of datasets, weights, statistics, rate ---------------------------------------------------
 
 
