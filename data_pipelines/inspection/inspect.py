@@ -158,7 +158,7 @@ def inspect_dataset(
             times = tuple(np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist())
             looked = {key: log.look(record[step_key(key)], times) for key, log in cameras.items()}
         except (EpisodeError, ValueError) as error:
-            source.skip(error if isinstance(error, EpisodeError) else EpisodeError(f"episode {i}: {error}"))
+            source.skip(int(i), error if isinstance(error, EpisodeError) else EpisodeError(f"episode {i}: {error}"))
             continue
         bytes_read += sum(_size(values) for values in record.values())
         steps.append(count)

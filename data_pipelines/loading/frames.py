@@ -119,7 +119,7 @@ class _Stream:
             try:
                 return self.source.frames(episode, self.image_key, lambda n: (draws % n).tolist(), size)
             except EpisodeError as error:
-                self.source.skip(error)
+                self.source.skip(episode, error)
         raise DataError(f"{self.source.name}: none of its {len(self.episodes)} episodes can be read")
 
     def describe(self, i: int) -> str:

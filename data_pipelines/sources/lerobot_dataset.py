@@ -103,6 +103,9 @@ class LeRobotDataset(EpisodeSource):
         self.check_keys(image_key, action_keys)
         camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
         entry, where = self._entries[i], self._where(i)
+        if not entry.length:
+            what = f"{where}: by the meta folder an episode without a step; leave it out with corrupt='skip'."
+            raise EpisodeError(what).at(entry.data, -1)
         with ExitStack() as stack:
             if not keys and self._cameras[camera] in entry.videos:  # frames alone: no table is needed
                 steps, actions, success = entry.length, np.zeros((entry.length, 0), np.float32), None

@@ -96,6 +96,8 @@ class RobomimicDataset(EpisodeSource):
         with self._read.open() as file:
             demo, where = file["data"][self._demos[i]], self._where(i)
             frames = _Frames(demo, _path(camera, image=True), where)
+            if not len(frames):
+                self._refuse(i, "a demonstration without a step")
             if "actions" in demo and len(frames) != len(demo["actions"]):
                 self._refuse(i, f"{len(frames)} frames of {camera!r} for {len(demo['actions'])} actions")
             fields = {field_slice(key)[0] for key in keys}

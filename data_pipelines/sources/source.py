@@ -110,6 +110,7 @@ class EpisodeSource(ABC):
         count_skippable(max_skipped, 0)
         self.corrupt, self._limit = corrupt, max_skipped
         self.skipped: dict[str, int] = {}  # reason -> episodes lost
+        self._counted: set[int] = set()  # episodes that `skip` has counted
 
     @property
     def max_skipped(self) -> int:
@@ -219,11 +220,13 @@ class EpisodeSource(ABC):
                     "Correct action_dims, or read the version of the dataset it was written for."
                 )
 
-    def skip(self, error: EpisodeError) -> None:
-        """Counts an unusable episode once, or raises `error` under the policy corrupt='raise'."""
+    def skip(self, i: int, error: EpisodeError) -> None:
+        """Counts the unusable episode `i` once, whichever of its frames are met; raises `error` under the policy
+        corrupt='raise'."""
         if self.corrupt == "raise":
             raise error
-        if str(error) not in self.skipped:
+        if i not in self._counted:
+            self._counted.add(i)
             self.lose(str(error), 1)
 
     def lose(self, reason: str, episodes: int) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from data_pipelines.sources.identity import describe
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.location import OpenFiles
 from hma_jax.config import ConfigError
+from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import REAL_DATA, count_open, make_spec, write_rlds
 
 SPEC = make_spec()
@@ -125,6 +127,41 @@ def test_damaged_episode_is_an_error_or_replaced(tmp_path):
         take([(SPEC, rlds)], 20)
     seen = np.concatenate(take([(SPEC, rlds)], 20, corrupt="skip"))[:, 0, 0, 0]
     assert 3 not in seen and len(set(seen.tolist())) == 4
+
+
+def test_a_damaged_episode_is_one_loss_however_many_of_its_frames_are_drawn(tmp_path):
+    def spoil(episode, features):
+        if episode == 3:
+            features["steps/observation/image"] = [b"broken"] * 9
+
+    rlds = write_rlds(tmp_path, SPEC, [9] * 6, change=spoil)
+    take([(SPEC, rlds)], 20, corrupt="skip", max_skipped=1)
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "robomimic"])
+def test_an_episode_without_a_step_is_damaged(tmp_path, kind):
+    if kind == "lerobot":
+        spec, place = replace(SPEC, image_key="observation/top"), write_lerobot(tmp_path / "toy", "v2.1")
+        path = place / "meta" / "episodes.jsonl"
+        path.write_text(path.read_text().replace('"length": 9', '"length": 0'))
+    else:
+        spec = make_spec("robomimic_lift", (7,))
+        spec, place = replace(spec, image_key="observation/agentview"), tmp_path / "x.hdf5"
+        write_robomimic(place, lengths=(5, 7), change=lambda file: empty(file["data/demo_10"]))
+    options = {"val_fraction": 0, "min_val": 0, "max_val": 0}
+    with pytest.raises(EpisodeError, match="(episode 1|demo_10).*without a step"):
+        take([(spec, place)], 4, **options)
+    assert len(take([(spec, place)], 4, corrupt="skip", max_skipped=1, **options)) == 4
+
+
+def empty(demonstration) -> None:
+    """Its arrays without a row."""
+    names: list[str] = []
+    demonstration.visit(names.append)
+    for name in [n for n in names if hasattr(demonstration[n], "dtype")]:
+        nothing = demonstration[name][:0]
+        del demonstration[name]
+        demonstration[name] = nothing
 
 
 def test_wrong_arguments_are_one_clear_message(rlds):

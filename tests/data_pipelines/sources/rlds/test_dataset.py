@@ -309,9 +309,9 @@ def test_the_bound_may_be_a_share_of_the_episodes(directory, share, lost):
     dataset = RldsDataset(directory, corrupt="skip", max_skipped=share)
     assert dataset.max_skipped == lost
     for i in range(lost):
-        dataset.skip(EpisodeError(f"episode {i} is broken"))
+        dataset.skip(i, EpisodeError(f"episode {i} is broken"))
     with pytest.raises(DataError, match=f"more than max_skipped={lost}"):
-        dataset.skip(EpisodeError("one too many"))
+        dataset.skip(lost, EpisodeError("one too many"))
 
 
 @pytest.mark.parametrize("wrong", [1.5, -1, -0.1])
@@ -322,14 +322,13 @@ def test_a_bound_that_is_neither_a_number_nor_a_share_is_refused(directory, wron
 
 def test_skip_counts_an_episode_once(directory):
     dataset = RldsDataset(directory, corrupt="skip", max_skipped=1)
-    error = EpisodeError("episode 1 is broken")
-    dataset.skip(error)
-    dataset.skip(error)
-    assert dataset.skipped == {"episode 1 is broken": 1}
-    with pytest.raises(DataError, match="max_skipped=1"):
-        dataset.skip(EpisodeError("episode 2 is broken"))
+    dataset.skip(1, EpisodeError("step 3 of episode 1 is broken"))
+    dataset.skip(1, EpisodeError("step 4 of episode 1 is broken"))
+    assert dataset.skipped == {"step 3 of episode 1 is broken": 1}
+    with pytest.raises(DataError, match="2 episodes are unusable, more than max_skipped=1"):
+        dataset.skip(2, EpisodeError("step 3 of episode 1 is broken"))  # in the same words
 
 
 def test_raise_passes_the_error_on(directory):
     with pytest.raises(EpisodeError, match="broken"):
-        RldsDataset(directory).skip(EpisodeError("broken"))
+        RldsDataset(directory).skip(0, EpisodeError("broken"))
