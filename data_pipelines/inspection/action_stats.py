@@ -67,7 +67,9 @@ def _one(columns: list[np.ndarray]) -> DimensionFacts:
     hint = _hint(columns, mean, std, counts[-2:].sum() / len(good), smoothness)
     extremes = float(good.min()), float(good.max())
     quantiles = tuple(np.quantile(good, QUANTILES, method="inverted_cdf").tolist())
-    histogram = tuple(np.histogram(good, BINS, extremes if alive else (mean - 1, mean + 1))[0].tolist())
+    # From the smallest on: between large numbers, as of nanoseconds, there may be no room for the edges of bins.
+    span = (0.0, extremes[1] - extremes[0]) if alive else (-1.0, 1.0)
+    histogram = tuple(np.histogram(good - extremes[0], BINS, span)[0].tolist())
     bad = int((~finite).sum())
     return DimensionFacts(*extremes, mean, std, distinct, smoothness, bad, quantiles, histogram, hint)
 

@@ -277,7 +277,8 @@ class _CameraLog:
 
 
 def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dict, actions: dict) -> Shown:
-    text = next((record[key][0] for key in INSTRUCTION_KEYS if record.get(key)), b"")
+    found = (record.get(key, ()) for key in INSTRUCTION_KEYS)
+    text = next((values[0] for values in found if len(values) and isinstance(values[0], bytes)), b"")
     success = record.get(SUCCESS_KEY)
     known = success is not None and len(success) == 1
     flag = bool(success[0]) if known else None

@@ -106,6 +106,13 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
     assert any("differ in length" in reason for reason in facts.damaged)
 
 
+def test_an_instruction_in_numbers_is_no_text(tmp_path):
+    """As some datasets keep the ids of its tokens."""
+    numbers = {"steps/language_instruction": np.arange(20)}
+    directory = write_rlds(tmp_path, make_spec(), [10] * 2, change=lambda _, features: features.update(numbers))
+    assert [shown.instruction for shown in inspect_dataset(directory).shown] == ["", ""]
+
+
 def test_directory_without_a_usable_episode(tmp_path):
     def change(episode, features):
         features["steps/action"] = features["steps/action"][:-1]
@@ -138,6 +145,13 @@ def test_hints_name_what_the_numbers_look_like():
 def test_constant_with_rounding_noise_is_dead():
     (facts,) = dimension_facts([np.float32(0.1) + np.float32([[0], [1e-8], [0]])])
     assert facts.hint == "constant" and np.isnan(facts.smoothness)
+
+
+@pytest.mark.parametrize("values", [np.full(10, 1.7e18), 2.0**62 + 1024 * np.arange(10), np.full(10, 3e38)])
+def test_values_too_large_to_tell_neighbours_apart_are_described(values):
+    """Nanoseconds since 1970, and the largest number of a type as a sign of none."""
+    (facts,) = dimension_facts([values[:, None]])
+    assert (facts.minimum, facts.maximum, sum(facts.histogram)) == (values.min(), values.max(), 10)
 
 
 def test_values_that_are_not_finite_are_counted_and_left_out():
