@@ -66,8 +66,13 @@ class Cut:
     def actions(self, item: StoredEpisode, start: int, width: int) -> np.ndarray:
         """float32 [T, U = width]: the action chunk of each frame, sub-step-major, raw units,
         followed by zeros."""
-        real, first = self.real(item, start), start * self.frame_step
-        chunk = item.actions[first : first + real * self.stride].reshape(real, self.stride * item.actions.shape[1])
+        return self.chunks(item.actions, start, width)
+
+    def chunks(self, actions: np.ndarray, start: int, width: int) -> np.ndarray:
+        """The same of the native actions of an episode [N, A], without anything else of it."""
+        first = start * self.frame_step
+        real = int(self.longest(len(actions) - first))
+        chunk = actions[first : first + real * self.stride].reshape(real, self.stride * actions.shape[1])
         padded = np.zeros((self.frames, width), np.float32)
         padded[:real, : chunk.shape[1]] = chunk
         return padded

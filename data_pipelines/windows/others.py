@@ -35,7 +35,8 @@ class OtherWindows:
     def __init__(self, store: TokenStore, cuts: dict[str, Cut], frames: int, rate: float | None, seed: int):
         self._store, self._cuts, self._frames, self._rate, self._seed = store, cuts, frames, rate, seed
         self._sets: dict[tuple[str, str], tuple[WindowSet, np.ndarray]] = {}
-        self._actions = lru_cache(KEPT)(lambda name, split, i: store.episode(name, split, i))
+        # Copied: a view would keep the whole record, which may hold hundreds of frames.
+        self._actions = lru_cache(KEPT)(lambda name, split, i: store.episode(name, split, i).actions.copy())
 
     def choose(self, name: str, episode: int, start: int, count: int) -> list[Other]:
         """Up to `count`, as many as there are, for the held-out window at `start` of `episode` (position in the store).
@@ -51,17 +52,17 @@ class OtherWindows:
         found: list[Other] = []
         for split in ("val", "train"):
             if len(found) < count:
-                found += self._of(name, split, real, seed, episode if split == "val" else -1)[: count - len(found)]
+                found += self._of(name, split, real, seed, episode if split == "val" else -1, count - len(found))
         return found
 
     def actions(self, name: str, others: Sequence[Other], width: int) -> np.ndarray:
         """float32 [n, T, U = width]: the chunks of each, as `Cut.actions` cuts them."""
         cut = self._cuts[name]
-        chunks = [cut.actions(self._actions(name, o.split, o.episode), o.start, width) for o in others]
+        chunks = [cut.chunks(self._actions(name, o.split, o.episode), o.start, width) for o in others]
         return np.stack(chunks) if chunks else np.zeros((0, self._frames, width), np.float32)
 
-    def _of(self, name: str, split: str, real: int, seed: int, own: int) -> list[Other]:
-        """All windows of at least `real` frames that are not of episode `own`, in the order of choice."""
+    def _of(self, name: str, split: str, real: int, seed: int, own: int, count: int) -> list[Other]:
+        """The first `count` windows of at least `real` frames that are not of episode `own`, in the order of choice."""
         windows, of_window = self._windows(name, split)
         at = np.flatnonzero((of_window >= real) & (windows.episode_idx != own))
         episode, h = windows.episode_idx[at], hash64(at, stream_seed(seed, split))
@@ -69,7 +70,7 @@ class OtherWindows:
         first = np.searchsorted(episode[by_episode], episode[by_episode])  # where each one's episode begins
         rank = np.empty(len(at), np.int64)
         rank[by_episode] = np.arange(len(at)) - first
-        return [Other(split, *windows.locate(int(i))) for i in at[np.lexsort((h, rank))]]
+        return [Other(split, *windows.locate(int(i))) for i in at[np.lexsort((h, rank))[:count]]]
 
     def _windows(self, name: str, split: str) -> tuple[WindowSet, np.ndarray]:
         """The windows of a split, and the real frames of each."""

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.windows.cut import make_cut
 from data_pipelines.windows.evalset import eval_batches, freeze_manifest
+from data_pipelines.windows.others import OtherWindows
 from data_pipelines.windows.truth import OtherTruth
+from data_pipelines.windows.windows import WindowSet
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -56,6 +59,19 @@ def test_more_are_taken_from_episodes_once_each_has_given_one_then_from_training
         (other,) = held_out - {own}
         assert episode[row, :3, 0].tolist() == [other] * 3 and sorted(step[row, :3, 0].tolist()) == [0, 1, 2]
         assert not set(episode[row, 3:, 0].tolist()) & held_out
+
+
+def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monkeypatch):
+    """Training has millions: of those that are not chosen none is located, and of episodes the actions alone are kept."""
+    store = small_store(tmp_path, lengths=(20,) * 8, min_val=2, max_val_fraction=0.25)
+    (name,) = store.names
+    others = OtherWindows(store, {name: make_cut(store, name, 4, 2.0)}, 4, 2.0, 0)
+    located, locate = [], WindowSet.locate
+    monkeypatch.setattr(WindowSet, "locate", lambda self, i: located.append(i) or locate(self, i))
+    chosen = others.choose(name, 0, 0, 40)
+    assert len(chosen) == len(located) == 40 and {o.split for o in chosen} == {"val", "train"}
+    assert others.actions(name, chosen, 3).shape == (40, 4, 3)
+    assert all(others._actions(name, o.split, o.episode).base is None for o in chosen)
 
 
 def test_fewer_than_asked_for_are_marked(tmp_path):
