@@ -12,6 +12,7 @@ and rate, and the held-out ones are drawn by hash.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import DataError
+from data_pipelines.names import shown
 from data_pipelines.sources.rlds.location import is_failure, retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import RobomimicSettings
@@ -51,7 +53,7 @@ class RobomimicSource:
             self.units = _demonstrations(self.path, file, settings.filter_key)
             self.layout, self.cameras = self._read_layout(file["data"][self.units[0]], settings.camera)
         self.task = str(args.get("env_name", "robomimic"))
-        self.hz = float(settings.hz or args.get("env_kwargs", {}).get("control_freq") or CONTROL_RATE)
+        self.hz = float(settings.hz or _control_rate(self.path, args))
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
     def identity(self) -> dict[str, Any]:
@@ -174,9 +176,20 @@ def _env_args(path: Path, text: Any) -> dict[str, Any]:
         return {}
     try:
         args = json.loads(text)
-    except ValueError as error:
-        raise DataError(f"{path}: the attribute env_args of 'data' is no JSON ({error}).") from error
+    except (ValueError, TypeError) as error:  # the latter of an attribute that is no text
+        raise DataError(f"{path}: the attribute env_args of 'data' is no JSON ({error}). Fetch the file again.") from error
     return args if isinstance(args, dict) else {}
+
+
+def _control_rate(path: Path, args: dict[str, Any]) -> float:
+    """Hz, as `env_args` says it; DataError for what is none."""
+    kwargs = args.get("env_kwargs")
+    rate = (kwargs.get("control_freq") if isinstance(kwargs, dict) else None) or CONTROL_RATE
+    if type(rate) not in (int, float) or not 0 < rate < math.inf:
+        raise DataError(
+            f"{path}: the attribute env_args of 'data' says control_freq {shown(rate)}, which is no rate in Hz. Correct it."
+        )
+    return rate
 
 
 def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -35,7 +36,7 @@ class RobomimicSettings:
     def check(self) -> None:
         """Raises ConfigError for what cannot work."""
         _check_side(self.short_side)
-        require(self.hz is None or self.hz > 0, f"hz must be positive, got {self.hz}")
+        require(self.hz is None or 0 < self.hz < math.inf, f"hz must be positive and finite, got {self.hz}")
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,16 @@ def drop(key):
     return lambda file: file.__delitem__(key)
 
 
+def env_args(value):
+    return lambda file: file["data"].attrs.__setitem__("env_args", value)
+
+
+@pytest.mark.parametrize("kwargs", ["null", "[]", "{}"])
+def test_a_file_that_does_not_say_its_rate_has_that_of_the_published_tasks(tmp_path, kwargs):
+    path = write_robomimic(tmp_path / "image.hdf5", change=env_args(f'{{"env_name": "Lift", "env_kwargs": {kwargs}}}'))
+    assert RobomimicSource(path).hz == 20
+
+
 def shorten(file):
     frames = file["data/demo_10/obs/agentview_image"][:-1]
     del file["data/demo_10/obs/agentview_image"]
@@ -73,7 +83,10 @@ def shorten(file):
         (drop("data/demo_10/actions"), "data/demo_10/actions cannot be read"),
         (drop("data/demo_10/obs/agentview_image"), "data/demo_10/obs/agentview_image cannot be read"),
         (shorten, r"demo_10/obs/agentview_image is uint8 \[6, 32, 32, 3\]; 7 actions need"),
-        (lambda f: f["data"].attrs.__setitem__("env_args", "{"), "env_args of 'data' is no JSON"),
+        (env_args("{"), "env_args of 'data' is no JSON"),
+        (env_args(3), "env_args of 'data' is no JSON"),
+        (env_args('{"env_kwargs": {"control_freq": "fast"}}'), "says control_freq 'fast', which is no rate"),
+        (env_args('{"env_kwargs": {"control_freq": -20}}'), "says control_freq -20, which is no rate"),
     ],
 )
 def test_malformed_files_are_named_to_the_field(tmp_path, change, message):
