@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ class LeRobotSource:
         self.root, self.short_side = Path(root), settings.short_side
         self.meta = read_meta(self.root)
         features = self.meta.features
+        _check_names(features, self.root / "meta" / "info.json")
         there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
         if not there:
             raise DataError(
@@ -213,6 +214,20 @@ def _is_camera(feature: dict[str, Any]) -> bool:
 def _is_vector(key: str, feature: dict[str, Any]) -> bool:
     numeric = str(feature.get("dtype")).startswith(("float", "int", "uint", "bool"))
     return numeric and key.partition(".")[0] in ("action", "observation")
+
+
+def _check_names(features: Mapping[str, dict[str, Any]], path: Path) -> None:
+    """Raises DataError for two features that would be called the same, so that one would hide the other."""
+    named: dict[str, str] = {}
+    for key, feature in features.items():
+        if not _is_camera(feature) and not _is_vector(key, feature):
+            continue
+        name = f"observation/{_short(key)}" if _is_camera(feature) else _key(key)
+        other = named.setdefault(name, key)
+        if other != key:
+            raise DataError(
+                f"{path}: the features {shown(other)} and {shown(key)} would both be called {name!r}. Rename one of them."
+            )
 
 
 def _short(camera: str) -> str:

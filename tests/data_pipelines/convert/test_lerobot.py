@@ -200,6 +200,21 @@ def test_line_that_describes_no_episode_is_named(tmp_path, line):
         LeRobotSource(root)
 
 
+@pytest.mark.parametrize("other", ["observation.images.left.wrist", "observation.left_wrist"])
+def test_two_features_of_one_name_are_refused(tmp_path, other):
+    """A camera beside a camera, and beside numbers: one would hide the other."""
+    root = write_lerobot(tmp_path / "toy", "v2.1", camera="image")
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    image = info["features"]["observation.images.top"]
+    numbers = info["features"]["observation.state"]
+    info["features"]["observation.images.left_wrist"] = image
+    info["features"][other] = image if "images" in other else numbers
+    path.write_text(json.dumps(info))
+    with pytest.raises(DataError, match=f"left_wrist' and '{other}' would both be called 'observation/left_wrist'"):
+        LeRobotSource(root)
+
+
 def test_a_directory_that_is_none_is_refused(tmp_path):
     with pytest.raises(DataError, match="info.json is missing: give the root of a LeRobot dataset"):
         LeRobotSource(tmp_path)
