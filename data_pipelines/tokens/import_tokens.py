@@ -176,9 +176,10 @@ def _tokens(folder: ReleaseFolder, start: int, stop: int, step: int, patch: int)
     """Every `step`-th frame of an episode: ids [F, S], or scaled latents [F, S, patch^2 C]."""
     part = np.asarray(folder.video[start:stop:step])
     if not folder.channels:
-        if part.max() >= folder.vocab_size:
+        wrong = part[(part < 0) | (part >= folder.vocab_size)]
+        if len(wrong):
             raise DataError(
-                f"{folder.path / 'video.bin'}: id {part.max()} in frames {start} to {stop - 1}, "
+                f"{folder.path / 'video.bin'}: id {wrong[0]} in frames {start} to {stop - 1}, "
                 f"but vocab_size is {folder.vocab_size}. Fetch the folder again."
             )
         return part.reshape(len(part), -1).astype(token_dtype(folder.vocab_size))

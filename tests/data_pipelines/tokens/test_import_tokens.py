@@ -207,6 +207,10 @@ def meta(**change):
     return apply
 
 
+def both(first, second):
+    return lambda path: (first(path), second(path))
+
+
 @pytest.mark.parametrize(
     "damage, message",
     [
@@ -223,6 +227,10 @@ def meta(**change):
         (
             rewrite("video.bin", np.full((21, 4, 4), 300000, np.uint32)),
             "id 300000 in frames 0 to 6, but vocab_size",
+        ),
+        (
+            both(rewrite("video.bin", np.full((21, 4, 4), -1, np.int32)), meta(token_dtype="int32")),
+            "id -1 in frames 0 to 6, but vocab_size",
         ),
         (
             rewrite("actions/part_0.bin", np.full((21, 3), np.nan, np.float32)),
