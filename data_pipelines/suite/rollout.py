@@ -58,6 +58,7 @@ def simulate(spec: EmbodimentSpec, seeds: Sequence[int], actions: np.ndarray | N
     behaviour = Behaviour(world, np.random.default_rng([int(seeds[0]), len(seeds), 2]))
     lengths = episode_lengths(spec, seeds)
     steps = int(lengths.max()) if actions is None else actions.shape[1]
+    lengths = np.minimum(lengths, steps)
     seen: dict[str, list[np.ndarray]] = {"q": [], "objects": [], "actions": []}
     reached = np.full(len(seeds), steps)
     for t in range(steps):

@@ -66,6 +66,12 @@ def test_actions_decide_what_is_seen(name):
     assert np.median(changed.mean((1, 2))) > 0.03, "other actions hardly change the picture"
 
 
+def test_an_episode_of_few_given_actions_is_as_long_as_they_are_and_no_success():
+    spec = BY_NAME["pusher_sand"]
+    rollout = simulate(spec, episode_seeds(spec, 4, 0), np.zeros((4, 3, spec.action_dim), np.float32))
+    assert rollout.lengths.tolist() == [3] * 4 and not rollout.success.any()
+
+
 @every_robot
 def test_the_background_is_still(name):
     """Where neither robot nor objects come, no pixel ever changes."""
