@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import types
 import typing
 from collections.abc import Sequence
@@ -40,7 +41,7 @@ class SuiteConfig:
     validation: int = 24  # held-out episodes of every dataset
 
     def __post_init__(self):
-        require(self.scale > 0, f"suite.scale must be positive, got {self.scale:g}")
+        require(0 < self.scale < math.inf, f"suite.scale must be positive and finite, got {self.scale:g}")
         require(self.fewest >= 1, f"suite.fewest must be at least 1 episode, got {self.fewest}")
 
 
@@ -59,7 +60,7 @@ class StoreConfig:
     def __post_init__(self):
         m = self.max_skipped
         require(
-            m >= 0 and (m < 1 or m == int(m)),
+            m >= 0 and (m < 1 or float(m).is_integer()),
             f"store.max_skipped must be a whole number of episodes or, below 1, a share of them, got {m:g}",
         )
 

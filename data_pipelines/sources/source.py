@@ -37,7 +37,7 @@ Corrupt = Literal["raise", "skip"]
 def count_skippable(limit: float, episodes: int) -> int:
     """How many of `episodes` may be left out: `limit`, or this share of them, rounded down, if it is below 1."""
     require(
-        limit >= 0 and (limit < 1 or limit == int(limit)),
+        limit >= 0 and (limit < 1 or float(limit).is_integer()),
         f"max_skipped must be a whole number of episodes or, below 1, a share of them, got {limit:g}",
     )
     return int(limit if limit >= 1 else limit * episodes)

@@ -83,7 +83,7 @@ def generate_suite(
     others are remade; each appears all at once.
     Raises ConfigError for bad arguments or a root that cannot be written.
     """
-    require(scale > 0, f"suite scale must be positive, got {scale}")
+    require(0 < scale < math.inf, f"suite scale must be positive and finite, got {scale}")
     require(validation >= 1, f"suite validation must be at least 1 episode, got {validation}")
     require(fewest >= 1, f"the fewest episodes of a dataset must be at least 1, got {fewest}")
     require(workers >= 1, f"suite workers must be at least 1, got {workers}")

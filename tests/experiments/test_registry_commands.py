@@ -115,6 +115,7 @@ def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsy
     [
         (["{robot}", "--entry", "x.toml"], 2, "add --hz"),
         (["{robot}", "--hz", "-3"], 2, "--hz must be positive"),
+        (["{robot}", "--hz", "nan"], 2, "--hz must be positive and finite, got nan"),
         (["{robot}", "--split", "test"], 2, "splits there: train"),
         (["{robot}/none"], 1, "no such directory"),
         (["{robot}", "--registry", "none.toml"], 2, "none.toml: the registry file cannot be read"),

@@ -118,6 +118,8 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("widths=4,8.5", "widths: expected int, got 8.5"),
         ("ablation_seeds=2,1", "ablation_seeds must increase"),
         ("tau=0", "tau must be positive, got 0"),
+        ("suite.scale=Infinity", "suite.scale must be positive and finite, got inf"),
+        ("store.max_skipped=Infinity", "store.max_skipped must be a whole number .* got inf"),
         ("flops_per_second=0", "flops_per_second must be positive"),
         ("trial_seconds=-1", "trial_seconds must not be negative"),
         ("designs.rate_factors=2,1", "designs.rate_factors must increase and be positive"),

@@ -140,6 +140,7 @@ def test_an_unknown_dataset_is_shown_and_its_entry_comes_next(toy, tmp_path, cap
     ("options", "code", "message"),
     [
         (("--hz", "0"), 2, "--hz must be positive"),
+        (("--hz", "inf"), 2, "--hz must be positive and finite, got inf"),
         (("--frames", "1"), 2, "--frames must be at least 2"),
         (("--shown", "9", "--episodes", "3"), 2, "--shown must lie between 1"),
         (("--split", "nonsense"), 2, "no split 'nonsense'"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json as jsonlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +17,7 @@ from experiments.cli.data.next_command import no_window, tokenize_command
 from experiments.progress import console, step, tidy_table
 from experiments.setting import use_entries
 from experiments.wrote import wrote
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
@@ -116,8 +117,7 @@ def data_inspect(
     from data_pipelines.registry.table import find_spec
     from experiments.contact_sheet import draw_sheet
 
-    if hz is not None and hz <= 0:
-        raise ConfigError(f"--hz must be positive, got {hz:g}")
+    require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     use_entries(registry)
     sheets = Path("runs") / "inspect"
     make_directory(out or sheets)

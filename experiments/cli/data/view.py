@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +57,7 @@ def view(
     """
     from experiments.report.data_page import draw_page
 
-    require(hz is None or hz > 0, f"--hz must be positive, got {hz}")
+    require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
     require(stride is None or stride >= 1, f"--stride must be at least 1, got {stride}")
     require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
     require(1 <= shown <= episodes, f"--shown must lie between 1 and --episodes {episodes}, got {shown}")

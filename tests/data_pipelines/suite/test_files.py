@@ -289,6 +289,7 @@ def test_sizes_go_evenly_in_the_logarithm_from_the_fewest_to_the_most():
     [
         ({"names": ["no_such_robot"]}, "unknown embodiment.*no_such_robot.*pusher_sand"),
         ({"scale": 0.0}, "scale must be positive"),
+        ({"scale": math.inf}, "scale must be positive and finite, got inf"),
         ({"workers": 0}, "workers must be at least 1"),
         ({"validation": 0}, "validation must be at least 1"),
     ],

@@ -314,7 +314,7 @@ def test_the_bound_may_be_a_share_of_the_episodes(directory, share, lost):
         dataset.skip(lost, EpisodeError("one too many"))
 
 
-@pytest.mark.parametrize("wrong", [1.5, -1, -0.1])
+@pytest.mark.parametrize("wrong", [1.5, -1, -0.1, float("inf"), float("nan")])
 def test_a_bound_that_is_neither_a_number_nor_a_share_is_refused(directory, wrong):
     with pytest.raises(ConfigError, match="max_skipped must be a whole number"):
         RldsDataset(directory, corrupt="skip", max_skipped=wrong)
