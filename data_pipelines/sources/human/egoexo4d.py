@@ -50,7 +50,8 @@ class EgoExo4dSource:
         settings.check()
         self.root, self.settings, self.camera = Path(root), settings, settings.camera
         self._poses = self.root / "annotations" / "ego_pose" / settings.split / "hand" / "automatic"
-        takes = _json(self.root / "takes.json", DataError)
+        root_advice = "Give the root of the dataset, with takes.json, takes and annotations."
+        takes = _json(self.root / "takes.json", DataError, root_advice)
         if not isinstance(takes, list) or not all(isinstance(t, dict) for t in takes):
             raise DataError(f"{self.root / 'takes.json'}: not a list of takes. Fetch it again.")
         for take in takes:
@@ -159,8 +160,8 @@ def _frame_number(text: str) -> int:
     return int(text)
 
 
-def _json(path: Path, kind: type[DataError]) -> Any:
+def _json(path: Path, kind: type[DataError], advice: str = ADVICE) -> Any:
     try:
         return json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise kind(f"{path} cannot be read ({error}). {ADVICE}") from error
+        raise kind(f"{path} cannot be read ({error}). {advice}") from error
