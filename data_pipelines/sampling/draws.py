@@ -29,7 +29,8 @@ class Draws:
 
     def __init__(self, weights: Sequence[float], seed: int | str):
         rest = np.cumsum(np.asarray(weights, np.float64)[::-1])[::-1]  # of a dataset and those after it
-        shares = np.minimum(np.asarray(weights) / rest, 1.0)
+        nothing = np.zeros(len(rest))  # where no weight is left: those before take all there is
+        shares = np.minimum(np.divide(weights, rest, out=nothing, where=rest > 0), 1.0)
         shares[-1] = 1.0
         self._shares = [round(float(share) * (1 << _BITS)) for share in shares]
         self._seed = stream_seed("mixture", seed)

@@ -34,6 +34,13 @@ def test_nothing_left_is_an_error_with_all_reasons():
         make_mixture({"a": 0, "b": 0}, 3.0, {"a": "too short"})
 
 
+@pytest.mark.parametrize("tau", [0.01, 0.001])
+def test_the_smallest_temperatures_draw_the_largest_alone(tau):
+    """Where the powers of the others, or of all, are too small for a number."""
+    assert mixture_weights([10, 10**6, 10], tau).tolist() == [0, 1, 0]
+    assert mixture_weights([5, 5, 5, 0], tau).tolist() == pytest.approx([1 / 3, 1 / 3, 1 / 3, 0])
+
+
 def test_temperature_must_be_positive():
     with pytest.raises(ConfigError, match="tau must be positive"):
         mixture_weights([1, 2], 0)
