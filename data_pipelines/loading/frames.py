@@ -60,7 +60,7 @@ def make_frame_loader(
     require(batch >= 1, f"batch must be at least 1, got {batch}")
     require(split in ("train", "val"), f"split must be 'train' or 'val', got {split!r}")
     require(len(datasets) >= 1, "no dataset was given to take frames from")
-    streams, counts, files = {}, {}, OpenFiles()
+    streams, counts, reasons, files = {}, {}, {}, OpenFiles()
     for spec, directory in datasets:
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
@@ -69,10 +69,13 @@ def make_frame_loader(
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):
+            reasons[spec.name] = f"it has no {split} episode"
+            if split == "val":
+                reasons[spec.name] += f": of {len(mask)} none is held out, which takes two and a max_val above 0"
             continue
         order = stream_seed(seed, "frames", split, spec.name)
         streams[spec.name] = _Stream(source, spec.image_key, episodes, order)
-    mixture = make_mixture(counts, tau, dict.fromkeys(counts, f"it has no {split} episode"))
+    mixture = make_mixture(counts, tau, reasons)
     group = math.gcd(batch, FRAMES_PER_READ)
     draws = Draws(mixture.weights, f"frames/{split}/{seed}")
     batches = _Batches(tuple(streams[n] for n in mixture.names), draws, batch, group, image_size)

@@ -114,6 +114,7 @@ def make_tokenizer(
             corrupt=settings.corrupt, max_skipped=settings.max_skipped,
         )  # fmt: skip
 
+    held_out = frames(0, "val")  # there are some, or it is said before hours of training
     aside = workspace.root / f"tokenizer.{made_from.id}"  # never resumed with other inputs
     with step("train the tokenizer") as update:
         tokenizer = train_tokenizer(
@@ -122,7 +123,7 @@ def make_tokenizer(
             progress=lambda done, total, metrics: update(done, total, f"PSNR {metrics['psnr']:.1f} dB"),
             records=lambda index: frames(0).describe(index),
         )  # fmt: skip
-        quality = reconstruction_psnr(tokenizer, frames(0, "val"))
+        quality = reconstruction_psnr(tokenizer, held_out)
     console.print(f"its reconstruction of held-out frames: {quality.mean:.2f} ± {quality.sem:.2f} dB PSNR")
     write_file(aside / QUALITY, json.dumps(dataclasses.asdict(quality)))
     made_from.save(aside)
