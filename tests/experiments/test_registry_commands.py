@@ -116,6 +116,8 @@ def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsy
         (["{robot}", "--entry", "x.toml"], 2, "add --hz"),
         (["{robot}", "--hz", "-3"], 2, "--hz must be positive"),
         (["{robot}", "--hz", "nan"], 2, "--hz must be positive and finite, got nan"),
+        (["{robot}", "--frames", "0"], 2, "--frames must be at least 2, got 0"),
+        (["{robot}", "--episodes", "0"], 2, "--episodes must be at least 1, got 0"),
         (["{robot}", "--split", "test"], 2, "splits there: train"),
         (["{robot}/none"], 1, "no such directory"),
         (["{robot}", "--registry", "none.toml"], 2, "none.toml: the registry file cannot be read"),

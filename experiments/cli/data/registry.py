@@ -118,6 +118,8 @@ def data_inspect(
     from experiments.contact_sheet import draw_sheet
 
     require(hz is None or 0 < hz < math.inf, f"--hz must be positive and finite, got {hz}")
+    require(episodes >= 1, f"--episodes must be at least 1, got {episodes}")
+    require(frames >= 2, f"--frames must be at least 2, got {frames}: a window is a first frame and what follows")
     use_entries(registry)
     sheets = Path("runs") / "inspect"
     make_directory(out or sheets)
