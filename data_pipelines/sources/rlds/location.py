@@ -17,7 +17,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
 
 from data_pipelines.errors import DataError, UnreachableError
 from hma_jax.config import ConfigError
@@ -226,6 +226,17 @@ def retried(location: Location, request: Callable[[], T]) -> T:
                 ) from error
             time.sleep(wait * random.uniform(0.5, 1.5))
     raise AssertionError("unreachable")
+
+
+def is_there(location: Location, kind: Literal["file", "directory"]) -> bool:
+    """Whether a file or a directory is there. Raises UnreachableError where nobody can tell."""
+    found = retried(location, location.is_dir if kind == "directory" else location.is_file)
+    if found or not is_remote(location):
+        return found
+    try:  # a store that fails says No to the question above
+        return retried(location, lambda: location.fs.info(location.path))["type"] == kind
+    except FileNotFoundError:
+        return False
 
 
 def is_failure(error: Exception) -> bool:

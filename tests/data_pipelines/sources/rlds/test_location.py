@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+
 import numpy as np
 import pytest
 
@@ -117,6 +119,24 @@ def test_store_that_does_not_answer_costs_no_episode(remote, tmp_path, monkeypat
     monkeypatch.setenv("HMA_CACHE_DIR", str(tmp_path / "empty"))
     with pytest.raises(UnreachableError):
         RldsDataset(remote, corrupt="skip")
+
+
+def test_a_store_that_cannot_be_asked_is_not_said_to_have_no_dataset(remote, monkeypatch):
+    """Of a failing store fsspec says that there is no such file or directory."""
+    monkeypatch.setattr(location, "RETRY_WAITS", (0.0, 0.0))
+    working, failures = remote.fs.info, [1]
+
+    def info(*args, **options):
+        if failures[0]:
+            failures[0] -= 1
+            raise OSError(errno.ECONNRESET, "reset by peer")
+        return working(*args, **options)
+
+    monkeypatch.setattr(remote.fs, "info", info)
+    assert len(RldsDataset("memory://bucket/data/toy")) == 6
+    failures[0] = 10**6
+    with pytest.raises(UnreachableError, match="memory://bucket/data/toy: cannot be read .*reset by peer"):
+        RldsDataset("memory://bucket/data/toy")
 
 
 @pytest.mark.parametrize("whole", [0, 2**20])
