@@ -280,7 +280,7 @@ def _shown(i: int, steps: int, record: dict, times: tuple[int, ...], looked: dic
     found = (record.get(key, ()) for key in INSTRUCTION_KEYS)
     text = next((values[0] for values in found if len(values) and isinstance(values[0], bytes)), b"")
     success = record.get(SUCCESS_KEY)
-    known = success is not None and len(success) == 1
+    known = isinstance(success, np.ndarray) and len(success) == 1
     flag = bool(success[0]) if known else None
     return Shown(i, steps, flag, text.decode(errors="replace"), times, shrink(looked), actions)
 

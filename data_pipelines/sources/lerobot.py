@@ -88,9 +88,6 @@ class LeRobotSource:
         times = self.times(table, where)
         images = {key: self._images(entry, name, table, times, where) for key, name in self.cameras.items()}
         vectors = {key: self.numbers(table, name, where) for key, name in self.vectors.items()}
-        success = None
-        if SUCCESS in self.meta.features:
-            success = bool(self.numbers(table, SUCCESS, where)[-1].any())
         has_reward = REWARD in table.column_names
         yield Episode(
             origin=f"{self.root.name}/episode_{entry.index:06d}",
@@ -98,7 +95,7 @@ class LeRobotSource:
             vectors=vectors,
             instructions=self.texts(entry, table, where),
             rewards=self.numbers(table, REWARD, where)[:, 0] if has_reward else None,
-            success=success,
+            success=self.success(table, where),
         )
 
     def rows(self, entry: EpisodeEntry) -> Any:
@@ -192,6 +189,13 @@ class LeRobotSource:
                 f"{where}: {shown(name)} is not one array of numbers per row ({error}). {ADVICE}"
             ) from error
         return rows.reshape(len(rows), -1)
+
+    def success(self, table: Any, where: str) -> bool | None:
+        """Of the episode's last row; None where it does not say."""
+        if SUCCESS not in table.column_names:
+            return None
+        last = self.numbers(table, SUCCESS, where)[-1]
+        return bool(last.any()) if np.isfinite(last).all() else None
 
     def texts(self, entry: EpisodeEntry, table: Any, where: str) -> list[str]:
         if "task_index" not in table.column_names or not self.meta.tasks:

@@ -19,7 +19,7 @@ import numpy as np
 from data_pipelines.errors import EpisodeError
 from data_pipelines.names import shown
 from data_pipelines.sources.identity import EpisodeRun
-from data_pipelines.sources.lerobot import SUCCESS, LeRobotSource
+from data_pipelines.sources.lerobot import LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
@@ -112,7 +112,7 @@ class LeRobotDataset(EpisodeSource):
                 table, times = None, np.arange(steps) / self.hz
             else:
                 table = self._table(i)
-                steps, times, success = table.num_rows, self._read.times(table, where), self._success(table, where)
+                steps, times, success = table.num_rows, self._read.times(table, where), self._read.success(table, where)
                 fields = {field_slice(key)[0] for key in keys}
                 record = {f: self._read.numbers(table, self._vectors[f], where) for f in fields}
                 actions = join_actions(
@@ -132,7 +132,7 @@ class LeRobotDataset(EpisodeSource):
                 found[key] = _Frames(self, entry, self._cameras[key], table, times, where)
             elif key == INSTRUCTION_KEY:
                 found[key] = [text.encode() for text in self._read.texts(entry, table, where)]
-            elif key == SUCCESS_KEY and (success := self._success(table, where)) is not None:
+            elif key == SUCCESS_KEY and (success := self._read.success(table, where)) is not None:
                 found[key] = np.array([success], np.int64)
         return found
 
@@ -148,9 +148,6 @@ class LeRobotDataset(EpisodeSource):
                 "Fetch the dataset again, or leave the episode out with corrupt='skip'."
             ).at(entry.data, -1)
         return table
-
-    def _success(self, table: Any, where: str) -> bool | None:
-        return bool(self._read.numbers(table, SUCCESS, where)[-1].any()) if SUCCESS in table.column_names else None
 
     def _fetch(
         self, stack: ExitStack, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str

@@ -261,6 +261,8 @@ def join_actions(
                 f"{key!r} has {np.size(values)} values, but {steps} frames of {size} need "
                 f"{steps * size}. Repair the episode, or read with corrupt='skip'."
             )
+        if values.dtype.kind not in "biuf":
+            raise unusable(f"{key!r} holds no numbers, but {values.dtype}. Repair the episode, or read with corrupt='skip'.")
         values = values.reshape(steps, size).astype(np.float32)
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():

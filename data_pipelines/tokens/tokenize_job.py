@@ -93,7 +93,7 @@ def tokenize_dataset(
     )  # fmt: skip
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
-        LostEpisodes(reason.replace(f"{source.location}/", ""), episodes=count)
+        LostEpisodes(_without_place(reason, source), episodes=count)
         for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
@@ -159,6 +159,13 @@ def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:
         factor_vocab=tokenizer.factor_vocab,
         channels=tokenizer.channels,
     )
+
+
+def _without_place(reason: str, source: EpisodeSource) -> str:
+    """A message that is the same wherever the source lies, as a directory or as one file."""
+    place, name = str(source.location), source.location.name
+    inside = reason.replace(f"{place}/", "")
+    return inside.replace(place, name) if name else inside  # "." has none
 
 
 def _cores() -> int:
@@ -247,6 +254,5 @@ class _Work:
     def _lose(self, error: EpisodeError) -> LostEpisodes:
         if self._source.corrupt == "raise":
             raise error
-        reason = str(error).replace(f"{self._source.location}/", "")
         place = (error.path.name, error.offset) if error.path is not None else ("", -1)
-        return LostEpisodes(reason, *place)
+        return LostEpisodes(_without_place(str(error), self._source), *place)

@@ -123,7 +123,7 @@ class RldsDataset(EpisodeSource):
                 record, action_keys, self.features, len(encoded), lambda what: self._unusable(i, what)
             )
             success = record.get(SUCCESS_KEY)
-            known = success is not None and len(success) == 1
+            known = isinstance(success, np.ndarray) and len(success) == 1  # a text, "False" too, says nothing here
             yield OpenEpisode(
                 i,
                 actions,

@@ -98,6 +98,46 @@ def test_robomimic_is_read_where_it_lies(tmp_path):
     assert some.episode(0, VIEW.image_key, ()).steps == 23 and some.ids.tolist() == [open_source(path).ids[1]]
 
 
+def test_what_is_lost_of_a_robomimic_file_does_not_say_where_it_lies(tmp_path):
+    """The hash of a token store covers it."""
+
+    def spoil(file):
+        del file["data/demo_10/obs"]
+
+    made = []
+    for place in ("here", "there"):
+        (tmp_path / place).mkdir()
+        path = write_robomimic(tmp_path / place / "image.hdf5", lengths=(5, 7, 4, 6), change=spoil)
+        made.append(tokenize_dataset(VIEW, path, FakeTokenizer(), tmp_path / place / "store", corrupt="skip"))
+    assert made[0].skipped[0].reason.startswith("image.hdf5: data/demo_10/obs/agentview_image is not there")
+    assert made[0].hash() == made[1].hash()
+
+
+def test_actions_that_are_texts_are_damage(tmp_path):
+    def spoil(file):
+        del file["data/demo_10/actions"]
+        file["data/demo_10/actions"] = np.full((7, 7), b"left")
+
+    source = open_source(write_robomimic(tmp_path / "image.hdf5", change=spoil))
+    with pytest.raises(EpisodeError, match="demo_10: 'steps/action' holds no numbers, but [|]S4"):
+        source.episode(1, VIEW.image_key, VIEW.action_keys)
+
+
+def test_a_success_that_is_not_said_is_unknown(tmp_path):
+    import pyarrow as pa
+
+    def forget(episode, rows):
+        rows["next.success"] = pa.array([None] * len(rows["timestamp"]), pa.bool_())
+
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1", change=forget)
+    assert open_source(root).episode(0, TOP.image_key, TOP.action_keys).success is None
+    texts = {"episode_metadata/success": [b"False"]}
+    spec = make_spec("said")
+    rlds = write_rlds(tmp_path, spec, [9] * 2, change=lambda _, features: features.update(texts))
+    assert open_source(rlds).episode(0, spec.image_key, ()).success is None
+    assert [shown.success for source in (root, rlds) for shown in inspect_dataset(source).shown] == [None] * 4
+
+
 def as_array_records(directory):
     """The same RLDS directory with ArrayRecord shards, as tfds writes them."""
     from array_record.python.array_record_module import ArrayRecordWriter
