@@ -23,7 +23,7 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
     """The entries of a file. ConfigError, naming file and entry, for anything that is none."""
     path = Path(path)
     try:
-        tables = tomllib.loads(path.read_text())
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: the registry file cannot be read ({error.strerror})") from error
     except ValueError as error:  # of which TOMLDecodeError and UnicodeDecodeError are kinds
@@ -47,6 +47,6 @@ def to_toml(spec: DatasetSpec) -> str:
     for field in dataclasses.fields(DatasetSpec)[1:]:
         value = getattr(spec, field.name)
         if value != field.default:
-            # JSON's strings, numbers, booleans and lists are TOML's too.
-            lines.append(f"{field.name} = {json.dumps(value)}")
+            # JSON's strings, numbers, booleans and lists are TOML's too, but for its escapes of rare characters.
+            lines.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join(lines) + "\n"

@@ -211,8 +211,9 @@ def test_unknown_name_suggests_the_closest():
 
 
 def test_entry_survives_its_toml_file(tmp_path):
-    for spec in all_specs():
-        (tmp_path / "one.toml").write_text(to_toml(spec))
+    rare = DatasetSpec("rare", "observation/\U0001f916", ("action\u00e9",), (7,), 10)
+    for spec in (*all_specs(), rare):
+        (tmp_path / "one.toml").write_text(to_toml(spec), encoding="utf-8")
         assert load_entries(tmp_path / "one.toml") == (spec,)
 
 
