@@ -132,18 +132,16 @@ def scan_shard(path: str | Location) -> tuple[ShardIndex, CorruptRecordError | N
     return index, damage
 
 
-def read_record(path: str | Location, offset: int, length: int, verify: bool = True) -> bytes:
+def read_record(path: str | Location, offset: int, length: int) -> bytes:
     """The payload of `length` bytes of the record that starts at byte `offset` of `path`.
 
-    Raises CorruptRecordError if the file is shorter than its index says or, with `verify`,
-    if the payload does not match its checksum.
+    Raises CorruptRecordError if the file is shorter than its index says or if the payload does not match its checksum.
     """
     path = locate(path)
     with open_ranges(path) as file:
         body = _read(file, path, offset, offset + HEADER, length + FOOTER)
     payload = body[:length]
-    if verify:
-        _verify(masked_crc32c(payload), body[length:], path, offset)
+    _verify(masked_crc32c(payload), body[length:], path, offset)
     return payload
 
 
