@@ -1,12 +1,13 @@
 """Trains a model of forty robots on several meshes of the devices at hand; prints a JSON line.
 
-Arguments: the kind of model ("ids", "latents", "attended": ids, actions entering by cross-attention, or "kept":
-ids, nothing computed twice), the number of steps, the number of robots and the meshes, each as "data,fsdp,tensor".
+Arguments: the kind of model ("ids", "latents", "attended": ids, actions entering by cross-attention, "kept": ids,
+nothing computed twice, or "recipe": latents with recall and Muon, as the continuous study has them), the number of steps, the number of robots and the meshes, each as "data,fsdp,tensor".
 """
 
 import json
 import math
 import sys
+from dataclasses import replace
 
 import jax
 
@@ -36,12 +37,18 @@ def make_table(robots: int) -> EmbodimentTable:
 
 def make_model(kind: str) -> ModelConfig:
     """More layers than are written out one after the other (`model.trunk.UNROLLED`)."""
-    changes = {"latents": {"diffusion": LATENTS}, "attended": {"conditioning": "cross_attention"}}
+    changes = {
+        "latents": {"diffusion": LATENTS},
+        "recipe": {"diffusion": LATENTS, "recall": True},
+        "attended": {"conditioning": "cross_attention"},
+    }
     return model_config(width=32, heads=8, layers=5, frames=4, tokens=4, **changes.get(kind, {}))
 
 
 def train(kind: str, mesh: tuple[int, int, int], steps: int, robots: int) -> dict:
-    model, table, config = make_model(kind), make_table(robots), train_config(steps=steps, batch=BATCH, optimizer=FAST)
+    model, table = make_model(kind), make_table(robots)
+    optimizer = replace(FAST, matrices="muon") if kind == "recipe" else FAST
+    config = train_config(steps=steps, batch=BATCH, optimizer=optimizer)
     mesh_config = MeshConfig(*mesh, min_shard_size=1)
     execution = ExecutionConfig(remat="none" if kind == "kept" else "everything", mesh=mesh_config)
     declared = declare_model(model, table, execution)

@@ -68,6 +68,11 @@ def test_values_that_are_kept_for_the_backward_pass_are_those_of_one_device():
 
 
 @pytest.mark.slow
+def test_latents_with_recall_and_muon_train_on_every_axis_of_the_mesh_as_on_one_device():
+    check_forty_robots("recipe", 10, ("2,2,2",))
+
+
+@pytest.mark.slow
 def test_a_run_goes_on_on_another_mesh(tmp_path: Path):
     def train(devices: int, mesh: str, name: str, steps: int) -> Any:
         return run_on(devices, "train_on_mesh", mesh, str(tmp_path / name), str(steps))
