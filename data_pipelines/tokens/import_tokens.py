@@ -106,7 +106,7 @@ def _plan(
         )
     name = name or train.name
     known = find_spec(name)
-    rate = hz or (known and known.hz)
+    rate = known.hz if hz is None and known is not None else hz
     require(
         rate is not None,
         f"{name!r} is not in the registry, so its rate is unknown: give --hz, in native frames per second "

@@ -38,7 +38,7 @@ one part each, 72 thousand frames are read per second on one core, of 25 parts e
 class TokenStore:
     """Opens every dataset under `root`. Thread-safe; pickles (files are reopened).
 
-    Raises DataError if `root` is no store or a manifest is damaged.
+    Raises DataError if `root` is no store, a manifest is damaged, or a dataset lies under another name than its own.
     """
 
     def __init__(self, root: str | Path):
@@ -49,6 +49,12 @@ class TokenStore:
         if not found:
             raise DataError(f"{self.root}: no dataset in this token store. Tokenise datasets into it first.")
         self._manifests = {directory.name: load_manifest(directory / FILE) for directory in found}
+        for directory, manifest in zip(found, self._manifests.values(), strict=True):
+            if directory.name != manifest.spec.name:
+                raise DataError(
+                    f"{directory}: it holds the dataset {manifest.spec.name!r}, whose name it must bear in a token store. "
+                    "Rename it, or move a copy out of the store."
+                )
         self._start()
 
     @property

@@ -145,6 +145,8 @@ def test_the_rate_comes_from_the_user_or_the_registry_never_from_the_folder(tmp_
         import_tokens(*pair, tmp_path / "store")
     manifest = import_tokens(*pair, tmp_path / "store", name="unitree_g1_sample")
     assert manifest.spec.hz == 30 and manifest.spec.stride == 15
+    with pytest.raises(ConfigError, match="hz, the native rate, must be positive and finite, got 0"):
+        import_tokens(*pair, tmp_path / "store", name="unitree_g1_sample", hz=0)
 
 
 class Decoder:

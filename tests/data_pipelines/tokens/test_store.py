@@ -104,6 +104,13 @@ def test_unknown_dataset_lists_those_there(store):
         store.manifest("leg")
 
 
+def test_a_copy_under_another_name_is_named(store_root, tmp_path):
+    for name in ("arm", "arm_before"):
+        shutil.copytree(store_root / "arm", tmp_path / name)
+    with pytest.raises(DataError, match="arm_before: it holds the dataset 'arm'.*move a copy out of the store"):
+        TokenStore(tmp_path)
+
+
 def test_missing_or_empty_store(tmp_path):
     with pytest.raises(DataError, match="no such token store"):
         TokenStore(tmp_path / "absent")
