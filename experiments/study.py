@@ -74,7 +74,8 @@ class StoreConfig:
             f"store.max_val_fraction must lie in (0, 0.5], got {self.max_val_fraction:g}",
         )
         require(
-            self.frame_step is None or self.frame_step >= 1, f"store.frame_step must be at least 1, got {self.frame_step}"
+            self.frame_step is None or self.frame_step >= 1,
+            f"store.frame_step must be at least 1, got {self.frame_step}",
         )
 
 

@@ -230,7 +230,8 @@ def _check_names(features: Mapping[str, dict[str, Any]], path: Path) -> None:
         other = named.setdefault(name, key)
         if other != key:
             raise DataError(
-                f"{path}: the features {shown(other)} and {shown(key)} would both be called {name!r}. Rename one of them."
+                f"{path}: the features {shown(other)} and {shown(key)} would both be called {name!r}. "
+                "Rename one of them."
             )
 
 

@@ -177,7 +177,8 @@ def _env_args(path: Path, text: Any) -> dict[str, Any]:
     try:
         args = json.loads(text)
     except (ValueError, TypeError) as error:  # the latter of an attribute that is no text
-        raise DataError(f"{path}: the attribute env_args of 'data' is no JSON ({error}). Fetch the file again.") from error
+        message = f"{path}: the attribute env_args of 'data' is no JSON ({error}). Fetch the file again."
+        raise DataError(message) from error
     return args if isinstance(args, dict) else {}
 
 
@@ -187,7 +188,8 @@ def _control_rate(path: Path, args: dict[str, Any]) -> float:
     rate = (kwargs.get("control_freq") if isinstance(kwargs, dict) else None) or CONTROL_RATE
     if type(rate) not in (int, float) or not 0 < rate < math.inf:
         raise DataError(
-            f"{path}: the attribute env_args of 'data' says control_freq {shown(rate)}, which is no rate in Hz. Correct it."
+            f"{path}: the attribute env_args of 'data' says control_freq {shown(rate)}, which is no rate in Hz. "
+            "Correct it."
         )
     return rate
 

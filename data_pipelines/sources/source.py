@@ -92,8 +92,8 @@ class EpisodeSource(ABC):
 
     Damage: with corrupt="raise" every damaged part is an error. With "skip", what can be read is
     listed, `skip` accepts unusable episodes, and all losses are counted in `skipped`; more than
-    `max_skipped` of them (below 1: more than this share of `runs`) raise DataError. A place that cannot be read at all is no damage: it
-    raises UnreachableError under both.
+    `max_skipped` of them (below 1: more than this share of `runs`) raise DataError. A place that cannot be
+    read at all is no damage: it raises UnreachableError under both.
     """
 
     name: str
@@ -262,7 +262,8 @@ def join_actions(
                 f"{steps * size}. Repair the episode, or read with corrupt='skip'."
             )
         if values.dtype.kind not in "biuf":
-            raise unusable(f"{key!r} holds no numbers, but {values.dtype}. Repair the episode, or read with corrupt='skip'.")
+            what = f"{key!r} holds no numbers, but {values.dtype}"
+            raise unusable(f"{what}. Repair the episode, or read with corrupt='skip'.")
         values = values.reshape(steps, size).astype(np.float32)
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():

@@ -52,8 +52,8 @@ class TokenStore:
         for directory, manifest in zip(found, self._manifests.values(), strict=True):
             if directory.name != manifest.spec.name:
                 raise DataError(
-                    f"{directory}: it holds the dataset {manifest.spec.name!r}, whose name it must bear in a token store. "
-                    "Rename it, or move a copy out of the store."
+                    f"{directory}: it holds the dataset {manifest.spec.name!r}, whose name it must bear in a token "
+                    "store. Rename it, or move a copy out of the store."
                 )
         self._start()
 

@@ -62,7 +62,7 @@ def test_more_are_taken_from_episodes_once_each_has_given_one_then_from_training
 
 
 def test_finding_some_costs_no_more_where_there_are_many_windows(tmp_path, monkeypatch):
-    """Training has millions: of those that are not chosen none is located, and of episodes the actions alone are kept."""
+    """Training has millions: those that are not chosen are not located, and of episodes the actions alone are kept."""
     store = small_store(tmp_path, lengths=(20,) * 8, min_val=2, max_val_fraction=0.25)
     (name,) = store.names
     others = OtherWindows(store, {name: make_cut(store, name, 4, 2.0)}, 4, 2.0, 0)
