@@ -39,10 +39,13 @@ def trace(roots: Iterable[str], root: Path = ROOT) -> dict[str, str]:
     if strangers:
         raise ValueError(f"{root}: no module {', '.join(strangers)}")
     found: dict[str, str] = {}
-    waiting = list(roots)
+    waiting, seen = list(roots), set()
     while waiting:
         name = waiting.pop()
-        path = None if name in found else _file(name, root)
+        if name in seen:
+            continue
+        seen.add(name)
+        path = _file(name, root)
         if path is None:
             continue
         source = _read(path.read_bytes())

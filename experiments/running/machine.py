@@ -7,6 +7,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,10 @@ def describe_machine(devices: Sequence[Any] = ()) -> dict[str, Any]:
     }
 
 
+@cache
 def git_commit() -> str:
-    """The commit of the sources, marked when the work tree differs from it; '' outside git."""
+    """The commit of the sources, marked when the work tree differs from it; '' outside git. As it was when a process
+    first asked: what it runs was loaded then."""
     root = Path(__file__).resolve().parent.parent
 
     def git(*arguments: str) -> str:

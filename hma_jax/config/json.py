@@ -7,6 +7,7 @@ nothing here knows a field by name.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import types
@@ -35,7 +36,7 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
     Unknown and missing keys, values of the wrong kind and choices that are not on offer raise
     ConfigError naming the field.
     """
-    hints = typing.get_type_hints(cls)
+    hints = _hints(cls)
     known = {f.name: f for f in dataclasses.fields(cls)}
     where = where or cls.__name__
     require(isinstance(values, dict), f"{where}: expected named fields ({', '.join(known)}), got {values!r}")
@@ -50,6 +51,9 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
     ]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
     return cls(**{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
+
+
+_hints = functools.cache(typing.get_type_hints)  # by class; thousands are read
 
 
 def _decode(hint: Any, value: Any, where: str) -> Any:
