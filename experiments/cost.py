@@ -1,28 +1,30 @@
 """What a study will cost, before it runs: parameters, FLOPs and a time estimate per trial.
 
 Needs no data and no device: action sizes come from the registry, parameter counts from the declared
-model without making an array. Rates and times are those of the preset's machine (`Study.flops_per_second`,
-`Study.trial_seconds`). What trials have in common is counted once; what is made before the first one is estimated in
-`preparing_cost`.
+model without making an array. The rate of a device and times are those of the preset's machine
+(`Study.flops_per_second`, `Study.trial_seconds`); several devices are taken to be as many times faster. What trials have
+in common is counted once; what is made before the first one is estimated in `preparing_cost`.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from experiments.preparing_cost import describe, estimate_preparing
+from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
 from experiments.progress import tidy_table
 from experiments.running.provenance import Provenance
 from experiments.running.shared_runs import share_runs
 from experiments.running.trial import Trial, trial_id
+from experiments.running.run_options import UNWATCHED
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
-from hma_jax.config import ModelConfig
+from hma_jax.config import MeshConfig, ModelConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 if TYPE_CHECKING:
@@ -128,31 +130,63 @@ class TrialPlan:
     seconds: float
 
 
-def plan_trials(study: Study, sweeps: Sequence[Sweep]) -> dict[str, TrialPlan]:
-    """Every trial of `sweeps` by id."""
+@dataclass(frozen=True)
+class Devices:
+    """What trials are computed on."""
+
+    each: float = 1.0  # of a trial; below 1: several trials share one
+    at_once: int | None = 1  # trials at a time; None: the cluster says
+
+
+def devices_of(mesh: MeshConfig, share: float | None) -> float:
+    """The devices that a program uses of its `share`; where nobody says that, as many as the mesh takes at least.
+
+    Raises ConfigError for a mesh that does not fit them, as training would.
+    """
+    from hma_jax.runtime.mesh import mesh_sizes
+
+    share = share or float(mesh.least)
+    mesh_sizes(mesh, math.ceil(share))
+    return share
+
+
+def plan_trials(
+    study: Study, sweeps: Sequence[Sweep], devices: float = 1.0, evaluated: bool = True
+) -> dict[str, TrialPlan]:
+    """Every trial of `sweeps` by id, each on so many `devices`. `evaluated`: not only trained."""
     trials = unique_trials(sweeps, UNKNOWN)
     shared = share_runs(trials)
     plans = {}
     for id, trial in trials.items():
         cost = estimate(trial)
+        whole = cost.flops if evaluated else cost.train_flops
         begun = max((step for _, step in shared[id].before), default=0) / trial.train.steps
-        flops = cost.flops - begun * cost.train_flops
-        plans[id] = TrialPlan(trial, cost, flops, flops / study.flops_per_second + study.trial_seconds)
+        flops = whole - begun * cost.train_flops
+        plans[id] = TrialPlan(trial, cost, flops, flops / (devices * study.flops_per_second) + study.trial_seconds)
     return plans
 
 
-def plan_table(study: Study, sweeps: Sequence[Sweep], given: bool = False, trained: bool = True, workers: int = 1) -> Table:
+def plan_table(
+    study: Study,
+    sweeps: Sequence[Sweep],
+    devices: Devices = Devices(),
+    *,
+    given: bool = False,
+    trained: bool = True,
+    evaluated: bool = True,
+) -> Table:
     """Every trial once, with the axes it belongs to, its size and its cost. `given`: the user has the data, `trained`:
-    the tokenizer is trained here, `workers`: so many trials at a time."""
-    plans = plan_trials(study, sweeps)
+    the tokenizer is trained here, `evaluated`: trials are judged, not only trained."""
+    plans = plan_trials(study, sweeps, devices.each, evaluated)
     several = len({plan.trial.train.steps for plan in plans.values()}) > 1
     budget = f"{all_steps(sweeps)} steps x batch {study.train.batch}"
     table = tidy_table(
-        f"Study '{study.name}': {len(plans)} trials of {budget}",
+        f"Study '{study.name}': {len(plans)} trial{'s' * (len(plans) != 1)} of {budget}",
         "trial", "sets", "videos", "width", *["steps"] * several, "params", "one robot", "FLOPs", "time",
     )  # fmt: skip
     table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
-    table.caption = _caption(study, list(plans.values()), given, trained, workers)
+    before = estimate_preparing(study, simulated=not given, trained=trained)
+    table.caption = _caption(study, list(plans.values()), devices, before, evaluated)
     seeds = {p.trial.train.seed for p in plans.values()}
     shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in seeds}
     axes = _axes(sweeps)
@@ -173,21 +207,46 @@ def plan_table(study: Study, sweeps: Sequence[Sweep], given: bool = False, train
     return table
 
 
-def _caption(study: Study, plans: Sequence[TrialPlan], given: bool, trained: bool, workers: int) -> str:
+def _caption(
+    study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool
+) -> str:
     """What it all comes to, and of what."""
-    trials, flops = sum(p.seconds for p in plans), sum(p.flops for p in plans)
-    before = estimate_preparing(study, simulated=not given, trained=trained)
-    alone = max(p.seconds for p in plans)
+    from hma_jax.runtime.audit import size_of
+
+    trials, flops, alone = sum(p.seconds for p in plans), sum(p.flops for p in plans), max(p.seconds for p in plans)
+    workers = devices.at_once or 1
     spent = max(trials / workers, alone)
-    at_once = "one after the other" if workers == 1 else f"{workers} at a time"
+    if len(plans) == 1:
+        what = "to train" if not evaluated else "for the trial"
+    elif devices.at_once is None:
+        what = f"for the trials, one after the other; {_duration(alone)} if the cluster runs all at a time"
+    else:
+        what = f"for the trials, {'one after the other' if workers == 1 else f'{workers} at a time'}"
+    if before.unknown:
+        whole = f"About {_duration(spent)} {what}, and what it takes to prepare: {describe(before, _duration)}"
+    else:
+        whole = (
+            f"About {_duration(before.seconds + spent)} in all: {_duration(before.seconds)} to prepare "
+            f"({describe(before, _duration)}) and {_duration(spent)} {what}"
+        )
+    number = devices.each * workers
+    each = f", {devices.each:g} for each trial," if workers > 1 else ""
+    hours = devices.each * trials / 3600
+    judged = "to train and to evaluate, sampler steps included" if evaluated else "to train"
     return (
-        f"About {_duration(before.seconds + spent)} in all: {_duration(before.seconds)} to prepare "
-        f"({describe(before, _duration)}) and {_duration(spent)} for the trials, {at_once}: {_flops(flops)} at "
-        f"{_flops(study.flops_per_second)}/s (flops_per_second) to train and to evaluate, sampler steps included, and "
-        f"{study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). What trials have in "
+        f"{whole}. {_flops(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
+        f"{_flops(study.flops_per_second)}/s each (flops_per_second); {hours:,.{0 if hours >= 100 else 1}f} device-hours "
+        f"with {study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). "
+        f"Checkpoints: {size_of(sum(map(checkpoint_bytes, plans)))}. What trials have in "
         "common is counted once. 'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are "
         "per dataset. 'Control': trained on shuffled actions."
     )
+
+
+def checkpoint_bytes(plan: TrialPlan) -> int:
+    """Of what a finished trial leaves: weights and two moments in float32, and their average where there is one."""
+    copies = 3 + (plan.trial.train.ema_decay > 0)
+    return UNWATCHED.keep_checkpoints * copies * 4 * plan.cost.parameters
 
 
 def _axes(sweeps: Sequence[Sweep]) -> dict[str, str]:

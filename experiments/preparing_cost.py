@@ -33,6 +33,7 @@ class PreparingCost:
     tokenizer: float = 0.0
     tokens: float = 0.0
     unknown: tuple[str, ...] = field(default=())  # datasets of which nobody says how many frames they have
+    datasets: int = 0  # those too
 
     @property
     def seconds(self) -> float:
@@ -59,6 +60,7 @@ def estimate_preparing(study: Study, simulated: bool = True, trained: bool = Tru
         tokenizer=training + QUALITY_FRAMES * step / 3 / rate if trained and step else 0.0,
         tokens=kept * (encode / rate + 1 / DECODED),
         unknown=tuple(name for name, frames in counts.items() if frames is None),
+        datasets=len(counts),
     )
 
 
@@ -115,7 +117,10 @@ def describe(cost: PreparingCost, duration: Callable[[float], str]) -> str:
     """In words; `duration` writes seconds."""
     parts = {"simulating": cost.simulating, "the tokenizer": cost.tokenizer, "tokens": cost.tokens}
     said = ", ".join(f"{name} {duration(seconds)}" for name, seconds in parts.items() if seconds)
-    unknown = f"; not counted, for the registry does not say their frames: {len(cost.unknown)} datasets" if cost.unknown else ""
-    return said + unknown
+    if not cost.unknown:
+        return said
+    known = cost.datasets - len(cost.unknown)
+    without = f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, whose frames the registry does not say"
+    return f"{without}; {duration(cost.seconds)} with the other {known} alone ({said})" if known else without
 
 

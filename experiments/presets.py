@@ -112,7 +112,7 @@ CPU_FULL = replace(
 )  # fmt: skip
 
 ACCELERATOR = Study(
-    name="accelerator",  # one GPU; its rate is assumed, not measured: time one trial and --set flops_per_second=...
+    name="accelerator",  # one GPU
     suite=SuiteConfig(scale=20.0),
     tokenizer=TokenizerConfig(image_size=64, downsample=8, bits=16, channels=512),
     tokenizer_train=TokenizerTrainConfig(steps=10_000, batch=128, learning_rate=5e-4),
@@ -131,7 +131,7 @@ ACCELERATOR = Study(
     widths=(64, 128, 256, 512),
     seeds=(0, 1, 2),
     transfer=TransferConfig(steps=4000),
-    flops_per_second=1e14,
+    flops_per_second=1e14,  # of an H100 at width 256 (docs/performance.md); others: time one trial and --set it
 )
 
 PAPER = Study(
@@ -151,7 +151,7 @@ PAPER = Study(
     widths=(64, 128, 256, 512, 768),
     transfer=TransferConfig(widths=(64, 256, 768), steps=6000),
     tau=3.0,
-    flops_per_second=8e14,  # eight accelerators at 100 TFLOP/s
+    flops_per_second=1e14,
 )
 
 SMOKE_CONTINUOUS = replace(

@@ -30,7 +30,7 @@ class RunningArguments:
     """Go on though the code changed since trials of the study ran; the page then counts the sources.
     For changes that alter no result."""
     dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False
-    """Print trials, parameters, FLOPs and expected time, and stop."""
+    """Print trials, parameters, FLOPs and expected time on the devices that they would use here, and stop."""
 
     def words(self) -> list[str]:
         """The arguments that say where and how many at a time."""

@@ -74,12 +74,13 @@ def _run(
     require(bool(axes), "axes is empty: the study has nothing to run; name some, such as --set axes=width,datasets")
     if running.workers is not None and running.workers < 1:
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
+    launching = Launching(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
-        from experiments.cost import plan_table
+        from experiments.cost import Devices, devices_of, plan_table
 
-        sweeps, workers = plan_sweeps(setting.study, axes), running.workers or 1
-        trained = setting.tokenizer is None
-        console.print(plan_table(setting.study, sweeps, bool(setting.data), trained, workers))
+        devices = Devices(devices_of(setting.study.execution.mesh, launching.share()), launching.at_once)
+        sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
+        console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained))
         return
     from experiments.run_study import run_study
 
@@ -87,7 +88,7 @@ def _run(
         setting,
         axes,
         again=setting.command(*words, *running.words(), "--retry-failed", *["--accept-code"] * running.accept_code),
-        launcher=Launching(running.launcher, running.workers, running.launcher_set),
+        launcher=launching,
         retry_failed=running.retry_failed,
         accept_code=running.accept_code,
         replace=remake.replace,

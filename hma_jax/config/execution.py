@@ -6,6 +6,7 @@ rounding at most.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -46,6 +47,11 @@ class MeshConfig:
         require(sizes.count(-1) <= 1, f"mesh: only one axis may be -1, got {sizes}")
         require(all(s == -1 or s >= 1 for s in sizes), f"mesh axes must be -1 or at least 1, got {sizes}")
         require(self.min_shard_size >= 0, f"mesh.min_shard_size must not be negative, got {self.min_shard_size}")
+
+    @property
+    def least(self) -> int:
+        """How many devices it takes at least: all of them where no axis is -1."""
+        return math.prod(size for size in (self.data, self.fsdp, self.tensor) if size != -1)
 
 
 @dataclass(frozen=True)

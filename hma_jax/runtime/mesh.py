@@ -22,16 +22,21 @@ AXES = ("data", "fsdp", "tensor")
 def make_mesh(config: MeshConfig, devices: Sequence[jax.Device] | None = None) -> Mesh:
     """The mesh of `config` over `devices` (default: those of all processes). Raises ConfigError if they do not fit."""
     devices = jax.devices() if devices is None else devices
-    sizes = [config.data, config.fsdp, config.tensor]
-    given = math.prod(s for s in sizes if s != -1)
-    if -1 in sizes and len(devices) % given == 0:
-        sizes[sizes.index(-1)] = len(devices) // given
-    require(
-        math.prod(sizes) == len(devices),
-        f"a mesh of data={config.data}, fsdp={config.fsdp}, tensor={config.tensor} does not "
-        f"fit {len(devices)} device(s); set one axis to -1 or change the sizes",
-    )
+    sizes = mesh_sizes(config, len(devices))
     return Mesh(arrange(sizes, devices), AXES, axis_types=(AxisType.Auto,) * 3)
+
+
+def mesh_sizes(config: MeshConfig, devices: int) -> list[int]:
+    """The mesh's axes over so many devices, -1 filled in. Raises ConfigError if they do not fit."""
+    sizes = [config.data, config.fsdp, config.tensor]
+    if -1 in sizes and devices % config.least == 0:
+        sizes[sizes.index(-1)] = devices // config.least
+    require(
+        math.prod(sizes) == devices,
+        f"a mesh of data={config.data}, fsdp={config.fsdp}, tensor={config.tensor} does not "
+        f"fit {devices} device(s); set one axis to -1 or change the sizes",
+    )
+    return sizes
 
 
 def arrange(sizes: Sequence[int], devices: Sequence[jax.Device]) -> np.ndarray:

@@ -57,6 +57,7 @@ def test_help_needs_no_jax():
         (["study", "--preset", "smoke", "--data", "{empty}/none"], 1, "{empty}/none"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
+        (["study", "--preset", "smoke", "--dry-run", "--launcher-set", "bogus=1"], 2, "no such setting, but none"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "axes="], 2, "axes is empty: the study has nothing to run"),
         (["sweep", "lr_horizon", "--preset", "cpu-full-continuous", "--dry-run"], 2, "designs.budgets is empty"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "suite.fewest=0"], 2, "suite.fewest must be at least 1"),

@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 
 from experiments.cli.main import main
-from experiments.cost import estimate, evaluation_flops_per_window, plan_trials
-from experiments.preparing_cost import estimate_preparing
-from experiments.presets import SMOKE, SMOKE_CONTINUOUS
+from experiments.cost import devices_of, estimate, evaluation_flops_per_window, plan_trials
+from experiments.preparing_cost import describe, estimate_preparing
+from experiments.presets import PAPER, SMOKE, SMOKE_CONTINUOUS
+from experiments.running.launchers import local
+from experiments.running.launchers.registry import Launching
+from experiments.running.slots import Accelerators
 from experiments.sweeps.registry import find_axis
 from experiments.sweeps.sweep import POINT, reference_trial
-from hma_jax.config import EvalConfig, ExecutionConfig, MaskingConfig
+from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MaskingConfig, MeshConfig
 from hma_jax.evaluation.protocol import make_predictor
 from hma_jax.model.hma import declare_model
 from tests.hma_jax.test_generation_flops import DIFFUSION, ROWS, counted
@@ -78,6 +81,68 @@ def test_the_plan_says_what_it_counts(capsys):
     assert "to prepare (simulating " in said and "the tokenizer " in said and "tokens " in said
     assert main([*plan, "--workers", "2"]) == 0
     assert "2.5 min for the trials, 2 at a time" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("gpus", "launching", "mesh", "each", "at_once"),
+    [
+        (0, Launching(), (-1, 1, 1), 1, 1),
+        (0, Launching(workers=8), (-1, 1, 1), 1, 8),
+        (0, Launching(), (8, 1, 1), 8, 1),
+        (0, Launching(workers=2), (2, -1, 2), 4, 2),
+        (8, Launching(), (-1, 1, 1), 8, 1),
+        (8, Launching(workers=2), (-1, 1, 1), 4, 2),
+        (8, Launching(workers=16), (-1, 1, 1), 0.5, 16),
+        (8, Launching("slurm"), (-1, 1, 1), 1, None),
+        (8, Launching("slurm", None, ("gpus=4",)), (-1, 1, 1), 4, None),
+        (0, Launching("slurm", 3, ("gpus=4",)), (1, -1, 1), 4, 3),
+        (0, Launching("ray", 4, ("tpus=4",)), (-1, 1, 1), 4, 4),
+        (0, Launching("ray", 2, ("gpus=0.5",)), (1, 1, 1), 0.5, 2),
+    ],
+)
+def test_every_launcher_says_which_devices_a_trial_runs_on(gpus, launching, mesh, each, at_once, monkeypatch):
+    found = Accelerators("gpu", tuple(map(str, range(gpus)))) if gpus else None
+    monkeypatch.setattr(local, "find_accelerators", lambda: found)
+    assert (devices_of(MeshConfig(*mesh), launching.share()), launching.at_once) == (each, at_once)
+
+
+def test_the_plan_prices_the_devices_that_trials_run_on(capsys):
+    """Before, a rate was that of a whole machine, for each worker."""
+    plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=3600", "--set", "flops_per_second=1e20"]
+    for more, said in (
+        ("", "priced for 1 device at 100.0 EFLOP/s each (flops_per_second); 5.0 device-hours"),
+        ("--workers 5", "priced for 5 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
+        ("--launcher slurm --launcher-set gpus=8", "if the cluster runs all at a time"),
+        ("--launcher slurm --launcher-set gpus=8", "for 8 devices at 100.0 EFLOP/s each (flops_per_second); 40.0 dev"),
+    ):
+        assert main([*plan, *more.split()]) == 0
+        assert said in " ".join(capsys.readouterr().out.split())
+
+
+def test_several_devices_are_as_many_times_faster():
+    sweep = find_axis("width")(SMOKE)
+    for one, eight in zip(*(plan_trials(SMOKE, [sweep], devices).values() for devices in (1, 8)), strict=True):
+        start = SMOKE.trial_seconds
+        assert one.seconds - start == pytest.approx(8 * (eight.seconds - start)) and one.flops == eight.flops
+
+
+def test_a_mesh_that_does_not_fit_what_a_trial_gets_is_refused_before_it_is_priced():
+    assert devices_of(MeshConfig(-1, 2, 1), None) == 2 and devices_of(MeshConfig(-1, 2, 1), 8.0) == 8
+    assert devices_of(MeshConfig(1, 1, 1), 0.5) == 0.5
+    with pytest.raises(ConfigError, match="a mesh of data=8, fsdp=1, tensor=1 does not fit 4 device"):
+        devices_of(MeshConfig(8, 1, 1), 4.0)
+
+
+def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
+    before = estimate_preparing(PAPER)
+    words = describe(before, lambda seconds: f"{seconds:.0f} s")
+    assert words.startswith("unknown for 38 of 40 datasets") and f"{before.seconds:.0f} s with the other 2 alone" in words
+    assert describe(replace(before, unknown=("a", "b"), datasets=2), str) == (
+        "unknown for 2 of 2 datasets, whose frames the registry does not say"
+    )
+    assert main(["sweep", "width", "--preset", "paper", "--dry-run"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "and what it takes to prepare: unknown for 38 of 40" in said and " in all" not in said
 
 
 def test_what_is_prepared_is_paid_for():

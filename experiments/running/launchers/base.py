@@ -37,6 +37,12 @@ class Launcher(ABC):
     at_once: int = sys.maxsize
     """How many trials it takes at a time; the engines queue what does not fit."""
 
+    @classmethod
+    @abstractmethod
+    def share(cls, workers: int | None, settings: Any) -> float | None:
+        """How many accelerators a trial gets, with so many `workers`; below 1: several trials share one. None: neither
+        the settings nor the place say it. Needs no engine."""
+
     @abstractmethod
     def launch(self, directories: Sequence[Path]) -> list[Any]:
         """Asks for an attempt at the trial of each directory, and returns a handle for each.

@@ -45,6 +45,15 @@ class LocalLauncher(Launcher):
         self._free = list(range(self.at_once))
         self._root, self._command = root, command
 
+    @classmethod
+    def share(cls, workers: int | None, settings: LocalSettings) -> float | None:
+        """Of this machine's; None without any."""
+        found = find_accelerators()
+        if found is None or not workers or workers == 1:
+            return found and float(len(found.names))
+        slots = cut(workers, found, ())
+        return sum(len(slot.accelerators.names) / slot.sharers for slot in slots) / workers
+
     def launch(self, directories: Sequence[Path]) -> list[Child]:
         return [self._start(directory) for directory in directories]
 

@@ -58,6 +58,10 @@ class RayLauncher(Launcher):
         self._ray = engine or _join(settings.address)
         self._run = self._ray.remote(**_options(settings))(run)
 
+    @classmethod
+    def share(cls, workers: int | None, settings: RaySettings) -> float | None:
+        return settings.gpus or settings.tpus or None
+
     def launch(self, directories: Sequence[Path]) -> list[Task]:
         cache = self._root / "compiled"
         return [Task(d, self._run.remote(Attempt(d, cache, self._command))) for d in directories]

@@ -37,6 +37,16 @@ class Launching:
         kind = launcher_class(self.name)
         return kind, parse_settings(self.name, kind.Settings, self.said)
 
+    @property
+    def at_once(self) -> int | None:
+        """Trials at a time; None: as many as the cluster has room for."""
+        return self.workers or (1 if self.name == "local" else None)
+
+    def share(self) -> float | None:
+        """How many accelerators each trial gets (`Launcher.share`)."""
+        kind, settings = self._parsed()
+        return kind.share(self.workers, settings)
+
     def launcher(self, root: Path) -> Launcher:
         """For the study in `root`. Raises ConfigError where it cannot work."""
         kind, settings = self._parsed()

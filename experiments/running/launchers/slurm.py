@@ -93,6 +93,10 @@ class SlurmLauncher(Launcher):
         self._states: dict[str, str] | None = None  # of all jobs; None: not known since the last were submitted
         self._over: dict[str, float] = {}  # when a job was first seen to be over
 
+    @classmethod
+    def share(cls, workers: int | None, settings: SlurmSettings) -> float | None:
+        return settings.gpus or None
+
     def launch(self, directories: Sequence[Path]) -> list[Any]:
         from submitit.core.utils import FailedJobError
 
