@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,4 +60,8 @@ def write_safetensors(
 ) -> None:
     """Writes contiguous copies where needed; the values' bytes are kept."""
     dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
+    # safetensors puts a file in the place of ours that its owner alone may read: it gets the mode that the umask gave.
+    path.touch()
+    mode = stat.S_IMODE(path.stat().st_mode)
     safetensors.numpy.save_file(dense, path, metadata)
+    path.chmod(mode)

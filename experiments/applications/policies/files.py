@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from data_pipelines.publishing.files import publish, remove
 from experiments.applications.policies.acting import ChunkPolicy, Scale
@@ -20,6 +20,7 @@ from experiments.applications.policies.cloning import BcConfig, ClonedPolicy, in
 from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, init_diffusion
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.convert.tensors import write_safetensors
 
 DESCRIPTION, WEIGHTS = "policy.json", "weights.safetensors"
 KINDS = {
@@ -40,7 +41,7 @@ def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] |
             "about": dict(about or {}),
         }
         (making / DESCRIPTION).write_text(json.dumps(description, indent=1) + "\n")
-        save_file(named(policy.params), making / WEIGHTS)
+        write_safetensors(making / WEIGHTS, named(policy.params))
         publish(making, directory)
     finally:
         remove(making)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -112,6 +113,17 @@ def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
     )
     with pytest.raises(ConfigError, match=r"1 missing: positions(.|\n)*1 not expected: other"):
         read_neutral(tmp_path / "out")
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o007, 0o660)])
+def test_weights_can_be_read_by_those_whom_the_umask_lets_read(umask, mode, tmp_path):
+    """safetensors itself writes files for their owner alone, of no use to a colleague on a shared disk."""
+    before = os.umask(umask)
+    try:
+        write_safetensors(tmp_path / "model.safetensors", {"one": np.zeros(3, np.float32)})
+    finally:
+        os.umask(before)
+    assert (tmp_path / "model.safetensors").stat().st_mode & 0o777 == mode
 
 
 SCRIPT = """

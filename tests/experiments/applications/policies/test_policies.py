@@ -102,7 +102,9 @@ def test_saved_policies_do_the_same_and_damaged_ones_are_refused(kind, demos, tm
     first = policy.act(images)
     np.testing.assert_array_equal(first, loaded.act(images))
     assert first.shape == (2, 4) and first.dtype == np.float32
-    (tmp_path / "one" / "weights.safetensors").write_bytes(b"x")
+    weights, about = (tmp_path / "one" / name for name in ("weights.safetensors", "policy.json"))
+    assert weights.stat().st_mode == about.stat().st_mode  # not their owner's alone
+    weights.write_bytes(b"x")
     with pytest.raises(ConfigError, match="train it again"):
         load_policy(tmp_path / "one")
 
