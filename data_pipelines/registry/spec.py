@@ -5,14 +5,18 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from data_pipelines.names import NAME_RULE, is_name, shown
 from data_pipelines.registry.angles import AngleForm, AngleUnit, angle_width, convert_angles
 from data_pipelines.sources.rlds.schema import field_slice
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 from hma_jax.config.json import stable_hash
+
+if TYPE_CHECKING:
+    from hma_jax.model.embodiments import Embodiment
 
 FRAME_RATE = 2.0
 """Hz at which the model sees frames unless a study says otherwise (paper section 4)."""
@@ -127,6 +131,32 @@ class DatasetSpec:
     def stride_at(self, rate: float | None) -> int:
         """Native frames per model frame in a study at `rate` Hz (None: native), unless this entry has its own."""
         return stride_of(self.hz, rate if self.rate is None else self.rate)
+
+    def check_like(self, robot: Embodiment, rate: float | None = FRAME_RATE) -> None:
+        """Raises ConfigError, saying what to change, unless a study at `rate` Hz has the actions of a frame as this
+        `robot` of a model has them."""
+        name = self.name
+        again = "in a file for --registry (`hma data inspect --entry` writes one), and tokenise into another --out"
+        dims = zip(self.action_keys, self.action_dims, strict=True)
+        takes = ", ".join(f"{key} ({dim})" for key, dim in dims) or "no actions"
+        if self.action_dim != robot.action_dim:
+            raise ConfigError(
+                f"{name}: the model was made for {robot.action_dim} action values, the registry's entry gives "
+                f"{self.action_dim}: {takes}. Name those of the model in the entry of {name}, {again}."
+            )
+        stride = self.stride_at(rate)
+        if stride != robot.stride:
+            right = f"{self.hz / robot.stride:.6g}"
+            raise ConfigError(
+                f"{name}: the model was made for frames at stride {robot.stride}, here they are at stride {stride} of "
+                f"{self.hz:g} Hz. Put `rate = {right}` into the entry of {name}, {again}; --set rate={right} does the "
+                "same to all datasets that have no rate of their own."
+            )
+        if robot.layout and self.action_layout() != robot.layout:  # tables of earlier versions do not say
+            raise ConfigError(
+                f"{name}: the values of an action are others, or stand in another order, than when the model was made: "
+                f"the registry's entry gives {takes}. Restore the entry of {name}, {again}."
+            )
 
     def action_layout(self) -> str:
         """A hash of what the values of an action mean and where they stand; of equal layouts it is equal.

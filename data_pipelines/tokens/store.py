@@ -130,20 +130,9 @@ class TokenStore:
     ) -> None:
         """Raises ConfigError unless `table` has each of `names` with the action layout stored here, at `rate`."""
         for name in names:
-            here, there = self.manifest(name).embodiment(rate), table.entries[table.index(name)]
-            if (here.action_dim, here.stride) != (there.action_dim, there.stride):
-                raise ConfigError(
-                    f"{name}: the token store has {here.action_dim} action values at stride {here.stride}, "
-                    f"the embodiment table {there.action_dim} at stride {there.stride}. "
-                    "Use the store the table was made from."
-                )
-            if there.layout and here.layout != there.layout:  # tables of earlier versions do not say
-                spec = self.manifest(name).spec
-                raise ConfigError(
-                    f"{name}: the values of an action are others, or stand in another order, than when the embodiment "
-                    f"table was made: the token store has {', '.join(spec.action_keys)} of "
-                    f"{', '.join(map(str, spec.action_dims))} values. Use the store the table was made from."
-                )
+            manifest = self.manifest(name)
+            manifest.stride_at(rate)  # raises, if it is not stored
+            manifest.spec.check_like(table.entries[table.index(name)], rate)
 
     def _start(self) -> None:
         self._ends = {

@@ -364,7 +364,7 @@ def test_the_rate_is_a_setting(tmp_path):
         config = LoaderConfig(frames=6, batch=4, rate=rate)
         (batch,) = take(store, training_table(store, config), 1, config)
         assert (np.diff(batch["tokens"][..., 0]) == stride).all() and batch["actions"].shape == (4, 6, 3 * stride)
-    with pytest.raises(ConfigError, match="toy: the token store has 3 action values at stride 2, .* at stride 5"):
+    with pytest.raises(ConfigError, match="toy: the model was made for frames at stride 5, here they are at stride 2"):
         make_loader(store, store.embodiment_table(("toy",)), config)
 
 
@@ -391,7 +391,7 @@ def test_rows_that_a_batch_does_not_have(store, table, rows):
 
 def test_table_of_another_action_layout(store, table):
     wrong = EmbodimentTable((replace(table.entries[0], stride=1), *table.entries[1:]))
-    with pytest.raises(ConfigError, match="arm: the token store has 3 action values at stride 2"):
+    with pytest.raises(ConfigError, match="arm: the model was made for frames at stride 1, here they are at stride 2"):
         make_loader(store, wrong, CONFIG)
 
 

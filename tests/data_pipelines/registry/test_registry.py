@@ -244,3 +244,16 @@ def test_toml_file_with_a_mistake_is_named(text, message, tmp_path):
 def test_missing_toml_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match="absent.toml: the registry file cannot be read"):
         load_entries(tmp_path / "absent.toml")
+
+
+@pytest.mark.parametrize(("hz", "stride"), [(5, 2), (3, 1), (15, 7), (12.5, 5), (10, 3), (30, 1)])
+def test_the_rate_that_is_advised_gives_the_stride_of_the_model(hz, stride):
+    """The official release floors a ratio of rates that is rounded here: 5 Hz are stride 2 there and 3 here."""
+    spec = make_spec("toy", hz=hz)
+    robot = Embodiment("toy", 3, stride, (0.0,) * 3, (1.0,) * 3)
+    with pytest.raises(ConfigError, match=f"made for frames at stride {stride}, here they are at stride") as refused:
+        spec.check_like(robot)
+    rate = re.search(r"`rate = ([0-9.]+)` into the entry of toy", str(refused.value))[1]
+    replace(spec, rate=float(rate)).check_like(robot)
+    with pytest.raises(ConfigError, match=r"made for 2 action values, .* gives 3: action \(3\)"):
+        spec.check_like(Embodiment("toy", 2, stride, (0.0,) * 2, (1.0,) * 2))

@@ -210,7 +210,7 @@ def test_the_rate_is_that_of_the_frames(tmp_path):
         batch = next(eval_batches(store, store.embodiment_table(("toy",), rate), frozen, 1))
         assert (np.diff(batch["tokens"][0, :, 0]) == stride).all()
         assert batch["actions"].shape == (1, 4, 3 * stride)
-    with pytest.raises(ConfigError, match="3 action values at stride 4"):
+    with pytest.raises(ConfigError, match="stride 2, here they are at stride 4"):
         eval_batches(store, store.embodiment_table(("toy",)), frozen, 1)
 
 
