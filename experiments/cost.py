@@ -2,8 +2,8 @@
 
 Needs no data and no device: action sizes come from the registry, parameter counts from the declared
 model without making an array. The rate of a device and times are those of the preset's machine
-(`Study.flops_per_second`, `Study.trial_seconds`); several devices are taken to be as many times faster. What trials have
-in common is counted once; what is made before the first one is estimated in `preparing_cost`.
+(`Study.flops_per_second`, `Study.trial_seconds`); several devices are taken to be as many times faster. What trials
+have in common is counted once; what is made before the first one is estimated in `preparing_cost`.
 """
 
 from __future__ import annotations
@@ -232,10 +232,11 @@ def _caption(
     number = devices.each * workers
     each = f", {devices.each:g} for each trial," if workers > 1 else ""
     hours = devices.each * trials / 3600
+    held = f"{hours:,.{0 if hours >= 100 else 1}f} device-hours"
     judged = "to train and to evaluate, sampler steps included" if evaluated else "to train"
     return (
         f"{whole}. {_flops(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
-        f"{_flops(study.flops_per_second)}/s each (flops_per_second); {hours:,.{0 if hours >= 100 else 1}f} device-hours "
+        f"{_flops(study.flops_per_second)}/s each (flops_per_second); {held} "
         f"with {study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). "
         f"Checkpoints: {size_of(sum(map(checkpoint_bytes, plans)))}. What trials have in "
         "common is counted once. 'One robot': parameters with a single embodiment of 2 action dimensions. 'Videos' are "

@@ -6,6 +6,8 @@ device would hold and send. The same report comes from the devices at hand.
 
 from __future__ import annotations
 
+import importlib.util
+import re
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,7 +18,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from experiments.bench.collectives import Collective, Sent, find_collectives
-from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, ModelConfig, TrainConfig
+from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.kernels.attention import backend_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_step
@@ -29,6 +31,9 @@ from hma_jax.training.state import TrainState, state_shapes
 from hma_jax.training.step import make_train_step
 
 LOCAL = "local"
+
+CORES_PER_CHIP = {"v2": 2, "v3": 2, "v4": 2, "v5p": 2, "v5e": 1, "v5litepod": 1, "v6e": 1}
+"""What the number in a cloud's name of TPUs counts, v4-32 or v5litepod-8: cores, or chips."""
 
 
 @dataclass(frozen=True)
@@ -58,22 +63,53 @@ class Plan:
 
 
 def find_devices(topology: str) -> list[Any]:
-    """The devices of a TPU topology such as v5e:2x4, or those at hand (`local`).
+    """The devices of a TPU topology such as v5e:2x4 or, by the cloud's name, v5e-8; or those at hand (`local`).
 
     Raises ConfigError for a topology that the compiler does not know or without the extra.
     """
     if topology == LOCAL:
         return jax.devices()
+    require(
+        re.match(r"v\d|tpu", topology) is not None,
+        f"no TPU called {re.split('[:-]', topology)[0]}; GPUs cannot be planned without one: run "
+        "`hma plan --topology local` there",
+    )
+    require(
+        importlib.util.find_spec("libtpu") is not None,
+        f"--topology {topology}: the TPU compiler is not installed: pip install -e '.[tpu]'",
+    )
     from jax.experimental import topologies
 
+    name = chips_of(topology)
+    cores = {"chip_config_name": "megacore"} if name.startswith("v4:") else {}  # a device is a chip, not a core
     try:
-        return list(topologies.get_topology_desc(platform="tpu", topology_name=topology).devices)
+        return list(topologies.get_topology_desc(platform="tpu", topology_name=name, **cores).devices)
     except (RuntimeError, ValueError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
+        called = topology if name == topology else f"{topology} ({name})"
         raise ConfigError(
-            f"no topology {topology!r} ({reason}); give one such as v5e:2x4, v5e:8x8, v5p:4x4x4 or v6e:8x8, and "
-            "install the TPU compiler with pip install -e '.[tpu]'"
+            f"the TPU compiler knows no topology {called}; give one such as v4:2x2x4, v5e:2x4, v5p:4x4x4 or v6e:8x8, "
+            f"or v4-32, v5e-8 as clouds call them ({str(error).splitlines()[0]})"
         ) from error
+
+
+def chips_of(topology: str) -> str:
+    """v4:2x2x4 of v4-32, v5e:2x4 of v5e-8: how the chips lie that a cloud's name counts, as close to a square or a cube
+    as powers of two do. Other names as they are. Raises ConfigError for a number that is none of a cloud's."""
+    found = re.fullmatch(r"(v\d\w*)-(\d+)", topology)
+    if found is None or found[1] not in CORES_PER_CHIP:
+        return topology
+    kind, count = found[1].replace("litepod", "e"), int(found[2])
+    chips, rest = divmod(count, CORES_PER_CHIP[found[1]])
+    doubled, axes = chips.bit_length() - 1, 3 if kind in ("v4", "v5p") else 2
+    whole = not rest and chips == 1 << doubled and doubled >= 2
+    unit = "cores, two for each chip" if CORES_PER_CHIP[found[1]] == 2 else "chips"
+    require(
+        whole,
+        f"--topology {topology}: the number counts {unit}, and must come to 4, 8, 16, ... chips; for other slices "
+        f"give how the chips lie, such as {kind}:{'x'.join(['2', '2', '4'][-axes:])}",
+    )
+    sizes = [2 ** ((doubled + axis) // axes) for axis in range(axes)]
+    return f"{kind}:{'x'.join(map(str, [2, 2, 1] if (axes, doubled) == (3, 2) else sizes))}"
 
 
 def make_plan(
@@ -114,12 +150,15 @@ def make_plan(
                 raise
             return Plan(**facts, compile_seconds=time.perf_counter() - began, refusal=_refusal(str(error)))
     memory = compiled.memory_analysis()
+    arguments, temporary = int(memory.argument_size_in_bytes), int(memory.temp_size_in_bytes)
+    # For CPU, XLA's peak leaves out what is temporary, which there and on GPU is one block beside the arguments.
+    counted = devices[0].platform == "tpu"
     return Plan(
         **facts,
         compile_seconds=time.perf_counter() - began,
-        arguments=int(memory.argument_size_in_bytes),
-        temporary=int(memory.temp_size_in_bytes),
-        peak=int(memory.peak_memory_in_bytes),
+        arguments=arguments,
+        temporary=temporary,
+        peak=int(memory.peak_memory_in_bytes) if counted else arguments + temporary,
         collectives=find_collectives(compiled.as_text(), mesh.shape),
     )
 

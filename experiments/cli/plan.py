@@ -3,29 +3,53 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+import re
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import FlagCreatePairsOff, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from experiments.cli.bench.arguments import Model
 from experiments.progress import console, step, tidy_table
-from hma_jax.config import ExecutionConfig, MeshConfig, TrainConfig
+from experiments.setting import Preset, StudyArguments, make_setting
+from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
 from hma_jax.runtime.audit import describe_sharding, size_of
 
 if TYPE_CHECKING:
     from experiments.bench.plan import Plan
+    from hma_jax.model.embodiments import EmbodimentTable
+
+
+@dataclass(frozen=True)
+class Planned(StudyArguments):
+    """The model that `hma train` with the same arguments would train."""
+
+    preset: Annotated[Preset | None, arg(help_behavior_hint="(default: a model of --model)")] = None
+    """The study whose model, robots, batch and execution are planned."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A model of `hma bench`, in place of a study's."""
+
+    model: Annotated[Model | None, arg(help_behavior_hint="(default: base)")] = None
+    """base is width 256 with 32 layers, xl width 1024."""
+    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 64)")] = None
+    """Windows per step, over all devices."""
+    robots: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1)")] = None
+    """Embodiments of the model."""
+    dtype: Annotated[Dtype | None, arg(help_behavior_hint="(default: bfloat16)")] = None
+    """What is computed in; parameters and moments are float32."""
+    remat: Annotated[Remat | None, arg(help_behavior_hint="(default: everything)")] = None
+    """What a block keeps for the backward pass; the rest is computed again."""
 
 
 def plan(
-    model: Model = "base",
+    asked: OmitArgPrefixes[Planned],
+    shape: OmitArgPrefixes[Shape],
     topology: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("local",),
-    batch: int = 64,
-    mesh: tuple[int, int, int] = (1, -1, 1),
-    robots: int = 1,
-    dtype: Dtype = "bfloat16",
-    remat: Remat = "everything",
+    memory: Annotated[str | None, arg(metavar="SIZE")] = None,
     brief: FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Compile the real training step and say how it would run: does it fit, what lies where, what is sent?
@@ -33,37 +57,33 @@ def plan(
     For a TPU topology no TPU is needed, but its compiler: pip install -e '.[tpu]'.
 
     Args:
-        model: The models of `hma bench`: base is width 256 with 32 layers, xl width 1024.
-        topology: TPU topologies such as v5e:2x4, v5e:8x8 or v5p:4x4x4; `local`: the devices here.
-        batch: Windows per step, over all devices.
-        mesh: Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
-        robots: Embodiments of the model.
-        dtype: What is computed in; parameters and moments are float32.
-        remat: What a block keeps for the backward pass; the rest is computed again.
+        asked: The study whose model is planned.
+        shape: A model of `hma bench`, where no study is named.
+        topology: TPU topologies such as v5e:2x4, v4:2x2x4, or v4-32 as clouds call it; `local`: the devices here.
+        memory: What one device has, such as 80GiB: for a verdict on devices whose compiler does not say it.
         brief: Leave out the layout of every parameter and the list of what is sent.
     """
+    limit = read_memory(memory)
     if any(name != "local" for name in topology):  # read when JAX starts
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
         os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # programs for absent devices cannot be written
     from experiments.bench.collectives import count_kinds
-    from experiments.bench.models import make_shape
     from experiments.bench.plan import find_devices, make_plan
 
-    config, table = make_shape(model, robots)
-    execution = ExecutionConfig(dtype, remat, mesh=MeshConfig(*mesh))
-    train = replace(TrainConfig(), batch=batch)
+    what, config, table, train, execution = _asked(asked, shape)
     rows: list[tuple[str, Plan]] = []
     for name in topology:
         devices = find_devices(name)
-        with step(f"compile {model} for {name} ({len(devices)} devices)"):
+        with step(f"compile {what} for {name} ({len(devices)} devices)"):
             rows.append((name, make_plan(config, table, train, execution, devices)))
     if not brief:
         for name, made in rows:
             _print_layouts(name, made)
             _print_sent(name, made)
     report = tidy_table(
-        f"{model}: {rows[0][1].parameters / 1e6:,.1f} M parameters, batch {batch}, {dtype}, remat {remat}; per device:",
+        f"{what}: {rows[0][1].parameters / 1e6:,.1f} M parameters, batch {train.batch}, {execution.dtype}, "
+        f"remat {execution.remat}; per device:",
         "topology", "mesh", "parameters", "moments", "activations", "peak", "TFLOP/step", "verdict",
     )  # fmt: skip
     for name, made in rows:
@@ -71,7 +91,9 @@ def plan(
         sizes = (made.stored, 2 * made.stored, made.temporary, made.peak)
         shown = [size_of(x) if made.peak else "" for x in sizes]
         shape = " x ".join(map(str, made.mesh.values()))
-        verdict = "[red]does not fit[/]" if made.refusal else "fits" if name != "local" else ""
+        verdict = "" if name == "local" and limit is None else "fits"
+        if made.refusal or limit is not None and made.peak > limit:
+            verdict = "[red]does not fit[/]"
         report.add_row(name, shape, *shown, f"{made.flops_per_step / 1e12:,.1f}", verdict)
     console.print(report)
     for name, made in rows:
@@ -80,6 +102,44 @@ def plan(
         counts = ", ".join(f"{n} {kind}" for kind, n in count_kinds(made.collectives).items()) or "none"
         console.print(f"[dim]{name}: compiled in {made.compile_seconds:.0f} s; collectives: {counts}[/]")
     console.print("[dim]collectives as they stand in the program, a loop's body once[/]")
+
+
+def read_memory(size: str | None) -> float | None:
+    """Bytes of '80GiB' or '80GB'. Raises ConfigError for what is no size."""
+    if size is None:
+        return None
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?(GiB|GB)", size)
+    require(found is not None, f"--memory {size}: write it as 80GiB or 80GB")
+    return float(found[1]) * {"GiB": 2**30, "GB": 10**9}[found[2]]
+
+
+def _asked(
+    asked: Planned, shape: Shape
+) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
+    """The model in words, then what its training step is made of: of a study's reference trial, or of a fixed model."""
+    if asked.preset is None:
+        from experiments.bench.models import make_shape
+
+        others = replace(asked, mesh=None) == Planned()
+        require(others, "only a study has these settings; add --preset, or choose by --model, --batch and --robots")
+        usual = {"model": "base", "batch": 64, "robots": 1, "dtype": "bfloat16", "remat": "everything"}
+        said = usual | {name: value for name, value in vars(shape).items() if value is not None}
+        config, table = make_shape(said["model"], said["robots"])
+        execution = ExecutionConfig(said["dtype"], said["remat"], mesh=MeshConfig(*asked.mesh or (1, -1, 1)))
+        return said["model"], config, table, replace(TrainConfig(), batch=said["batch"]), execution
+    from experiments.cost import declared_table
+    from experiments.sweeps.sweep import reference_trial
+
+    require(
+        shape == Shape(),
+        "--model, --batch, --robots, --dtype and --remat are for a model without --preset; of a study --set says them: "
+        "model.*, train.batch, datasets, execution.dtype and execution.remat",
+    )
+    study = make_setting(asked).study
+    trial = reference_trial(study, study.seeds[0])
+    table = declared_table(trial.datasets, trial.rate)
+    what = f"{study.name}, width {study.model.width}, {table.size} robots"
+    return what, trial.model, table, trial.train, study.execution
 
 
 def _print_layouts(name: str, made: Plan) -> None:

@@ -136,7 +136,8 @@ def test_a_mesh_that_does_not_fit_what_a_trial_gets_is_refused_before_it_is_pric
 def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     before = estimate_preparing(PAPER)
     words = describe(before, lambda seconds: f"{seconds:.0f} s")
-    assert words.startswith("unknown for 38 of 40 datasets") and f"{before.seconds:.0f} s with the other 2 alone" in words
+    assert words.startswith("unknown for 38 of 40 datasets")
+    assert f"{before.seconds:.0f} s with the other 2 alone" in words
     assert describe(replace(before, unknown=("a", "b"), datasets=2), str) == (
         "unknown for 2 of 2 datasets, whose frames the registry does not say"
     )

@@ -1,14 +1,19 @@
 """`hma plan`: the real training step, compiled and not run."""
 
+from types import SimpleNamespace
 from typing import get_args
 
 import jax
 import pytest
+from jax.experimental import topologies
 
+from experiments.bench import plan as planning
 from experiments.bench.collectives import Collective, Sent, count_kinds, find_collectives
 from experiments.bench.models import MODELS
-from experiments.bench.plan import abstract_inputs, find_devices, make_plan
+from experiments.bench.plan import Plan, abstract_inputs, chips_of, find_devices, make_plan
 from experiments.cli.bench.arguments import Model
+from experiments.cli.main import main
+from experiments.cli.plan import read_memory
 from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.runtime.mesh import make_mesh
@@ -40,6 +45,7 @@ def test_a_step_that_fits_is_reported_with_its_memory_and_parameters():
     assert plan.parameters == declare_model(config, TABLE).count() and plan.devices == 1
     assert plan.stored == 4 * plan.parameters
     assert plan.arguments > 3 * plan.stored  # weights and two moments
+    assert plan.peak == plan.arguments + plan.temporary > plan.temporary > 0
     assert not plan.refusal and not plan.collectives
 
 
@@ -71,7 +77,118 @@ def test_collectives_are_counted_once_with_what_is_sent_over_which_axes():
     assert by_axes["reduce-scatter"] == "data+fsdp"
 
 
-def test_an_unknown_topology_is_refused_with_names_to_try(monkeypatch):
-    monkeypatch.setenv("TPU_SKIP_MDS_QUERY", "1")
-    with pytest.raises(ConfigError, match="no topology 'v99:1x1'.*v5e:2x4"):
+@pytest.fixture
+def compiler(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, dict]]:
+    """What a TPU compiler that knows v4 and v5e was asked for."""
+    asked = []
+
+    def get_topology_desc(platform, topology_name, **options):
+        asked.append((topology_name, options))
+        if topology_name.partition(":")[0] not in ("v4", "v5e"):
+            raise RuntimeError(f"Invalid TPU external name: {topology_name}\nmore of it")
+        return SimpleNamespace(devices=["device"])
+
+    monkeypatch.setattr(topologies, "get_topology_desc", get_topology_desc)
+    monkeypatch.setattr(planning.importlib.util, "find_spec", lambda name: name)
+    return asked
+
+
+def test_an_unknown_topology_is_refused_with_names_to_try(compiler):
+    with pytest.raises(ConfigError, match="knows no topology v99:1x1; give one such as v4:2x2x4, .*external name"):
         find_devices("v99:1x1")
+
+
+def test_chips_of_a_v4_are_one_device_each(compiler):
+    """A mesh over their cores is none: JAX ends with an assertion."""
+    assert find_devices("v4-32") == find_devices("v5e:2x4") == ["device"]
+    assert compiler == [("v4:2x2x4", {"chip_config_name": "megacore"}), ("v5e:2x4", {})]
+
+
+def test_without_the_compiler_it_is_asked_for(monkeypatch):
+    monkeypatch.setattr(planning.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"v5e:2x4: the TPU compiler is not installed: pip install -e '\.\[tpu\]'$"):
+        find_devices("v5e:2x4")
+
+
+def test_gpus_are_not_taken_for_tpus_without_a_compiler(monkeypatch):
+    monkeypatch.setattr(planning.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="^no TPU called h100; .* `hma plan --topology local` there$"):
+        find_devices("h100:8")
+
+
+@pytest.mark.parametrize(
+    ("cloud", "chips"),
+    [
+        ("v4-8", "v4:2x2x1"), ("v4-16", "v4:2x2x2"), ("v4-32", "v4:2x2x4"), ("v4-64", "v4:2x4x4"),
+        ("v5p-8", "v5p:2x2x1"), ("v5p-128", "v5p:4x4x4"), ("v3-8", "v3:2x2"), ("v5e-4", "v5e:2x2"),
+        ("v5e-8", "v5e:2x4"), ("v5litepod-16", "v5e:4x4"), ("v6e-32", "v6e:4x8"), ("v5e-256", "v5e:16x16"), ("v5e:2x4", "v5e:2x4"),
+        ("v9-8", "v9-8"),
+    ],
+)  # fmt: skip
+def test_names_of_clouds_are_said_in_chips(cloud, chips):
+    assert chips_of(cloud) == chips
+
+
+@pytest.mark.parametrize(
+    ("cloud", "words"),
+    [
+        ("v4-33", "counts cores, two for each chip, and must come to 4, 8, 16, ... chips; .* such as v4:2x2x4"),
+        ("v4-4", "must come to 4"),
+        ("v5e-12", "counts chips, and must come to 4, 8, 16, ... chips; .* such as v5e:2x4"),
+    ],
+)
+def test_a_number_that_is_no_slice_is_explained(cloud, words):
+    with pytest.raises(ConfigError, match=words):
+        chips_of(cloud)
+
+
+def test_sizes_of_memory_are_read():
+    assert (read_memory("80GiB"), read_memory("1.5 GB"), read_memory(None)) == (80 * 2**30, 1.5e9, None)
+    with pytest.raises(ConfigError, match="--memory 80: write it as 80GiB"):
+        read_memory("80")
+
+
+@pytest.fixture
+def planned(monkeypatch: pytest.MonkeyPatch, capsys):
+    """Runs `hma plan` without compiling; returns what was to be compiled, and the last row that it printed."""
+    calls = []
+
+    def make(*asked):
+        calls.append(asked)
+        return Plan((), 1, {"data": 1, "fsdp": 1, "tensor": 1}, 0.0, 1e12, temporary=3 * 2**30, peak=4 * 2**30)
+
+    monkeypatch.setattr(planning, "make_plan", make)
+
+    def run(*arguments: str):
+        assert main(["plan", "--brief", *arguments]) == 0
+        lines = map(str.strip, capsys.readouterr().out.splitlines())
+        return calls[-1], next(line for line in lines if line.startswith("local "))
+
+    return run
+
+
+def test_memory_gives_a_verdict_where_the_compiler_has_none(planned):
+    for memory, verdict in (((), "1.0"), (("--memory", "4GiB"), "fits"), (("--memory", "3GiB"), "does not fit")):
+        assert planned(*memory)[1].endswith(verdict)
+
+
+def test_the_plan_of_a_study_is_of_the_model_that_it_trains(planned):
+    (model, table, train, execution, _), _ = planned(
+        "--preset", "paper", "--set", "model.width=768", "--set", "train.batch=8", "--mesh", "1", "-1", "1"
+    )
+    assert (model.width, model.layers, train.batch, table.size, len(set(table.names))) == (768, 32, 8, 40, 40)
+    assert execution == ExecutionConfig("bfloat16", mesh=MeshConfig(1, -1, 1))
+    assert planned("--preset", "smoke")[0][3].mesh == MeshConfig()  # as it trains
+    assert planned()[0][3].mesh == MeshConfig(1, -1, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--preset", "paper", "--batch", "64"], "of a study --set says them: model.*, train.batch"),
+        (["--preset", "paper", "--model", "base"], "are for a model without --preset"),
+        (["--set", "model.width=768"], "only a study has these settings; add --preset"),
+    ],
+)
+def test_a_study_and_a_fixed_model_are_not_mixed(arguments, words, capsys):
+    assert main(["plan", *arguments]) == 2 and words in capsys.readouterr().err
