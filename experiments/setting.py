@@ -19,7 +19,7 @@ from experiments.program import PROGRAM
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
 from experiments.study import Study, on_tokenizer, on_user_data, override
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.claim import is_address
 
 Preset = Literal[
@@ -124,10 +124,11 @@ def command_words(*arguments: str | Path) -> str:
     return shlex.join(map(_word, arguments))
 
 
-def make_setting(where: StudyArguments) -> Setting:
+def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Setting:
     """The preset, on the user's data and tokenizer if given, with overrides. Writes nothing.
 
-    Raises ConfigError, and DataError for directories that are no datasets.
+    `model`: that of a trained run, in place of the preset's. Raises ConfigError, and DataError for directories that
+    are no datasets.
     """
     asked = where.anywhere()
     study, data = get_preset(asked.preset), asked.data
@@ -146,7 +147,7 @@ def make_setting(where: StudyArguments) -> Setting:
         from hma_jax.tokenizers.io import load_config
 
         study = on_tokenizer(study, load_config(asked.tokenizer))
-    study = override(study, asked.set)
+    study = override(study, asked.set, model)
     if asked.mesh is not None:
         sizes = dict(zip(("data", "fsdp", "tensor"), asked.mesh, strict=True))
         mesh = replace(study.execution.mesh, **sizes)

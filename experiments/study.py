@@ -285,13 +285,14 @@ def on_tokenizer(study: Study, tokenizer: AnyTokenizerConfig) -> Study:
     return replace(study, tokenizer=tokenizer, model=model)
 
 
-def override(study: Study, settings: Sequence[str]) -> Study:
-    """`study` with fields changed by 'path=value' strings, such as 'model.frames=4'.
+def override(study: Study, settings: Sequence[str], model: ModelConfig | None = None) -> Study:
+    """`study`, of another `model` where one is given, with fields changed by 'path=value' strings, such as
+    'model.frames=4'.
 
     Values are JSON; lists may be written '4,8,16'. Raises ConfigError for an unknown path
     (with the closest known one) or a value of the wrong kind.
     """
-    values = to_dict(study)
+    values = to_dict(study) | ({} if model is None else {"model": to_dict(model)})
     for setting in settings:
         path, separator, text = setting.partition("=")
         require(bool(separator), f"--set {setting}: write it as path=value, such as model.frames=4")

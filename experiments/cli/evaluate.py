@@ -122,7 +122,7 @@ def require_prepared(setting: Setting) -> None:
 def check_fits(trained: Run, materials: Materials) -> None:
     """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
     advice = "; evaluate it with the --out it was trained in"
-    check_tokenizer(trained, materials, advice)
+    check_tokenizer(trained, materials.tokenizer, advice)
     frames, manifest = trained.model.frames, materials.manifest
     if frames != manifest.frames:
         raise ConfigError(
@@ -136,32 +136,35 @@ def check_fits(trained: Run, materials: Materials) -> None:
         )
 
 
-def check_tokenizer(trained: Run, materials: Materials, advice: str) -> None:
-    """A model that was converted does not know its tokenizer: then the form of its tokens decides."""
-    if "official" in trained.provenance and "tokenizer" not in trained.provenance:
-        _check_form(trained, materials.tokenizer, advice)
-        return
-    tokenizer, here = trained.provenance.get("tokenizer"), materials.tokenizer.identity
-    if tokenizer != here:
-        raise ConfigError(
-            f"the model was trained on tokens of tokenizer {tokenizer}, the study here uses {here}{advice}"
+def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
+    """Raises ConfigError, with `advice`, for a `misfit`."""
+    if why := misfit(trained, tokenizer):
+        raise ConfigError(why + advice)
+    if _converted(trained):
+        console.print(
+            f"note: the model comes from the official release and does not say on which tokens it was trained; "
+            f"taken for those of the tokenizer here, {tokenizer.identity}",
+            soft_wrap=True,
         )
 
 
-def _check_form(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
+def misfit(trained: Run, tokenizer: Tokenizer) -> str:
+    """Why a model was not trained on the tokens of this tokenizer; '' if it was. A model that was converted does not
+    know its own: then the form of its tokens decides."""
+    if not _converted(trained):
+        own, here = trained.provenance.get("tokenizer"), tokenizer.identity
+        return "" if own == here else f"the model was trained on tokens of tokenizer {own}, the study here uses {here}"
     model = trained.model
     if model.diffusion:
         takes = (model.tokens, 0, 0, model.diffusion.token_channels)
     else:
         takes = (model.tokens, model.factors, model.factor_vocab, 0)
     makes = (tokenizer.tokens, tokenizer.factors, tokenizer.factor_vocab, tokenizer.channels)
-    if takes != makes:
-        words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
-        raise ConfigError(
-            f"the model takes {words.format(*takes)}, the tokenizer here makes {words.format(*makes)}{advice}"
-        )
-    console.print(
-        f"note: the model comes from the official release and does not say on which tokens it was trained; "
-        f"taken for those of the tokenizer here, {tokenizer.identity}",
-        soft_wrap=True,
-    )
+    words = "{0} tokens per frame of {1} factors with {2} entries and {3} latent channels"
+    if takes == makes:
+        return ""
+    return f"the model takes {words.format(*takes)}, the tokenizer here makes {words.format(*makes)}"
+
+
+def _converted(trained: Run) -> bool:
+    return "official" in trained.provenance and "tokenizer" not in trained.provenance

@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import OneModel, Remake
-from experiments.cli.evaluate import check_tokenizer
+from experiments.cli.begin import known, require_known, setting_of, strangers
 from experiments.cli.hosts import Hosts
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step
 from experiments.running.run_options import RunOptions
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, short
 from experiments.sweeps.sweep import reference_trial
+from experiments.words import few
 from experiments.wrote import wrote
 from hma_jax.config import require
 
 if TYPE_CHECKING:
     from experiments.running.trial import Materials, Trial
+    from hma_jax.training.runs import Run
 
 
 def train(
@@ -41,12 +44,17 @@ def train(
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
         hosts: Several processes that train together, on one host or on many.
-        begin: A trained model of the same robots and architecture. The new run begins with its weights, or with their
-            average where it keeps one.
+        begin: A trained or converted model that knows the study's robots. The new run begins with its weights, or with
+            their average where it keeps one, and has its architecture and tokenizer. Its other robots stay as they are.
     """
+    from hma_jax.training.runs import load_run
+
     hosts.join()
-    setting = make_setting(asked)
-    train_model(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace, begin=begin)
+    trained = None if begin is None else load_run(begin, "auto")
+    setting = make_setting(asked) if trained is None else setting_of(begin, trained, asked)
+    if trained is not None:
+        require_known(begin, trained, setting)
+    train_model(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
 
 
 def adapt(
@@ -65,7 +73,8 @@ def adapt(
 
     Args:
         source: Directory of the training run that knows the other robots.
-        asked: The study with the new datasets. Give --tokenizer: the one of the trained model.
+        asked: The study with the new datasets. Its tokenizer is the one of the trained model: give it with --tokenizer
+            if it is not beside RUN.
         one: How the new robots are trained.
         options: How the run is saved and watched; each start may say it anew.
         remake: What was made with other settings or data is never replaced without being asked for.
@@ -74,7 +83,7 @@ def adapt(
     """
     hosts.join()
     adapt_model(
-        make_setting(asked),
+        asked,
         source,
         one.directory(),
         options,
@@ -91,34 +100,25 @@ def train_model(
     *,
     trajectories: int | None = None,
     replace: Step | None = None,
-    begin: Path | None = None,
+    begin: Run | None = None,
 ) -> None:
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
-    the run `begin` on where one is given. Raises ConfigError if that is of another model."""
-    _check(trajectories, options)
+    the run `begin` on where one is given, which knows its robots."""
+    run = run or setting.workspace.root / "model"
+    _check(setting, run, trajectories, options)
     _prepare(setting, replace)
-    trial = _single_trial(setting, trajectories)
-    start = {} if begin is None else _begin_with(begin, setting, trial)
-    _train(setting, trial, run or setting.workspace.root / "model", options, **start)
-
-
-def _begin_with(source: Path, setting: Setting, trial: Trial) -> dict[str, Any]:
-    """What `train_trial` takes for a run that begins with the weights of `source`."""
-    from experiments.running.trial import open_materials
-    from hma_jax.training.runs import load_run
-
-    trained = load_run(source, "auto")
-    check_tokenizer(trained, open_materials(setting.workspace), f"; add --tokenizer with that of {short(source)}")
-    require(
-        (trained.model, trained.table.names) == (trial.model, trial.datasets),
-        f"--from {short(source)} is another model or has other robots; give the settings it was trained with",
-    )
-    origin = {"step": trained.step, "provenance": trained.provenance}
-    return {"table": trained.table, "initial": trained.params, "origin": origin}
+    start = {}
+    if begin is not None:
+        kept = [name for name in begin.table.names if name not in known(begin, setting)]
+        if kept:
+            console.print(f"note: kept as they are, for want of data here: {', '.join(kept)}", soft_wrap=True)
+        origin = {"step": begin.step, "provenance": begin.provenance}
+        start = {"table": begin.table, "initial": begin.params, "origin": origin}
+    _train(setting, _single_trial(setting, trajectories), run, options, **start)
 
 
 def adapt_model(
-    setting: Setting,
+    asked: StudyArguments,
     source: Path,
     run: Path | None,
     options: RunOptions,
@@ -132,30 +132,49 @@ def adapt_model(
     from experiments.running.trial import open_materials
     from hma_jax.training.runs import load_run
 
-    _check(trajectories, options)
-    _prepare(setting, replace)
-    study, materials = setting.study, open_materials(setting.workspace)
     trained = load_run(source)
-    check_tokenizer(trained, materials, f"; add --tokenizer with the one that {short(source)} was trained with")
-    seed = study.seeds[0]
-    new = [name for name in study.dataset_names() if name not in trained.table.names]
-    require(bool(new), f"{source} already knows {', '.join(study.dataset_names())}: there is nothing to add")
+    setting = setting_of(source, trained, asked)
+    require(
+        bool(strangers(trained, setting)),
+        f"{short(source)} already knows {few(setting.study.dataset_names())}: there is nothing to add. To train it on: "
+        f"{setting.command('train', '--from', source)}",
+    )
+    run = run or setting.workspace.root / "model"
+    _check(setting, run, trajectories, options)
+    _prepare(setting, replace)
+    study, new = setting.study, strangers(trained, setting)
     only = () if everything else tuple(new)
     trial = dataclasses.replace(
         _single_trial(setting, trajectories),
-        model=trained.model,
-        train=dataclasses.replace(study.train, seed=seed, only=only),
+        train=dataclasses.replace(study.train, seed=study.seeds[0], only=only),
     )
-    beginning = add_robots(trained, trial, materials)
+    beginning = add_robots(trained, trial, open_materials(setting.workspace))
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
-    where = run or setting.workspace.root / "model"
-    _train(setting, trial, where, options, **beginning)
+    _train(setting, trial, run, options, **beginning)
 
 
-def _check(trajectories: int | None, options: RunOptions) -> None:
+def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOptions) -> None:
+    """Raises ConfigError, before any work, for options that cannot be and for a run that was not trained here."""
     options.check()
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
+    _require_trained_here(setting, run)
+
+
+def _require_trained_here(setting: Setting, run: Path) -> None:
+    """Raises ConfigError for a run that was converted: it was trained on no data that training could go on with."""
+    from hma_jax.training.reading import CheckpointError, list_steps, read_description
+
+    checkpoints, described = run.absolute() / "checkpoints", {}
+    for latest in list_steps(checkpoints)[-1:]:
+        with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
+            described = read_description(checkpoints / str(latest))
+    # What has no table is no model, of which the restoring speaks too.
+    require(
+        "table" not in described or "loader" in described["provenance"],
+        f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
+        f"{setting.command('train', '--from', run)} --run NEW",
+    )
 
 
 def _prepare(setting: Setting, replace: Step | None) -> None:

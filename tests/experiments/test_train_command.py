@@ -1,20 +1,32 @@
 """`hma train`: its own settings, and what it says it trains on."""
 
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from experiments.cli.begin import require_known, setting_of, strangers
 from experiments.cli.main import main
+from experiments.presets import get_preset
 from experiments.running import trial as trials
 from experiments.running.run_options import RunOptions
+from experiments.setting import StudyArguments
+from hma_jax.config import ConfigError
+from hma_jax.convert import read_official, write_run
+from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.tokenizers.autoencoder import declare_tokenizer
+from hma_jax.tokenizers.io import save_tokenizer
+from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
+from tests.hma_jax.convert.fakes import DISCRETE, make_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -152,4 +164,65 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
         np.testing.assert_allclose(new, old, atol=1e-6)
     other = ["train", *where, "--run", str(tmp_path / "other"), "--from", str(source), "--set", "model.width=24"]
     assert main(other) != 0
-    assert "is another model or has other robots" in " ".join(capsys.readouterr().err.split())
+    said = capsys.readouterr().err
+    assert "is another model than --set asks for (there -> asked for): model.width: 16 -> 24. Leave out" in said
+
+
+@pytest.fixture(scope="module")
+def released(tmp_path_factory) -> Path:
+    """A run that was converted, of another model than the smoke study's, which takes its tokens."""
+    root = tmp_path_factory.mktemp("released")
+    robots = [(spec.name, spec.action_dim, spec.stride) for spec in (BASE, ARM)] + [("push2", 2, 1)]
+    changes = {"d_model": 8, "T": 4, "S": 16, "image_vocab_size": 256}
+    write_run(read_official(make_checkpoint(root / "a", DISCRETE | changes, robots)), root / "rel")
+    return root / "rel"
+
+
+def test_a_converted_run_is_fine_tuned_as_the_model_that_it_is(released, train, tmp_path, capsys):
+    train()  # there is a tokenizer
+    said, trial, _ = train("--from", str(released), "--run", str(tmp_path / "tuned"))
+    assert "note: kept as they are, for want of data here: push2" in said
+    before, after = load_run(released), load_run(tmp_path / "tuned")
+    assert trial.model == after.model == before.model and before.model.width == 8
+    assert after.table == before.table and set(trial.datasets) == {ARM.name, BASE.name}
+    for old, new in zip(jax.tree.leaves(before.params), jax.tree.leaves(after.params), strict=True):
+        np.testing.assert_array_equal(old, new)  # no step here learns anything
+
+
+def test_a_converted_run_is_not_resumed(released, where, monkeypatch, capsys):
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
+    assert main(["train", *where, "--run", str(released)]) == 2
+    said = capsys.readouterr().err
+    assert f"{released} was converted, not trained here, so it cannot be resumed; fine-tune it with: " in said
+    assert f"hma train --from {released} --preset smoke " in said and said.endswith(" --run NEW\n")
+
+
+def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where, tmp_path, monkeypatch, capsys):
+    """What does not fit is said before a tokenizer is trained on the data."""
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
+    out, data = tmp_path / "out", where[where.index("--data") + 1 :]
+
+    def refused(*arguments: str) -> str:
+        assert main([*arguments, *SMOKE, "--out", str(out)]) == 2 and not out.exists()
+        return capsys.readouterr().err
+
+    adapt, goes_on = ("adapt", str(released)), ("train", "--from", str(released))
+    for command in (adapt, goes_on):
+        said = refused(*command, "--data", *data)
+        assert f"its tokenizer is neither beside it nor in {out}; add --tokenizer" in said
+    tokenizer = tmp_path / "study" / "tokenizer"
+    config = get_preset("smoke").tokenizer
+    save_tokenizer(LfqTokenizer(config, declare_tokenizer(config).init(0)), tokenizer)
+    given = ("--tokenizer", str(tokenizer), "--data", *data)
+    assert "there is nothing to add. To train it on: hma train --from " in refused(*adapt, *given)
+    assert "made for frames at stride 3, here they are at stride 13" in refused(*goes_on, *given, "--set", "rate=0.4")
+    beside = shutil.copytree(released, tmp_path / "study" / "model")
+    few = replace(load_run(beside), table=EmbodimentTable(load_run(beside).table.entries[1:]))
+    asked = StudyArguments("smoke", out, tuple(data))
+    setting = setting_of(beside, few, asked)
+    assert setting.tokenizer == tokenizer and strangers(few, setting) == [BASE.name]
+    with pytest.raises(ConfigError, match=f"not {BASE.name}. To add them: hma adapt "):
+        require_known(beside, few, setting)
+    other = replace(few, provenance={"tokenizer": "another"})
+    with pytest.raises(ConfigError, match="trained on tokens of tokenizer another, .*; add --tokenizer"):
+        setting_of(beside, other, asked)

@@ -1,0 +1,75 @@
+"""What a training run takes of the trained model that it begins with: its architecture, its tokenizer, its robots."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from experiments.cli.evaluate import check_tokenizer, misfit
+from experiments.running.workspace import Workspace
+from experiments.setting import Setting, StudyArguments, make_setting, short
+from experiments.words import few
+from hma_jax.config import require
+from hma_jax.config.json import diff
+
+if TYPE_CHECKING:
+    from hma_jax.training.runs import Run
+
+
+def setting_of(source: Path, trained: Run, asked: StudyArguments) -> Setting:
+    """The study that goes on from the model `trained`, which lies in `source`. Writes nothing.
+
+    Raises ConfigError, before there is any work, for another model, other tokens or other actions than it was made for.
+    """
+    from data_pipelines.registry import get_spec
+
+    asked = asked.anywhere()
+    asked = dataclasses.replace(asked, tokenizer=_tokenizer(source, trained, asked))
+    setting = make_setting(asked, trained.model)
+    lines = diff(trained.model, setting.study.model, "model")
+    require(
+        not lines,
+        f"{short(source)} is another model than --set asks for (there -> asked for): {'; '.join(lines)}. Leave out "
+        "settings of the model: they are taken from there",
+    )
+    for name in known(trained, setting):
+        get_spec(name).check_like(trained.table.entries[trained.table.index(name)], setting.study.rate)
+    return setting
+
+
+def known(trained: Run, setting: Setting) -> list[str]:
+    """The datasets of a study whose robots a model knows."""
+    return [name for name in setting.study.dataset_names() if name in trained.table.names]
+
+
+def strangers(trained: Run, setting: Setting) -> list[str]:
+    """The others."""
+    return [name for name in setting.study.dataset_names() if name not in trained.table.names]
+
+
+def require_known(source: Path, trained: Run, setting: Setting) -> None:
+    """Raises ConfigError unless a model knows every robot of the study."""
+    new = strangers(trained, setting)
+    require(
+        not new,
+        f"{short(source)} knows {few(trained.table.names)}, not {few(new)}. To add them: "
+        f"{setting.command('adapt', source)}",
+    )
+
+
+def _tokenizer(source: Path, trained: Run, asked: StudyArguments) -> Path:
+    """The directory of the tokenizer whose tokens a model takes: the one that is asked for, or one in the study's
+    directory or beside the run. Raises ConfigError where it is none of them."""
+    from hma_jax.simulator.folder import TOKENIZER
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    places: Sequence[Path] = (Workspace(asked.out).tokenizer, source / TOKENIZER, Workspace.of_run(source).tokenizer)
+    places = [asked.tokenizer] if asked.tokenizer else [place for place in places if place.is_dir()]
+    advice = f"; add --tokenizer with the directory of the one that {short(source)} was trained with"
+    require(bool(places), f"{short(source)}: its tokenizer is neither beside it nor in {short(asked.out)}{advice}")
+    tokenizers = {place: load_tokenizer(place) for place in places}
+    found = next((place for place in places if not misfit(trained, tokenizers[place])), places[0])
+    check_tokenizer(trained, tokenizers[found], advice)
+    return found
