@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
+from experiments.presets import get_preset
 from experiments.progress import console
 from experiments.wrote import wrote
 from hma_jax.config import Weights
@@ -26,27 +28,40 @@ HELP = (
 
 Platform = Literal["cpu", "cuda", "rocm", "tpu"]
 
+RATES = "rates.toml"
+
+PROMPT = 4
+"""Frames that a program is given unless told otherwise."""
+
 
 @convert_app.command(name="from-official")
 def from_official(checkpoint: Positional[Path], out: Path) -> None:
     """Make a run of a checkpoint of the official PyTorch release, discrete or continuous.
 
     Every tensor must be there, with the shape that config.json asks for. PyTorch is not needed, and
-    no code of the checkpoint is run. The run can be evaluated, trained on, and converted further.
+    no code of the checkpoint is run. The run can be evaluated, fine-tuned (hma train --from), given new
+    robots (hma adapt), and converted further; it cannot be resumed. docs/checkpoints.md shows each.
 
     Args:
         checkpoint: Directory with config.json and model.safetensors (or pytorch_model.bin, model.bin).
-        out: The run to write.
+        out: The run to write. Its rates.toml has the registry entries of those of its robots that are known, with the
+            rates of frames that it was trained at.
     """
     from hma_jax.convert import read_official, require_free, write_run
 
     require_free(out)
     run = read_official(checkpoint)
     write_run(run, out)
+    _write_rates(run, out / RATES)
     if run.model.conditioning == "cross_attention":
         console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
     _describe(run)
-    wrote(out, then=f"hma convert to-safetensors {_quoted(out)} --out DIR (or to-stablehlo, to-official)")
+    asked = _study_of(run, out / RATES)
+    wrote(
+        out,
+        then=f"hma tokenize {asked} && \\\n  hma evaluate {_quoted(out)} {asked}\n"
+        f"or: hma convert to-safetensors {_quoted(out)} --out DIR (or to-stablehlo, to-official)",
+    )
 
 
 @convert_app.command(name="to-official")
@@ -121,8 +136,8 @@ def to_stablehlo(
     run: Positional[Path],
     out: Path,
     batch: int = 1,
-    prompt: int = 4,
-    frames: int = 5,
+    prompt: Annotated[int | None, arg(help_behavior_hint="(default: 4, or all but the last)")] = None,
+    frames: Annotated[int | None, arg(help_behavior_hint="(default: the model's window)")] = None,
     unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2,
     temperature: float = 0.0,
     sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100,
@@ -155,11 +170,47 @@ def to_stablehlo(
     require_free(out)
     latents = SamplerConfig(sampler, sampler_steps, temperature)
     decode = DecodeConfig(unmask_steps, temperature, sampler=latents)
-    config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
     loaded = load_run(run, weights)
+    frames = loaded.model.frames if frames is None else frames
+    prompt = min(PROMPT, frames - 1) if prompt is None else prompt
+    config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
     write_stablehlo(loaded, out, config)
     _describe(loaded)
     wrote(out, then=f"read {_quoted(out / 'model.json')} for the program's inputs and outputs")
+
+
+def _write_rates(run: Run, path: Path) -> None:
+    """Registry entries of the run's robots, at the rates that give their strides. Says which robots have none."""
+    from data_pipelines.registry import find_spec
+    from data_pipelines.registry.toml_file import to_toml
+    from hma_jax.runtime.files import write_file
+
+    entries, unknown, other = [], [], []
+    for robot in run.table.entries:
+        spec = find_spec(robot.name)
+        if spec is None:
+            unknown.append(robot.name)
+        elif spec.action_dim != robot.action_dim:
+            other.append(f"{robot.name} ({robot.action_dim} values, {spec.action_dim} here)")
+        else:
+            entries.append(to_toml(replace(spec, rate=float(f"{spec.hz / robot.stride:.6g}"))))
+    write_file(path, "\n".join(entries))
+    for names, why in ((unknown, "which the registry does not know"), (other, "of other actions than the registry's")):
+        if names:
+            console.print(
+                f"note: not in {path.name}: {', '.join(names)}, {why}; to use one write an entry (docs/own_data.md)",
+                markup=False,
+                soft_wrap=True,
+            )
+
+
+def _study_of(run: Run, rates: Path) -> str:
+    """The arguments, some of them to be filled in, of a study that judges a converted run."""
+    study = get_preset("cpu-continuous" if run.model.diffusion else "paper")
+    words = f"--preset {study.name} --registry {_quoted(rates)} --tokenizer TOKENIZER --data DIR --out OUT"
+    frames, prompt = run.model.frames, study.eval.prompt_frames
+    words += f" --set model.frames={frames}" if frames != study.model.frames else ""
+    return words + (f" --set eval.prompt_frames={frames // 2}" if prompt >= frames else "")
 
 
 def _describe(run: Run) -> None:

@@ -1,6 +1,7 @@
 """`hma convert`, from an official checkpoint through every format and back."""
 
 import json
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import jax
 import numpy as np
 import pytest
 
+from data_pipelines.registry import get_spec
+from data_pipelines.registry.toml_file import load_entries
 from experiments.cli.main import main
 from hma_jax.convert.run_directory import fresh_state
 from hma_jax.training.checkpoints import Checkpoints
@@ -32,11 +35,26 @@ def test_a_checkpoint_goes_through_every_format_and_back(tmp_path, capsys):
     before, after = (json.loads((folder / "config.json").read_text()) for folder in (CHECKPOINT, back))
     assert before == after
 
-    options = ("--prompt", "1", "--frames", "2", "--platforms", "cpu")
-    program = convert("to-stablehlo", again, "program", *options)
+    program = convert("to-stablehlo", again, "program", "--platforms", "cpu")
     about = json.loads((program / "model.json").read_text())
-    assert about["outputs"][0]["shape"] == [1, 1, 16]
+    assert about["outputs"][0]["shape"] == [1, 1, 16]  # of a window of 3 frames 2 are given
     assert {path.name for path in program.iterdir()} == {"model.json", "model.safetensors", "model.stablehlo"}
+
+
+def test_a_released_model_comes_with_the_rates_that_give_its_strides_and_the_commands_that_judge_it(tmp_path, capsys):
+    """bridge_dataset has 5 Hz, of which the release makes stride 2 and the registry 3."""
+    robots = [("bridge_dataset", 7, 2), ("push", 2, 1), ("fractal20220817_data", 3, 1)]
+    start, run = make_checkpoint(tmp_path / "a", DISCRETE, robots), tmp_path / "run"
+    assert main(["convert", "from-official", str(start), "--out", str(run)]) == 0
+    said = capsys.readouterr().out
+    (entry,) = load_entries(run / "rates.toml")
+    assert entry.name == "bridge_dataset" and entry.rate == 2.5 and entry.stride == 2 != get_spec(entry.name).stride
+    assert "note: not in rates.toml: push, which the registry does not know" in said
+    assert "fractal20220817_data (3 values, 10 here), of other actions than the registry's" in said
+    command = said.split("next: ")[1].split("\nor: ")[0].replace("\\\n", "")
+    first, second = (shlex.split(part) for part in command.split("&&"))
+    assert first[:2] == ["hma", "tokenize"] and second[:3] == ["hma", "evaluate", str(run)] and first[2:] == second[3:]
+    assert str(run / "rates.toml") in first and "model.frames=3" in first and "eval.prompt_frames=1" in first
 
 
 @pytest.mark.parametrize(("base", "loads"), [(DISCRETE, True), (CONTINUOUS, False)], ids=["discrete", "continuous"])
