@@ -23,6 +23,9 @@ from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 
+BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "plan", "play", "check")
+"""Commands that keep nothing of what they had begun when they are stopped."""
+
 app = SubcommandApp()
 app.command(name="study")(study.study)
 app.command(name="sweep")(study.sweep)
@@ -62,4 +65,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
             args=arguments or ["--help"],
         )
 
-    return guarded(work, debug, own_process, skipping="--set store.corrupt=skip")
+    resumes = not set(arguments[:1]) & set(BEGIN_ANEW)
+    return guarded(work, debug, own_process, resumes=resumes, skipping="--set store.corrupt=skip")

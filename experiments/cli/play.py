@@ -14,6 +14,7 @@ from experiments.applications import DRIVEN
 from experiments.progress import console
 from experiments.setting import UNSET
 from hma_jax.config import ConfigError, ExecutionConfig, require
+from hma_jax.runtime.exits import raise_lost_request
 
 if TYPE_CHECKING:
     from data_pipelines.true_simulator import TrueSimulator
@@ -31,7 +32,7 @@ def play(
 ) -> None:
     """Serve a page on which a trained model is driven with keys, gamepad or sliders.
 
-    Needs the extra `play`. Runs until it is interrupted. docs/simulator.md describes the page.
+    Needs the extra `play`. Runs until it is interrupted, and ends with 130 then (SIGTERM: 143). docs/simulator.md describes the page.
 
     Args:
         run: Directory of a training run; without it the one in experiments/results/simulator_grown.
@@ -69,6 +70,7 @@ def play(
     )
     console.print(f"{run}: {len(simulator.robots)} robots; compiling")
     warm_up(simulator, together=1)
+    raise_lost_request()
 
     def truth(robot: Robot) -> TrueSimulator | None:
         # What draws a physics simulator belongs to one thread; turns are taken in several.
@@ -93,7 +95,9 @@ def play(
     try:
         asyncio.run(serve(app, host, port, say))
     except KeyboardInterrupt:
-        console.print("stopped" + ", as soon as a program is compiled" * compiling.is_alive())
+        if compiling.is_alive():
+            console.print("ends as soon as a program is compiled")
+        raise
     except OSError as error:
         raise ConfigError(f"cannot listen at {host}:{port}: {error.strerror}; choose another --port") from error
     finally:

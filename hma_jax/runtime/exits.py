@@ -11,9 +11,11 @@ from enum import IntEnum
 from types import FrameType
 
 IMPORTER = "<frozen importlib._bootstrap>"
+COMPILER = "compile_or_get_cached"
+"""JAX's function around the compiler, in its file compiler.py."""
 
 LOOK_EVERY = 0.05
-"""Seconds between two looks whether an import has ended that a request to stop waits for."""
+"""Seconds between two looks whether what a request to stop waits for has ended."""
 
 
 class Exit(IntEnum):
@@ -41,11 +43,13 @@ def terminated_like_interrupted() -> Iterator[None]:
     """SIGTERM raises Terminated in the main thread while the block runs; by default the process would just be gone.
 
     It waits for imports to end, and so does Ctrl-C: an exception in the middle of one is lost where a library tries
-    what it can import, leaves half a module, or ends the process by a signal in a library's C code.
+    what it can import, leaves half a module, or ends the process by a signal in a library's C code. It waits for the
+    compiler too, which cannot be interrupted: raised between its end and the use of the program that it made, an
+    exception loses the program, and the process ends by a segmentation fault.
     """
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _imports(frame):
+        if _waits(frame):
             again = threading.Timer(LOOK_EVERY, os.kill, (os.getpid(), number))
             again.daemon = True
             again.start()
@@ -85,10 +89,14 @@ def raise_lost_request() -> None:
         raise KeyboardInterrupt if request == Exit.INTERRUPTED else Terminated
 
 
-def _imports(frame: FrameType | None) -> bool:
-    while frame is not None and frame.f_code.co_filename != IMPORTER:
+def _waits(frame: FrameType | None) -> bool:
+    """Whether it imports or compiles."""
+    while frame is not None:
+        code = frame.f_code
+        if code.co_filename == IMPORTER or (code.co_name == COMPILER and code.co_filename.endswith("compiler.py")):
+            return True
         frame = frame.f_back
-    return frame is not None
+    return False
 
 
 def exit_of_interrupt(request: KeyboardInterrupt) -> Exit:

@@ -8,7 +8,10 @@ import signal
 import time
 from pathlib import Path
 
+import jax
 import pytest
+from jax._src import compiler
+from jax._src.config import enable_compilation_cache
 
 from hma_jax.runtime.exits import Exit, Terminated, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
 
@@ -46,6 +49,22 @@ def test_a_request_to_stop_waits_for_the_import_that_it_meets(number, code, tmp_
         time.sleep(60)
     assert module.whole and exit_of_interrupt(stopped.value) == code
     assert signal.getsignal(number) is before
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
+def test_a_request_to_stop_waits_for_the_program_that_is_compiled(number, code, monkeypatch):
+    """The compiler's program would be lost with the exception, and the process end by a segmentation fault."""
+    real, compiled = compiler.backend_compile_and_load, []
+
+    def compile_and_load(*arguments, **options):
+        os.kill(os.getpid(), number)
+        return compiled.append(real(*arguments, **options)) or compiled[-1]
+
+    monkeypatch.setattr(compiler, "backend_compile_and_load", compile_and_load)
+    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted(), enable_compilation_cache(False):
+        jax.jit(lambda x: x + 1)(1.0)
+        time.sleep(60)
+    assert len(compiled) == 1 and exit_of_interrupt(stopped.value) == code
 
 
 @pytest.mark.parametrize("number, code", [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])

@@ -4,7 +4,9 @@ import asyncio
 import contextlib
 import io
 import json
+import os
 import resource
+import signal
 import threading
 import time
 import zipfile
@@ -24,7 +26,9 @@ from experiments.applications.play import crowd as crowd_module
 from experiments.applications.play import server
 from experiments.applications.play.crowd import REPLIES, Visitor
 from experiments.applications.play.turn import Seat
+from experiments.cli.main import main
 from hma_jax.config import require
+from hma_jax.runtime.exits import Exit
 from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving
 from tests.hma_jax.simulator.small import simulator
 
@@ -164,6 +168,34 @@ def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp
     monkeypatch.setattr(server, "serve", serve)
     play(tmp_path, visitors=2)
     assert first == [1]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
+def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, monkeypatch, tmp_path, capsys):
+    from experiments.applications import simulators
+
+    async def serve(app, host, port, ready):
+        ready(port)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    assert main(["play", str(tmp_path), "--visitors", "1"]) == code
+    assert capsys.readouterr().err.endswith("; the same command begins anew\n")
+
+
+def test_a_request_to_stop_that_was_lost_while_it_compiled_is_obeyed_before_it_serves(monkeypatch, tmp_path):
+    from experiments.applications import simulators
+    from hma_jax.simulator import warm_up
+
+    def lost(*_, **__):
+        with contextlib.suppress(KeyboardInterrupt):  # as in a library's callback
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(warm_up, "warm_up", lost)
+    monkeypatch.setattr(server, "serve", lambda *_: pytest.fail("it serves"))
+    assert main(["play", str(tmp_path)]) == Exit.STOPPED
 
 
 def test_after_a_fault_of_the_device_all_begin_again_and_drive_on(monkeypatch):
