@@ -180,7 +180,7 @@ class Study:
     judged: Literal["first", "drawn"] = "first"  # on the datasets axis: the first datasets, or random ones per seed
     unseen: tuple[str, ...] = ()  # robots that no model is trained on but to adapt to them
     execution: ExecutionConfig = field(default_factory=ExecutionConfig)  # how trials are computed; names none
-    flops_per_second: float = 1e13  # sustained; as the next only for the estimates of --dry-run
+    flops_per_second: float = 1e13  # sustained, of one device; as the next only for the estimates of --dry-run
     trial_seconds: float = 120.0  # of a trial, besides computing: start, compilation, decoding, files
 
     def __post_init__(self):

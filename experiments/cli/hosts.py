@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, arg
 
 from experiments.setting import UNSET
+
+if TYPE_CHECKING:
+    from hma_jax.runtime.processes import Processes
 
 
 @dataclass(frozen=True)
@@ -28,13 +31,22 @@ class Hosts:
     lost_after: Annotated[float, arg(name="lost-after", metavar="SECONDS")] = 90.0
     """Without a sign of life of one process, after which the others end with code 75."""
 
-    def join(self) -> None:
-        """Joins the other processes, if there are any; from then on only process 0 writes to the screen."""
-        from hma_jax.runtime.processes import Processes, start
+    def _asked(self) -> Processes:
+        from hma_jax.runtime.processes import Processes
 
-        asked = Processes(
+        return Processes(
             self.coordinator, self.processes, self.process, self.distributed, self.start_timeout, self.lost_after
         ).or_from(os.environ)
+
+    def count(self) -> int:
+        """How many processes are asked for; 1 also where --distributed is to find it out."""
+        return self._asked().processes or 1
+
+    def join(self) -> None:
+        """Joins the other processes, if there are any; from then on only process 0 writes to the screen."""
+        from hma_jax.runtime.processes import start
+
+        asked = self._asked()
         if not asked.several:
             return
         start(asked)

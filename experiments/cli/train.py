@@ -33,6 +33,7 @@ def train(
     remake: OmitArgPrefixes[Remake],
     hosts: OmitArgPrefixes[Hosts],
     begin: Annotated[Path | None, arg(name="from", metavar="RUN"), UNSET] = None,
+    dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False,
 ) -> None:
     """Train one model: the study's reference trial, on all trajectories unless told otherwise.
 
@@ -46,14 +47,20 @@ def train(
         hosts: Several processes that train together, on one host or on many.
         begin: A trained or converted model that knows the study's robots. The new run begins with its weights, or with
             their average where it keeps one, and has its architecture and tokenizer. Its other robots stay as they are.
+        dry_run: Print parameters, FLOPs and expected time on the devices that it would use here, and stop.
     """
     from hma_jax.training.runs import load_run
 
-    hosts.join()
+    if not dry_run:
+        hosts.join()
     trained = None if begin is None else load_run(begin, "auto")
     setting = make_setting(asked) if trained is None else setting_of(begin, trained, asked)
     if trained is not None:
         require_known(begin, trained, setting)
+    if dry_run:
+        _check(setting, one.directory() or setting.workspace.root / "model", one.trajectories, options)
+        _print_cost(setting, _single_trial(setting, one.trajectories), hosts.count())
+        return
     train_model(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
 
 
@@ -191,6 +198,19 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
     """The reference trial, but that the largest number of trajectories in a sweep does not bound it."""
     study = setting.study
     return dataclasses.replace(reference_trial(study, study.seeds[0]), max_trajectories=trajectories)
+
+
+def _print_cost(setting: Setting, trial: Trial, processes: int) -> None:
+    """The dry run of a study with nothing but this trial, on the devices of so many `processes` as this one."""
+    from experiments.cost import Devices, devices_of, plan_table
+    from experiments.running.launchers.registry import Launching
+    from experiments.sweeps.sweep import Point, Sweep
+
+    mesh, own = setting.study.execution.mesh, Launching().share()
+    share = own * processes if own else float(max(processes, mesh.least))
+    model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
+    devices, given, trained = Devices(devices_of(mesh, share)), bool(setting.data), setting.tokenizer is None
+    console.print(plan_table(setting.study, [model], devices, given=given, trained=trained, evaluated=False))
 
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:

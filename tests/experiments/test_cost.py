@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.cli.main import main
-from experiments.cost import devices_of, estimate, evaluation_flops_per_window, plan_trials
+from experiments.cost import checkpoint_bytes, devices_of, estimate, evaluation_flops_per_window, plan_trials
 from experiments.preparing_cost import describe, estimate_preparing
 from experiments.presets import PAPER, SMOKE, SMOKE_CONTINUOUS
 from experiments.running.launchers import local
@@ -124,6 +124,12 @@ def test_several_devices_are_as_many_times_faster():
     for one, eight in zip(*(plan_trials(SMOKE, [sweep], devices).values() for devices in (1, 8)), strict=True):
         start = SMOKE.trial_seconds
         assert one.seconds - start == pytest.approx(8 * (eight.seconds - start)) and one.flops == eight.flops
+
+
+def test_a_model_that_is_only_trained_pays_for_no_evaluation_and_leaves_two_checkpoints():
+    plans = plan_trials(SMOKE, [find_axis("width")(SMOKE)], evaluated=False)
+    assert all(plan.flops == plan.cost.train_flops < plan.cost.flops for plan in plans.values())
+    assert all(checkpoint_bytes(plan) == 2 * 3 * 4 * plan.cost.parameters for plan in plans.values())
 
 
 def test_a_mesh_that_does_not_fit_what_a_trial_gets_is_refused_before_it_is_priced():

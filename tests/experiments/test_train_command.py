@@ -13,7 +13,9 @@ from experiments.cli.begin import require_known, setting_of, strangers
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.running import trial as trials
+from experiments.running.launchers import local
 from experiments.running.run_options import RunOptions
+from experiments.running.slots import Accelerators
 from experiments.setting import StudyArguments
 from hma_jax.config import ConfigError
 from hma_jax.convert import read_official, write_run
@@ -64,6 +66,25 @@ def test_all_trajectories_unless_told_otherwise(train, tmp_path):
     assert "training on 1 of 2 robots: 10 of 13 trajectories, 30 windows of 4 frames" in said
     assert f"note: not trained on {BASE.name}: 2 frames, the least there may be, need 4 native frames" in said
     assert load_run(tmp_path / "run").provenance["loader"]["max_trajectories"] is None
+
+
+def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(local, "find_accelerators", lambda: None)
+    dry = ["train", "--preset", "smoke", "--dry-run", "--out", str(tmp_path), "--set", "flops_per_second=1e20"]
+    for more, said in (
+        ("", "priced for 1 device at 100.0 EFLOP/s each"),
+        ("--mesh 2 -1 2", "priced for 4 devices at"),
+        ("--coordinator host0:29400 --processes 4 --process 0", "priced for 4 devices at"),
+        ("--set trial_seconds=7200", "2.0 h to train."),
+    ):
+        assert main([*dry, *more.split()]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert "1 trial of 3 steps" in printed and " to evaluate" not in printed and said in printed
+    monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", tuple("01234567")))
+    assert main([*dry, *"--coordinator host0:29400 --processes 2 --process 1".split()]) == 0
+    assert "priced for 16 devices at" in " ".join(capsys.readouterr().out.split())
+    assert main([*dry, "--trajectories", "0"]) == 2 and "--trajectories must be at least 1" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_fewer_trajectories_when_asked_for(train):
