@@ -116,7 +116,7 @@ MEANINGS = {
     "prompt": "frames to continue: token ids, or latent patches",
     "actions": "raw action chunks of all frames, padded with zeros; chunk t is executed after frame t",
     "embodiment": "index of each example's robot in `table`",
-    "key": "any two numbers; the same ones give the same frames",
+    "key": "any two numbers, as jax.random.key_data gives them; row i of the batch draws with fold_in(key, i)",
 }
 
 
