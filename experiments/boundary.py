@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import select
 import sys
 import warnings
 from collections.abc import Callable
@@ -30,9 +31,20 @@ def guarded(
         _silence_background()
     try:
         with terminated_like_interrupted():
-            work()
+            try:
+                work()
+            except SystemExit:  # of --help
+                sys.stdout.flush()
+                raise
+            sys.stdout.flush()  # not later, where nothing catches what is wrong with it
             _end_together()
         return Exit.DONE
+    except BrokenPipeError as error:
+        if not _unread():
+            return _failed(error, debug, skipping)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left in buffers goes there
+        _end_together(error, Exit.UNREAD)
+        return Exit.UNREAD
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
         what = "stopped by SIGTERM" if code == Exit.STOPPED else "interrupted"
@@ -40,13 +52,29 @@ def guarded(
         _end_together(request, code)
         return code
     except Exception as error:  # the boundary of the program
-        code = _exit_code(error)
-        if debug or code is None:
-            _end_together(error, code or Exit.FAILED, show=True)
-            raise
-        _say(f"error: {_words(error, skipping)}")
-        _end_together(error, code)
-        return code
+        return _failed(error, debug, skipping)
+
+
+def _failed(error: Exception, debug: bool, skipping: str) -> int:
+    """Says what is wrong, and returns the exit code. Raises `error` again if it is a bug, or with `debug`."""
+    code = _exit_code(error)
+    if debug or code is None:
+        _end_together(error, code or Exit.FAILED, show=True)
+        raise error
+    _say(f"error: {_words(error, skipping)}")
+    _end_together(error, code)
+    return code
+
+
+def _unread() -> bool:
+    """Whether standard output is a pipe, or a socket, that nobody reads any more; other pipes break too."""
+    try:
+        number = sys.stdout.fileno()
+    except (OSError, ValueError):  # a test's
+        return False
+    asked = select.poll()
+    asked.register(number, 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in asked.poll(0))
 
 
 def _end_together(error: BaseException | None = None, code: int = Exit.DONE, show: bool = False) -> None:
