@@ -4,22 +4,33 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.runner import Job, Monitor
 from hma_jax.runtime.exits import raise_lost_request
 
-console = Console(highlight=False, width=None if sys.stdout.isatty() else 110)
+
+class _Output(Console):
+    def on_broken_pipe(self) -> None:
+        """What rich has caught goes on to the boundary of the program; rich itself would end it as failed."""
+        raise
+
+
+console = _Output(highlight=False, width=None if sys.stdout.isatty() else 110)
 errors = Console(stderr=True, highlight=False)
+
+FOLDED = 16
+"""The least width of a table's column whose words may be broken."""
 
 SAY_EVERY = 30.0
 """Seconds between lines about work that goes on, where there is no terminal for a bar."""
@@ -84,11 +95,63 @@ class Pace:
         return f", {_clock((now - began) / (done - before) * (total - done))} left"
 
 
-def tidy_table(title: str, *columns: str) -> Table:
-    """A plain table: words in the first column, numbers in the others."""
-    table = Table(
-        title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
-    )
+class TidyTable(Table):
+    """A plain table that cuts no cell short: columns that do not fit beside the others stand in further tables below,
+    each after the first column again."""
+
+    def __init__(self, title: str | None = None):
+        super().__init__(
+            title=title, title_justify="left", caption_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1)
+        )
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        sizes = [_sizes(column, console, options) for column in self.columns]
+        room = options.max_width - 1  # of each column 2 beside its words: padding, and a line or an edge
+        parts = [[0]]
+        for i in range(1, len(sizes)):
+            if len(parts[-1]) > 1 and sum(sizes[k].minimum + 2 for k in (*parts[-1], i)) > room:
+                parts.append([0])
+            parts[-1].append(i)
+        for chosen in parts:
+            part = self._of(chosen, chosen is parts[0], chosen is parts[-1])
+            inside = [sizes[k] for k in chosen]
+            spare = room - sum(size.minimum + 2 for size in inside)
+            wished = sum(size.maximum - size.minimum for size in inside)
+            if 0 <= spare < wished:
+                for column, size in zip(part.columns, inside, strict=True):
+                    column.width = size.minimum + spare * (size.maximum - size.minimum) // wished
+            elif spare < 0:  # a very narrow terminal
+                for column in part.columns:
+                    column.no_wrap, column.overflow = False, "fold"
+            yield from Table.__rich_console__(part, console, options)
+
+    def _of(self, chosen: Sequence[int], first: bool, last: bool) -> Table:
+        part, columns = TidyTable(self.title if first else None), [self.columns[i] for i in chosen]
+        part.caption = self.caption if last else None
+        for of in columns:
+            part.add_column(
+                of.header, justify=of.justify, overflow=of.overflow, no_wrap=of.no_wrap, min_width=of.min_width
+            )
+        for cells in zip(*(of.cells for of in columns), strict=True):
+            part.add_row(*cells)
+        return part
+
+
+def _sizes(column: Column, console: Console, options: ConsoleOptions) -> Measurement:
+    """The width below which a column's words are broken, or cut, and the one that it takes if it can."""
+    whole = options.update(width=sys.maxsize)
+    cells = [Measurement.get(console, whole, cell) for cell in (column.header, *column.cells)]
+    most = max(column.min_width or 1, *(cell.maximum for cell in cells))
+    if column.no_wrap:
+        return Measurement(most, most)
+    # One that folds may break words.
+    least = FOLDED if column.overflow == "fold" else max(cell.minimum for cell in cells)
+    return Measurement(min(max(column.min_width or 1, least), most), most)
+
+
+def tidy_table(title: str, *columns: str) -> TidyTable:
+    """Words in the first column, numbers in the others."""
+    table = TidyTable(title)
     for i, name in enumerate(columns):
         table.add_column(name, justify="right" if i else "left", no_wrap=True, min_width=len(name))
     return table

@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 
 def few(names: Sequence[str]) -> str:
     """The first names of a list that may be long."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def number(value: float, error: float, sign: str = "") -> str:
+    """`value` to two digits of its standard error, and four after the point at most. `sign`: as in a format, "+" for one
+    before every value."""
+    digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
+    return f"{value:{sign}.{digits}f}"
+
+
+def plus_minus(mean: float, error: float, sign: str = "") -> str:
+    """A mean with its standard error, or alone where none is known."""
+    if 0 < error < math.inf:
+        return f"{number(mean, error, sign)} ± {number(error, error)}"
+    return f"{mean:{sign}.4g}" + (" ± 0" if error == 0 else "")

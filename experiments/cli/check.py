@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 from experiments.progress import console, step, tidy_table
 from experiments.running.workspace import Workspace
 from experiments.setting import UNSET, require_local
+from experiments.words import plus_minus
 from hma_jax.config import require
 
 
@@ -44,7 +45,7 @@ def check(
     for robot, effects in found.items():
         table = tidy_table(robot, "dimension", "worth", "verdict")
         for effect in effects:
-            worth = f"{effect.worth.mean:.4f} ± {effect.worth.sem:.4f}"
+            worth = plus_minus(effect.worth.mean, effect.worth.sem)
             table.add_row(names[robot][effect.dimension], worth, verdict(effect, names[robot]))
         console.print(table)
     write_effects(run / "check.json", found, names)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, tidy_table
+from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.runtime.outputs import make_directory
 
@@ -62,6 +63,8 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     several = max((row.seeds for row in rows), default=1)
     seeds = f" and over {several} seeds" if several > 1 else ""
     table.caption = f"Differences with standard errors over episodes{seeds}, window by window."
+    if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
+        table.caption += f" No error of {few(alone)}: one held-out episode."
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
         table.caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
     elif not (a.tokenizer and b.tokenizer):
@@ -74,4 +77,4 @@ def _unit(metric: str) -> str:
 
 
 def _cell(row: Difference | None) -> str:
-    return f"{row.mean:+.4f} ± {row.sem:.4f}" if row else ""
+    return plus_minus(row.mean, row.sem, "+") if row else ""

@@ -12,6 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 from experiments.cli.hosts import Hosts
 from experiments.progress import console, step, tidy_table
 from experiments.setting import Setting, StudyArguments, make_setting, short
+from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
 from hma_jax.config.json import from_dict
@@ -92,7 +93,9 @@ def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
     which = ", averaged weights" if trained.weights == "ema" else ""
     table = tidy_table(f"{short(run)}, step {trained.step:,}{which}", "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
-        table.add_row(name, *(f"{stats[m].mean:.4g} ± {stats[m].sem:.2g}" if m in stats else "" for m in metrics))
+        table.add_row(name, *(plus_minus(stats[m].mean, stats[m].sem) if m in stats else "" for m in metrics))
+    if alone := [n for n, stats in summary.datasets.items() if all(s.clusters == 1 for s in stats.values())]:
+        table.caption = f"No error of {few(alone)}: one held-out episode does not say how they differ."
     console.print(table)
     write_evaluation(run, evaluation)
     write_file(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))

@@ -5,13 +5,13 @@ from __future__ import annotations
 import base64
 import html
 import io
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from experiments import words
 from experiments.rows import CurvePoint
 
 
@@ -45,9 +45,8 @@ def pm(mean: float, error: float) -> str:
 
 
 def number(value: float, error: float) -> str:
-    """`value` to two digits of `error`."""
-    digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
-    return f"{value:.{digits}f}".replace("-", "\u2212")
+    """`words.number` with a minus sign as it is set in print."""
+    return words.number(value, error).replace("-", "\u2212")
 
 
 def picture(path: Path, title: str) -> str:

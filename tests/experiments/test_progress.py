@@ -1,0 +1,53 @@
+"""Tables that say everything at any width."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from experiments.progress import tidy_table
+
+METRICS = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval")
+
+
+def shown(table, width: int) -> str:
+    console = Console(file=io.StringIO(), width=width, highlight=False)
+    console.print(table)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 80, 110, 200])
+def test_no_cell_is_cut_short_at_any_width(width):
+    table = tidy_table("a run", "dataset", *METRICS)
+    for name in ("my_robot", "overall"):
+        table.add_row(name, *(f"{i}7.1234 ± 5.4321" for i, _ in enumerate(METRICS)))
+    table.caption = "a caption"
+    said = shown(table, width)
+    assert "…" not in said and max(map(len, said.splitlines())) <= width
+    words = said.split()
+    assert all(words.count(metric) == 1 for metric in METRICS)
+    assert all(words.count(f"{i}7.1234") == 2 for i in range(len(METRICS)))
+    tables = words.count("dataset")
+    assert words.count("my_robot") == tables and (tables == 1) == (width == 200)
+    assert said.count("a run") == said.count("a caption") == 1
+
+
+def test_a_name_wider_than_the_terminal_is_folded():
+    table = tidy_table("", "field", "kind")
+    table.add_row("observation/" * 5, "image")
+    said = shown(table, 40)
+    assert "…" not in said and "image" in said and "".join(said.split()).count("observation/") >= 4
+
+
+@pytest.mark.parametrize("width", [60, 80, 110, 200])
+def test_a_column_of_prose_takes_what_the_others_leave(width):
+    table = tidy_table("", "name", "Hz", "steps")
+    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
+    table.add_column("what it is", min_width=30)
+    prose = [f"word{i}" for i in range(40)]
+    table.add_row("a_name_of_a_dataset_that_is_longer_than_most", "10", "1234", " ".join(prose))
+    said = shown(table, width)
+    assert all(len(line) <= width for line in said.splitlines())
+    assert [word for word in said.split() if word.startswith("word")] == prose

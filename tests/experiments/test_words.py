@@ -1,0 +1,25 @@
+"""Numbers as they are printed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from experiments.words import plus_minus
+
+
+@pytest.mark.parametrize(
+    ("mean", "error", "said"),
+    [
+        (27.1234, 5.4321, "27.1 ± 5.4"),
+        (65410.47, 655.1, "65410 ± 655"),
+        (0.0, 2.4e-17, "0.0000 ± 0.0000"),
+        (0.5, 0.0, "0.5 ± 0"),
+        (10.3456, math.nan, "10.35"),
+        (math.inf, math.nan, "inf"),
+    ],
+)
+def test_a_mean_has_the_digits_that_its_error_leaves(mean, error, said):
+    assert plus_minus(mean, error) == said
+    assert plus_minus(mean, error, "+") == f"+{said}"
