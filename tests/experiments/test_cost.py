@@ -1,6 +1,7 @@
 """What `--dry-run` says a trial will cost."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,11 +10,11 @@ import pytest
 from experiments.cli.main import main
 from experiments.cost import checkpoint_bytes, devices_of, estimate, evaluation_flops_per_window, plan_trials
 from experiments.preparing_cost import describe, estimate_preparing
-from experiments.presets import PAPER, SMOKE, SMOKE_CONTINUOUS
+from experiments.presets import ACCELERATOR, PAPER, SMOKE, SMOKE_CONTINUOUS
 from experiments.running.launchers import local
 from experiments.running.launchers.registry import Launching
 from experiments.running.slots import Accelerators
-from experiments.sweeps.registry import find_axis
+from experiments.sweeps.registry import find_axis, plan_sweeps
 from experiments.sweeps.sweep import POINT, reference_trial
 from hma_jax.config import ConfigError, EvalConfig, ExecutionConfig, MaskingConfig, MeshConfig
 from hma_jax.evaluation.protocol import make_predictor
@@ -177,3 +178,17 @@ def test_what_trials_have_in_common_is_paid_for_once():
     per_step = plans[500].cost.train_flops / 500
     own = {steps: plan.flops - plan.cost.evaluation_flops for steps, plan in plans.items()}
     assert own[500] == pytest.approx(500 * per_step) and own[1000] == pytest.approx((1000 - 400) * per_step)
+
+
+def test_the_table_of_what_to_run_on_is_what_dry_runs_say():
+    """docs/launching.md: a row for each machine, of devices of a trial, trials at a time, rate."""
+    page = (Path(__file__).parents[2] / "docs" / "launching.md").read_text()
+    rows = [line.split("|")[1:-1] for line in page.splitlines() if line.startswith(("| 1 H100", "| 8 H100", "| TPU v"))]
+    sweeps = plan_sweeps(ACCELERATOR, ACCELERATOR.axes)
+    machines = ((1, 1, 1e14), (1, 8, 1e14), (4, 4, 2.75e13), (8, 1, 1.97e13))
+    for (*_, hours, _, device_hours), (each, at_once, rate) in zip(rows, machines, strict=True):
+        study = replace(ACCELERATOR, flops_per_second=rate)
+        seconds = [plan.seconds for plan in plan_trials(study, sweeps, each).values()]
+        whole = estimate_preparing(study).seconds + max(sum(seconds) / at_once, max(seconds))
+        assert (float(hours), float(device_hours)) == (round(whole / 3600, 1), round(each * sum(seconds) / 3600, 1))
+    assert f"{len(seconds)} trials" in page
