@@ -1,7 +1,6 @@
 """`hma train`: its own settings, and what it says it trains on."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.cli.begin import require_known, setting_of, strangers
+from data_pipelines.registry import DatasetSpec
+from experiments.cli.begin import setting_of, strangers
 from experiments.cli.main import main
 from experiments.presets import get_preset
 from experiments.running import trial as trials
@@ -19,7 +19,6 @@ from experiments.running.slots import Accelerators
 from experiments.setting import StudyArguments
 from hma_jax.config import ConfigError
 from hma_jax.convert import read_official, write_run
-from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
@@ -151,7 +150,7 @@ def test_the_average_of_the_weights_is_evaluated_unless_told_otherwise(train, wh
         return said.out if code == 0 else said.err
 
     assert "step 3, averaged weights" in evaluate(tmp_path / "run")
-    last = evaluate(tmp_path / "run", "--weights", "last")
+    last = evaluate(tmp_path / "run", "--weights", "last", "--replace")
     assert "step 3" in last and "averaged" not in last
 
 
@@ -189,14 +188,20 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
     assert "is another model than --set asks for (there -> asked for): model.width: 16 -> 24. Leave out" in said
 
 
+def make_released(root: Path, *robots: tuple[str, int, int]) -> Path:
+    """A run that was converted, of another model than the smoke study's, which takes its tokens."""
+    changes = {"d_model": 8, "T": 4, "S": 16, "image_vocab_size": 256}
+    write_run(read_official(make_checkpoint(root / "checkpoint", DISCRETE | changes, robots)), root / "model")
+    return root / "model"
+
+
+def as_registered(spec: DatasetSpec) -> tuple[str, int, int]:
+    return spec.name, spec.action_dim, spec.stride
+
+
 @pytest.fixture(scope="module")
 def released(tmp_path_factory) -> Path:
-    """A run that was converted, of another model than the smoke study's, which takes its tokens."""
-    root = tmp_path_factory.mktemp("released")
-    robots = [(spec.name, spec.action_dim, spec.stride) for spec in (BASE, ARM)] + [("push2", 2, 1)]
-    changes = {"d_model": 8, "T": 4, "S": 16, "image_vocab_size": 256}
-    write_run(read_official(make_checkpoint(root / "a", DISCRETE | changes, robots)), root / "rel")
-    return root / "rel"
+    return make_released(tmp_path_factory.mktemp("a"), as_registered(BASE), as_registered(ARM), ("push2", 2, 1))
 
 
 def test_a_converted_run_is_fine_tuned_as_the_model_that_it_is(released, train, tmp_path, capsys):
@@ -237,13 +242,13 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     given = ("--tokenizer", str(tokenizer), "--data", *data)
     assert "there is nothing to add. To train it on: hma train --from " in refused(*adapt, *given)
     assert "made for frames at stride 3, here they are at stride 13" in refused(*goes_on, *given, "--set", "rate=0.4")
-    beside = shutil.copytree(released, tmp_path / "study" / "model")
-    few = replace(load_run(beside), table=EmbodimentTable(load_run(beside).table.entries[1:]))
-    asked = StudyArguments("smoke", out, tuple(data))
-    setting = setting_of(beside, few, asked)
-    assert setting.tokenizer == tokenizer and strangers(few, setting) == [BASE.name]
-    with pytest.raises(ConfigError, match=f"not {BASE.name}. To add them: hma adapt "):
-        require_known(beside, few, setting)
-    other = replace(few, provenance={"tokenizer": "another"})
+    beside = make_released(tmp_path / "study", as_registered(ARM))
+    assert f"knows {ARM.name}, not {BASE.name}. To add them: hma adapt " in refused(
+        "train", "--from", str(beside), "--data", *data
+    )
+    asked, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
+    setting = setting_of(beside, trained, asked)
+    assert setting.tokenizer == tokenizer and strangers(trained, setting) == [BASE.name]
+    other = replace(trained, provenance={"tokenizer": "another"})
     with pytest.raises(ConfigError, match="trained on tokens of tokenizer another, .*; add --tokenizer"):
         setting_of(beside, other, asked)
