@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.analysis.compare import Side
+from experiments.preparing.made_from import read_stamp
 from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.running.sealed import RESULT, read_result
@@ -82,9 +83,12 @@ def read_side(path: Path) -> Side:
 
 
 def _tokenizer_of(run: Path) -> str:
-    """Of a training run's latest checkpoint; "" where it does not say."""
+    """That an evaluation was on, or of a training run's latest checkpoint; "" where neither says."""
+    from experiments.cli.evaluated import STAMP
     from hma_jax.training.reading import list_steps, read_description
 
+    if (stamp := read_stamp(run, STAMP)) is not None:
+        return stamp.inputs.get("tokenizer", "")
     steps = list_steps(run / "checkpoints")
     described = read_description(run / "checkpoints" / str(steps[-1])) if steps else {}
     return described.get("provenance", {}).get("tokenizer", "")

@@ -7,11 +7,12 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
+from experiments.cli.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.cli.hosts import Hosts
 from experiments.progress import console, step, tidy_table
-from experiments.setting import Setting, StudyArguments, make_setting, short
+from experiments.setting import UNSET, Setting, StudyArguments, make_setting, require_local, short
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
@@ -36,6 +37,8 @@ def evaluate(
     asked: OmitArgPrefixes[StudyArguments],
     hosts: OmitArgPrefixes[Hosts],
     weights: Weights = "auto",
+    to: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: RUN)")] = None,
+    replace: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:
     """Evaluate a trained model on the frozen windows of a study.
 
@@ -44,23 +47,29 @@ def evaluate(
         asked: The study whose windows, tokenizer and protocol are used.
         hosts: Several processes that evaluate together, on one host or on many.
         weights: The last weights, their moving average (train.ema_decay), or the average where there is one.
+        to: Directory for the results, for those of several sets of windows beside each other.
+        replace: Put the results in place of those of other data, windows or settings.
+            Otherwise these stay, and the command is refused.
     """
     hosts.join()
-    evaluate_model(make_setting(asked), run, weights)
+    evaluate_model(make_setting(asked), run, weights, to, replace)
 
 
-def evaluate_model(setting: Setting, run: Path, weights: Weights) -> None:
+def evaluate_model(setting: Setting, run: Path, weights: Weights, to: Path | None = None, replace: bool = False) -> None:
+    """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may be
+    replaced."""
     from hma_jax.runtime.processes import is_writer
     from hma_jax.training.claim import EVALUATION, locked_run
     from hma_jax.training.runs import load_model
 
+    require_local("--to", to)
     trained = load_model(run, setting.study.execution, weights).run
     # Before the work: that its results can be written, and by nobody else.
-    with locked_run(run, EVALUATION) if is_writer() else nullcontext():
-        _evaluate(setting, run, trained)
+    with locked_run(to or run, EVALUATION) if is_writer() else nullcontext():
+        _evaluate(setting, run, trained, to or run, replace)
 
 
-def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
+def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: bool) -> None:
     from experiments.running.trial import evaluate_on, open_materials, write_evaluation
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
@@ -74,9 +83,13 @@ def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
         console.print(f"note: not evaluated, for want of windows here: {', '.join(left_out)}", soft_wrap=True)
     if untrained:
         console.print(f"note: not evaluated, for it was not trained on: {', '.join(untrained)}", soft_wrap=True)
+    names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
+    made_from = describe_evaluation(trained, names, materials, setting.study.eval)
+    if not replace:
+        require_same_evaluation(place, made_from)
     with step(f"evaluate {short(run)}") as update:
         evaluation = evaluate_on(
-            tuple(name for name in trained.table.names if name in frozen - set(untrained)),
+            names,
             trained.params,
             trained.model,
             trained.table,
@@ -97,9 +110,10 @@ def _evaluate(setting: Setting, run: Path, trained: Run) -> None:
     if alone := [n for n, stats in summary.datasets.items() if all(s.clusters == 1 for s in stats.values())]:
         table.caption = f"No error of {few(alone)}: one held-out episode does not say how they differ."
     console.print(table)
-    write_evaluation(run, evaluation)
-    write_file(run / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
-    wrote(run / "evaluation.json", run / FILE, run / "samples.npz")
+    write_evaluation(place, evaluation)
+    write_file(place / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
+    made_from.save(place, STAMP)
+    wrote(place / "evaluation.json", place / FILE, place / "samples.npz")
 
 
 def _not_trained_on(trained: Run, materials: Materials) -> list[str]:

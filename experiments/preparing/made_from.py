@@ -59,14 +59,14 @@ class MadeFrom:
     def id(self) -> str:
         return stable_hash(self.identity())
 
-    def save(self, directory: Path) -> None:
-        write_file(directory / STAMP, json.dumps(to_dict(self), indent=1))
+    def save(self, directory: Path, name: str = STAMP) -> None:
+        write_file(directory / name, json.dumps(to_dict(self), indent=1))
 
 
-def read_stamp(directory: Path) -> MadeFrom | None:
+def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
     """What the thing in `directory` was made from; None if it is not written down there."""
     try:
-        there = from_dict(MadeFrom, json.loads((directory / STAMP).read_text()))
+        there = from_dict(MadeFrom, json.loads((directory / name).read_text()))
     except (OSError, ValueError):  # ConfigError is a ValueError
         return None
     moved = {name: there.recorded[name] for name in FORMERLY_RECORDED if name in there.recorded}

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import pytest
 
 from data_pipelines.tokens import part_maker
+from experiments.analysis.tables import read_side
 from experiments.cli.main import main
 from experiments.running import trial as trials
 from experiments.running import trial_main
@@ -164,6 +165,18 @@ def test_two_evaluations_of_one_run_are_refused(where, study, capsys):
         assert main(evaluate) == Exit.REFUSED
     assert f"{study / 'model'} is being evaluated by process {os.getpid()} on " in capsys.readouterr().err
     assert (study / "model" / "evaluation.json").read_bytes() == before
+
+
+def test_results_of_other_windows_or_settings_are_kept_unless_told_otherwise(where, study, tmp_path, capsys):
+    run, other = study / "model", ("--set", "eval.perplexity_group=2")
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    assert main(["evaluate", str(run), *where, *other]) == Exit.REFUSED
+    said = capsys.readouterr().err
+    assert "eval.perplexity_group: 4 -> 2\n" in said and "--to DIR, or add --replace" in said
+    assert main(["evaluate", str(run), *where, *other, "--to", str(tmp_path / "beside")]) == 0
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    assert {"evaluation.json", "windows.parquet", "samples.npz"} < {p.name for p in (tmp_path / "beside").iterdir()}
+    assert read_side(tmp_path / "beside").tokenizer == read_side(run).tokenizer != ""
 
 
 def test_a_model_that_is_being_trained_may_be_evaluated(where, study):

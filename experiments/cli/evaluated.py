@@ -1,0 +1,82 @@
+"""What the results of `hma evaluate` are of, written beside them, so that those of other windows do not replace them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.preparing.made_from import MadeFrom, dataset_differences, differences, read_stamp
+from hma_jax.config import ConfigError, EvalConfig
+from hma_jax.config.json import from_dict, stable_hash, to_dict
+
+if TYPE_CHECKING:
+    from experiments.running.trial import Materials
+    from hma_jax.training.runs import Run
+
+STAMP = "evaluation.made_from.json"
+
+
+def describe_evaluation(trained: Run, names: Sequence[str], materials: Materials, config: EvalConfig) -> MadeFrom:
+    """Model, windows of the datasets `names`, and protocol. The step is recorded only: of a run that trains on, later
+    results replace earlier ones."""
+    train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
+    chosen = {d.dataset: d.windows for d in materials.manifest.datasets}
+    data = {
+        name: {
+            "tokens": materials.store.hash((name,)),
+            "windows": len(chosen[name]),
+            "chosen": stable_hash(chosen[name]),
+        }
+        for name in names
+    }
+    inputs = {
+        "model": stable_hash({"model": trained.model, "train": train, "provenance": trained.provenance}),
+        "weights": trained.weights,
+        "tokenizer": materials.tokenizer.identity,
+        "frames": materials.manifest.frames,
+        "rate": materials.manifest.rate,
+        "eval": _protocol(to_dict(config)),
+        "datasets": sorted(names),
+        "data": data,
+    }
+    return MadeFrom(inputs, {"step": trained.step})
+
+
+def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:
+    """Raises ConfigError if `place` holds results of another evaluation than `wanted`."""
+    there = read_stamp(place, STAMP)
+    if there is not None:
+        known = there.inputs | {"eval": _protocol(there.inputs.get("eval", {}))}
+        lines = differences(known, wanted.inputs)
+    else:
+        lines = _differences_of_windows(place, wanted)
+    if lines:
+        raise ConfigError(
+            f"{place}: the results there are of another evaluation (there -> asked for):\n  "
+            + "\n  ".join(lines)
+            + "\nNothing was changed. Write the new ones elsewhere with --to DIR, or add --replace, which puts them in "
+            "place of those."
+        )
+
+
+def _protocol(values: dict[str, Any]) -> dict[str, Any]:
+    """As this version writes it, with the batch of nobody: no result depends on that."""
+    return to_dict(replace(from_dict(EvalConfig, values), batch=EvalConfig.batch))
+
+
+def _differences_of_windows(place: Path, wanted: MadeFrom) -> list[str]:
+    """From results of an earlier version, which do not say what they are of: datasets, and how many windows of each."""
+    from hma_jax.evaluation.windows import FILE, WindowTable
+
+    try:
+        there = WindowTable.load(place / FILE)
+    except ConfigError:  # none, or no use
+        return []
+    lines = dataset_differences(sorted(there.datasets), wanted.inputs["datasets"])
+    for name, facts in wanted.inputs["data"].items():
+        count = len(there.of(name))
+        if count not in (0, facts["windows"]):
+            lines.append(f"windows of {name}: {count} -> {facts['windows']}")
+    return lines

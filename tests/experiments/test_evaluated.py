@@ -1,0 +1,64 @@
+"""Whether results that lie in a directory are of the evaluation that is asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from experiments.cli.evaluated import STAMP, require_same_evaluation
+from experiments.preparing.made_from import MadeFrom
+from hma_jax.config import ConfigError, EvalConfig
+from hma_jax.config.json import to_dict
+from hma_jax.evaluation.windows import FILE, WindowTable
+
+
+def made_from(step: int = 3, windows: int = 2, name: str = "arm", **changed) -> MadeFrom:
+    data = {name: {"tokens": "t", "windows": windows, "chosen": f"{windows}"}}
+    inputs = {"model": "m", "weights": "last", "tokenizer": "a", "eval": to_dict(EvalConfig()), "datasets": [name]}
+    return MadeFrom(inputs | {"data": data} | changed, {"step": step})
+
+
+def test_the_same_evaluation_may_be_repeated_of_a_later_step_too(tmp_path):
+    require_same_evaluation(tmp_path, made_from())
+    made_from().save(tmp_path, STAMP)
+    require_same_evaluation(tmp_path, made_from())
+    require_same_evaluation(tmp_path, made_from(step=9))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "line"),
+    [
+        (made_from(name="drawer"), "datasets: 1 -> 1, without arm and with drawer"),
+        (made_from(windows=5), "data of arm.windows: 2 -> 5"),
+        (made_from(tokenizer="b"), "tokenizer: 'a' -> 'b'"),
+        (made_from(weights="ema"), "weights: 'last' -> 'ema'"),
+        (made_from(model="n"), "model: 'm' -> 'n'"),
+        (made_from(eval=to_dict(EvalConfig(seed=1))), "eval.seed: 0 -> 1"),
+    ],
+)
+def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
+    made_from().save(tmp_path, STAMP)
+    with pytest.raises(ConfigError) as refused:
+        require_same_evaluation(tmp_path, wanted)
+    assert line in str(refused.value) and "--to DIR" in str(refused.value) and "--replace" in str(refused.value)
+
+
+def test_a_setting_of_the_protocol_that_came_later_is_no_difference(tmp_path):
+    there = made_from()
+    del there.inputs["eval"]["other_actions"]
+    there.save(tmp_path, STAMP)
+    require_same_evaluation(tmp_path, made_from())
+    with pytest.raises(ConfigError, match="other_actions"):
+        require_same_evaluation(tmp_path, made_from(eval=to_dict(dataclasses.replace(EvalConfig(), other_actions=1))))
+
+
+def test_results_that_do_not_say_what_they_are_of_are_known_by_their_windows(tmp_path):
+    number = np.arange(2)
+    WindowTable(np.array(["arm", "arm"]), number, number, number + 4, {"psnr": number * 1.0}).save(tmp_path / FILE, "run")
+    require_same_evaluation(tmp_path, made_from())
+    with pytest.raises(ConfigError, match="windows of arm: 2 -> 5"):
+        require_same_evaluation(tmp_path, made_from(windows=5))
+    with pytest.raises(ConfigError, match="with drawer"):
+        require_same_evaluation(tmp_path, made_from(name="drawer"))
