@@ -14,8 +14,9 @@ import numpy as np
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches
 from experiments.running.workspace import Workspace
-from hma_jax.config import require
-from hma_jax.evaluation.effects import Effect, find_effects, make_loss
+from experiments.setting import command_words
+from hma_jax.config import ConfigError, require
+from hma_jax.evaluation.effects import FEWEST, Effect, find_effects, make_loss
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_robots
 from hma_jax.simulator.robots import Robot
@@ -43,8 +44,38 @@ def check_run(
     names = list(robots) or there
     unknown = [name for name in names if name not in there]
     require(bool(names) and not unknown, f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}")
+    for name in names:
+        require_episodes(store, manifest, name, windows, workspace.root)
     loss = jax.jit(make_loss(model.config, model.table, model.execution))
     return {name: _check(model, loss, store, manifest, known[name], windows, spoil) for name in names}
+
+
+def require_episodes(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> None:
+    """Raises ConfigError, which says what took how many, if the first `windows` of a robot are of too few episodes."""
+    (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
+    judged, of_all = (len({episode for episode, _ in some}) for some in (frozen[:windows], frozen))
+    if judged >= FEWEST:
+        return
+    there = store.manifest(robot)
+    held_out, settings = len(there.val.steps), there.settings
+    if of_all >= FEWEST:
+        why = f"--windows {windows} takes {judged} of the {of_all} that the {len(frozen)} windows there are of; give more"
+    elif held_out >= FEWEST:
+        why = (
+            f"{held_out} are held out, of which the {len(frozen)} frozen windows are of {of_all}: eval.windows_per_dataset "
+            f"took no more, or the others are too short. Freeze more with `hma tokenize ... {command_words('--out', out)} "
+            "--set eval.windows_per_dataset=64 --replace windows`"
+        )
+    elif there.spec.val_split:
+        why = f"Its own split {there.spec.val_split} has {held_out}: leave val_split out of its entry"
+    else:
+        why = (
+            f"{held_out} of {held_out + len(there.train.steps)} are held out, by store.min_val={settings.min_val}, "
+            f"store.val_fraction={settings.val_fraction:g} and at most store.max_val_fraction={settings.max_val_fraction:g}. "
+            "It is judged on episodes that it was not trained on: tokenise and train in another --out, with --set "
+            "store.min_val=8 from the first command on (4 of 16 episodes are held out then)"
+        )
+    raise ConfigError(f"{robot} has {judged} episodes to be judged; what actions do is told from at least {FEWEST}. {why}")
 
 
 def _check(

@@ -1,0 +1,35 @@
+"""`hma check` on few episodes: what took how many, and how to go on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from data_pipelines.windows.evalset import freeze_manifest
+from experiments.applications.check import require_episodes
+from hma_jax.config import ConfigError
+from tests.data_pipelines.windows.test_evalset import small_store
+
+
+@pytest.mark.parametrize(
+    ("min_val", "frozen", "windows", "said"),
+    [
+        (2, 9, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 2 of 16 are held out, by "
+                   "store.min_val=2, store.val_fraction=0.05 and at most store.max_val_fraction=0.5. It is judged on "),
+        (5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, of which the "
+                   "2 frozen windows are of 2: eval.windows_per_dataset took no more, or the others are too short. Freeze "
+                   "more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace windows`"),
+        (5, 9, 2, "--windows 2 takes 1 of the 5 that the 9 windows there are of; give more"),
+        (5, 25, 64, ""),
+    ],
+)  # fmt: skip
+def test_too_few_episodes_are_told_with_what_took_them(min_val, frozen, windows, said, tmp_path):
+    store = small_store(tmp_path, lengths=(20,) * 16, min_val=min_val, max_val_fraction=0.5)
+    manifest = freeze_manifest(store, ("toy",), 4, frozen, 0)
+    if not said:
+        require_episodes(store, manifest, "toy", windows, Path("runs/a"))
+        return
+    with pytest.raises(ConfigError) as refused:
+        require_episodes(store, manifest, "toy", windows, Path("runs/a"))
+    assert said in str(refused.value)
