@@ -48,7 +48,8 @@ class StudyArguments:
     """Directory of a tokenizer to use, instead of training one on the data.
     The model's tokens follow it."""
     set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="PATH=VALUE")] = ()
-    """Change one setting, such as --set model.frames=4 --set train.steps=100."""
+    """Change one setting, such as --set model.frames=4 --set train.steps=100.
+    --set help shows all, --set model.help those of a group."""
     mesh: Annotated[tuple[int, int, int] | None, arg(metavar="DATA FSDP TENSOR"), UNSET] = None
     """Devices for data, fsdp and tensor parallelism; -1 takes those that are left.
     Short for --set execution.mesh.data=... and so on. No result depends on it."""

@@ -37,7 +37,7 @@ class SuiteConfig:
 
     scale: float = 1.0  # multiplies the largest dataset's number of episodes
     fewest: int = 8  # episodes of the smallest dataset; what lies between is stretched evenly in the logarithm
-    seed: int = 0
+    seed: int = 0  # of episodes and appearances
     validation: int = 24  # held-out episodes of every dataset
 
     def __post_init__(self):
@@ -49,7 +49,7 @@ class SuiteConfig:
 class StoreConfig:
     """What the token store keeps (`data_pipelines.tokens.tokenize_job`)."""
 
-    val_fraction: float = 0.05
+    val_fraction: float = 0.05  # of episodes that are held out
     min_val: int = 2  # held-out episodes per dataset, at least
     max_val: int = 200  # and at most
     max_val_fraction: float = 0.25  # of a dataset, at most, whatever min_val says
@@ -153,7 +153,7 @@ class Study:
     """One scaling study. The reference trial, which most axes share, uses all datasets, the
     largest trajectory count and the base model."""
 
-    name: str
+    name: str  # in titles and of the preset
     model: ModelConfig
     train: TrainConfig
     eval: EvalConfig
@@ -290,14 +290,34 @@ def override(study: Study, settings: Sequence[str], model: ModelConfig | None = 
     'model.frames=4'.
 
     Values are JSON; lists may be written '4,8,16'. Raises ConfigError for an unknown path
-    (with the closest known one) or a value of the wrong kind.
+    (with the closest known one) or a value of the wrong kind. 'help' and 'model.help' show what settings there are, as
+    the ones before change them, and end the program as --help does.
     """
     values = to_dict(study) | ({} if model is None else {"model": to_dict(model)})
     for setting in settings:
         path, separator, text = setting.partition("=")
-        require(bool(separator), f"--set {setting}: write it as path=value, such as model.frames=4")
+        if not separator and path.split(".")[-1] == "help":
+            _show(values, path.removesuffix("help").removesuffix("."))
+            raise SystemExit(0)
+        require(
+            bool(separator), f"--set {setting}: write it as path=value, such as model.frames=4; --set help shows what there is"
+        )
         _assign(values, path.strip(), text.strip())
     return from_dict(Study, values)
+
+
+def _show(values: dict[str, Any], group: str) -> None:
+    """Prints all settings, or those of a group. Raises ConfigError if there is no such group."""
+    from experiments.settings_help import describe_settings, show_settings
+
+    found = [
+        one
+        for one in describe_settings(from_dict(Study, values))
+        if not group or one.path == group or one.path.startswith(f"{group}.")
+    ]
+    if not found:
+        raise ConfigError(f"--set {group}.help: {_instead(values, group, _leaves(values))}")
+    show_settings(found, f"Settings of preset {values['name']}; --set PATH=VALUE changes one")
 
 
 def _assign(values: dict[str, Any], path: str, text: str) -> None:

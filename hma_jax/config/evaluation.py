@@ -20,9 +20,9 @@ class SamplerConfig:
     implies.
     """
 
-    kind: SamplerKind = "ddpm"
+    kind: SamplerKind = "ddpm"  # how clean vectors are drawn
     steps: int = 100  # evaluations of the denoiser; 10 to 12 will do for dpm++
-    temperature: float = 1.0
+    temperature: float = 1.0  # multiplies noise
     # Of dpm++: how much fresh noise its steps draw, from 0 (none) to 1 (as much as ancestral ones). 0 suits
     # an exact network best; a trained one errs, and noise corrects it (docs/performance.md).
     eta: float = 0.5
@@ -60,8 +60,8 @@ class DecodeConfig:
     (reference section 3.2). Continuous tokens have the `sampler` and its own temperature.
     """
 
-    unmask_steps: int = 2  # M
-    temperature: float = 0.0
+    unmask_steps: int = 2  # M: looks at a frame until it is finished
+    temperature: float = 0.0  # divides logits; 0: the likeliest entry
     top_k: int = 0  # draw from the k likeliest entries of each factor; 0: from all
     order: Literal["random", "confidence"] = "random"  # in which tokens are unmasked
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -81,18 +81,18 @@ class DecodeConfig:
 class EvalConfig:
     """The evaluation protocol (paper section 4, Metrics)."""
 
-    windows_per_dataset: int = 500
+    windows_per_dataset: int = 500  # held-out ones that are judged, at most
     # What a predicted frame follows: frames the model made, from a prompt on, or (`recorded`, as the
     # release judges) in every case the recorded ones.
     context: Literal["generated", "recorded"] = "generated"
-    prompt_frames: int = 4
+    prompt_frames: int = 4  # recorded ones that a window begins with
     # Continuous tokens: the mean of each diffusion step, not a draw.
     decode: DecodeConfig = field(default_factory=lambda: DecodeConfig(sampler=SamplerConfig(temperature=0.0)))
     random_actions: int = 5  # draws for delta PSNR
     other_actions: int = 15  # of other episodes, that the true ones are told from; 0: neither action-nats nor retrieval
-    batch: int = 32
+    batch: int = 32  # windows at a time
     perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
-    seed: int = 0
+    seed: int = 0  # of the choice of windows and of all draws
 
     def __post_init__(self):
         check_choices(self)

@@ -36,9 +36,9 @@ they are not compared."""
 class MeshConfig:
     """Devices along each mesh axis; -1 on one axis takes all that are left."""
 
-    data: int = -1
-    fsdp: int = 1
-    tensor: int = 1
+    data: int = -1  # the batch is split over them
+    fsdp: int = 1  # batch and parameters are split over them
+    tensor: int = 1  # heads and MLP are split over them
     min_shard_size: int = 2**14  # smaller parameters stay whole on every device
 
     def __post_init__(self):
@@ -62,7 +62,7 @@ class ExecutionConfig:
     # The least memory, so that what fits at all fits without a choice. Where there is four times as much for activations,
     # "products" is a seventh faster on CPU (twelve layers; docs/performance.md).
     remat: Remat = "everything"
-    attention: Attention = "auto"
+    attention: Attention = "auto"  # what computes it; auto: what suits platform and shapes
     accumulate: int = 1  # micro-batches per optimiser step
     # Of an evaluation batch, per device, that are in memory at a time; each is continued under
     # 1 + eval.random_actions action sequences, and the caches of those are most of the memory.

@@ -18,10 +18,10 @@ class MupConfig:
     that each is needed.
     """
 
-    enabled: bool = True
-    base_width: int = 256
-    attention_scale: float = 8.0
-    without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()
+    enabled: bool = True  # whether anything scales with the width
+    base_width: int = 256  # where the multipliers are 1
+    attention_scale: float = 8.0  # attention logits scale with this over the width of a head
+    without: tuple[Literal["init", "learning_rate", "readout", "attention"], ...] = ()  # ingredients taken away
 
     def __post_init__(self):
         check_choices(self)
@@ -37,8 +37,8 @@ class DiffusionConfig:
     `patch` x `patch` latent cells of `channels` values, flattened to C = patch^2 x channels.
     """
 
-    channels: int = 4
-    patch: int = 2
+    channels: int = 4  # values of a latent cell
+    patch: int = 2  # latent cells along a side of a token
     width: int = 1024  # of the denoising network
     depth: int = 4  # its residual blocks
     steps: int = 1000  # of the noising process
@@ -86,16 +86,16 @@ class ModelConfig:
     and `factor_vocab` mean nothing.
     """
 
-    width: int = 256  # D
-    layers: int = 32  # N
-    heads: int = 8  # H
-    frames: int = 12  # T
-    tokens: int = 256  # S
-    action_tokens: int = 64  # K
-    factors: int = 2  # Q
-    factor_vocab: int = 512  # V
-    diffusion: DiffusionConfig | None = None
-    conditioning: Conditioning = "concat+modulate"
+    width: int = 256  # D: values of a token inside the trunk
+    layers: int = 32  # N: blocks
+    heads: int = 8  # H: attention heads of a block
+    frames: int = 12  # T: of a window
+    tokens: int = 256  # S: of a frame
+    action_tokens: int = 64  # K: of a frame's actions, where conditioning has concat
+    factors: int = 2  # Q: of a token's id
+    factor_vocab: int = 512  # V: entries of a factor
+    diffusion: DiffusionConfig | None = None  # of models on latents; null: on ids
+    conditioning: Conditioning = "concat+modulate"  # how actions reach the trunk
     # Which chunk conditions frame t: the one executed after it (`released`; the chunk that led
     # to it then arrives through temporal attention) or the one that led to it (`causal`).
     action_alignment: Literal["released", "causal"] = "released"
@@ -106,11 +106,11 @@ class ModelConfig:
     # A token's factors are drawn one after the other, each given those before it. DIFFERS: the release draws them as if
     # independent, so that where two tokens are likely it may show a third, made of a piece of each.
     chain_factors: bool = False
-    mlp_ratio: float = 4.0
-    qkv_bias: bool = False
-    proj_bias: bool = True
-    mlp_bias: bool = True
-    qk_norm: bool = False
+    mlp_ratio: float = 4.0  # width of a block's MLP over that of the trunk
+    qkv_bias: bool = False  # of queries, keys and values
+    proj_bias: bool = True  # of what leaves attention
+    mlp_bias: bool = True  # of both products of the MLP
+    qk_norm: bool = False  # norms of queries and keys
     trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
     stem_gain: float = 0.01  # Xavier gain of the action stems
     mup: MupConfig = field(default_factory=MupConfig)

@@ -17,17 +17,17 @@ class TokenizerConfig:
     channels; `factors`, the entropy and the commitment then mean nothing.
     """
 
-    image_size: int = 32
-    downsample: int = 8
-    quantise: bool = True
+    image_size: int = 32  # pixels along a side
+    downsample: int = 8  # pixels along a side of a token
+    quantise: bool = True  # tokens are ids; false: latents
     bits: int = 16  # channels per token: C of the continuous variant
-    factors: int = 2
-    channels: int = 256
-    encoder_blocks: int = 1
-    decoder_blocks: int = 2
-    entropy_weight: float = 0.0
+    factors: int = 2  # that an id splits into
+    channels: int = 256  # inside encoder and decoder
+    encoder_blocks: int = 1  # of the encoder
+    decoder_blocks: int = 2  # of the decoder
+    entropy_weight: float = 0.0  # of the loss that spreads codes
     entropy_temperature: float = 1.0  # of the soft code assignment that the entropy is taken of
-    commitment_weight: float = 0.0
+    commitment_weight: float = 0.0  # of the distance of values from their codes
     # Without quantisation: noise on the latents while training, its standard deviation in the
     # range -1..1 of the encoder. It makes the decoder bear the errors of a generative model: on
     # the suite 0.1 costs 0.6 dB without errors and gains 1.7 dB where they are 0.2 (of latents
@@ -98,14 +98,14 @@ class TokenizerConfig:
 class TokenizerTrainConfig:
     """How a tokenizer is trained. `batch` counts images per step."""
 
-    steps: int = 2000
-    batch: int = 64
-    learning_rate: float = 3e-3
-    warmup_steps: int = 50
+    steps: int = 2000  # of the optimiser
+    batch: int = 64  # images per step
+    learning_rate: float = 3e-3  # after the warmup; falls as a cosine
+    warmup_steps: int = 50  # over which the learning rate rises from 0
     final_fraction: float = 0.01  # of the learning rate, at the end of the cosine
-    weight_decay: float = 1e-4
-    clip_norm: float = 1.0
-    seed: int = 0
+    weight_decay: float = 1e-4  # of weights that decay
+    clip_norm: float = 1.0  # largest norm of a gradient
+    seed: int = 0  # of initial values and order of frames
 
     def __post_init__(self):
         check_choices(self)

@@ -28,17 +28,17 @@ ActionScale = Literal["deviation", "quantiles"]
 class MaskingConfig:
     """Training-time masking and corruption (reference sections 1.9 and 2.3, paper section 3.5)."""
 
-    setting: Setting = "forward"
-    action_loss_weight: float = 0.5
+    setting: Setting = "forward"  # what is hidden in training, and so predicted
+    action_loss_weight: float = 0.5  # beside the loss of frames, where both are predicted
     non_mlm_ratio: float = 0.2  # probability that prompt frames stay clean
-    prompt_frames: int = 4
+    prompt_frames: int = 4  # the first of a window
     # A frame's mask rate is cos(pi/2 u) with u uniform from here to 1. DIFFERS: the release calls
     # it the minimum mask ratio, but a larger value lowers the largest rate.
     mask_angle_min: float = 0.0
     # The schedule of paper section 3.5, which the release lacks: the least mask rate of a frame, and how
     # far it rises over the window; at 1 the last frame is wholly masked.
     min_ratio: float = 0.0
-    horizon_gain: float = 0.0
+    horizon_gain: float = 0.0  # how far the least mask rate rises over the window
     # Continuous variant: mask whole patches. DIFFERS: the release masks single cells, so that
     # patches are partly masked in training and never at inference; `cell` is as released.
     mask_unit: Literal["patch", "cell"] = "patch"
@@ -51,13 +51,13 @@ class MaskingConfig:
     # does so here too), and in how many rounds, each after what the one before drew. A step passes over every frame
     # once more for each.
     own_past: float = 0.0
-    own_past_rounds: int = 1
+    own_past_rounds: int = 1  # in which own_past is drawn, each after what the one before drew
     # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
     # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
     change_weight: float = 1.0
-    max_corrupt_rate: float = 0.2
-    clean_rate_min: float = 0.2
-    label_smoothing: float = 0.01
+    max_corrupt_rate: float = 0.2  # of tokens that others stand for, at most
+    clean_rate_min: float = 0.2  # of tokens that stay what they are in frames after a clean prompt, at least
+    label_smoothing: float = 0.01  # share of the loss that all entries have alike
     # DIFFERS: the release shows hidden actions to the blocks (`conditioning`, discrete variant)
     # or everywhere (`all`, continuous variant), so that the objective gives them away.
     action_leak: ActionLeak = "none"
@@ -105,15 +105,15 @@ class MaskingConfig:
 @dataclass(frozen=True)
 class OptimizerConfig:
     learning_rate: float = 1e-4  # at the muP base width
-    schedule: Literal["constant", "cosine", "wsd"] = "constant"
-    warmup_steps: int = 500
+    schedule: Literal["constant", "cosine", "wsd"] = "constant"  # of the learning rate, after the warmup
+    warmup_steps: int = 500  # over which the learning rate rises from 0
     final_fraction: float = 0.1  # of the learning rate, at the end of cosine and wsd
     decay_fraction: float = 0.2  # of all steps, the decay phase of wsd
-    beta1: float = 0.9
-    beta2: float = 0.95
-    epsilon: float = 1e-8
-    weight_decay: float = 0.05
-    clip_norm: float = 1.0
+    beta1: float = 0.9  # AdamW's decay of the first moment
+    beta2: float = 0.95  # and of the second
+    epsilon: float = 1e-8  # AdamW's, in the denominator
+    weight_decay: float = 0.05  # of matrices
+    clip_norm: float = 1.0  # largest norm of a gradient
     # How matrices between two widths of the trunk are moved: as everything else is, or along their momentum made
     # orthogonal (Muon; Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
     matrices: Literal["adamw", "muon"] = "adamw"
@@ -135,9 +135,9 @@ class OptimizerConfig:
 class TrainConfig:
     """One training run. `batch` counts windows per optimiser step, over all devices."""
 
-    steps: int = 60_000
-    batch: int = 64
-    seed: int = 0
+    steps: int = 60_000  # of the optimiser
+    batch: int = 64  # windows per step, over all devices
+    seed: int = 0  # of initial values, masks and order of data
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     masking: MaskingConfig = field(default_factory=MaskingConfig)
     only: tuple[str, ...] = ()  # train these robots' own parameters and nothing else; (): everything

@@ -1,0 +1,63 @@
+"""`--set help`: which settings there are."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+import pytest
+
+from experiments.cli.main import main
+from experiments.presets import get_preset
+from experiments.settings_help import Described, describe_settings
+
+
+@dataclass(frozen=True)
+class Inner:
+    """Not read."""
+
+    a: int = 1  # of things; a second half. Left out.
+    # Above, over
+    # two lines (paper section 1.9). And more.
+    b: tuple[int, ...] = ()
+    c: Literal["x", "y"] = "x"
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner = Inner()
+    d: str = "# no comment"
+
+
+def test_a_setting_is_told_by_its_own_comment():
+    assert list(describe_settings(Outer())) == [
+        Described("inner.a", "1", "of things; a second half"),
+        Described("inner.b", "[]", "Above, over two lines (paper section 1.9)"),
+        Described("inner.c", "x", "(x, y)"),
+        Described("d", "# no comment", ""),
+    ]
+
+
+@pytest.mark.parametrize("preset", ["smoke", "smoke-continuous"])
+def test_every_setting_is_told(preset):
+    found = list(describe_settings(get_preset(preset)))
+    assert len(found) > 140
+    untold = [one.path for one in found if re.fullmatch(r"(\(.*\))?", one.text)]
+    assert not untold, f"no comment says what they are: {', '.join(untold)}"
+
+
+def test_the_settings_of_a_group_are_shown_as_those_before_change_them(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate", "run", "--preset", "smoke", "--set", "store.min_val=3", "--set", "store.help"])
+    said = capsys.readouterr().out
+    assert end.value.code == 0 and "store.min_val" in said and "model." not in said
+    (line,) = (line.split() for line in said.splitlines() if "store.min_val " in line)
+    assert line[1] == "3"
+
+
+def test_a_group_that_there_is_not_is_an_error(capsys):
+    assert main(["study", "--preset", "smoke", "--set", "modle.help"]) == 2
+    assert "--set modle.help: no such setting; a study has name, model.*" in capsys.readouterr().err
+    assert main(["study", "--preset", "smoke", "--set", "hlep"]) == 2
+    assert "--set help shows what there is" in capsys.readouterr().err
