@@ -7,9 +7,13 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.intervals import Interval
 from experiments.applications import DRIVEN
+from experiments.applications.plan_actions import read_trials
 from experiments.bench.beside import OURS, RELEASED, THEIRS
 from experiments.bench.record import read_record
 from experiments.rows import OVERALL, Row, read_csv
@@ -129,10 +133,51 @@ def test_policies_and_plans_are_as_readme_says():
         assert len(judged["policies"]) == policies
         assert cells[0] == f"r = {learned['mean']:.2f} ({learned['low']:.2f} to {learned['high']:.2f})"
         assert cells[1] in (f"other actions {control['mean']:.2f}", "without actions: none")
-    success = {way: float(row["mean"]) for way, row in planned("planning_grown").items()}
     (cells,) = (cells for label, cells in rows.items() if label.startswith("plans"))
-    plans, shooting = (f"{100 * success[f'{way} in the model']:.0f} %" for way in ("MPPI", "random shooting"))
-    assert cells == [plans, f"random shooting {shooting}"]
+    assert cells == [f"{100 * planned_by_mppi().mean():.0f} %", f"cloned policies {100 * cloned().mean():.0f} %"]
+
+
+def planned_by_mppi() -> np.ndarray:
+    """Success [starts] in the served model, from the further starts."""
+    trials = read_trials(ROOT / "experiments/results/planning_more/trials.csv")
+    return np.array([float(trial["success"]) for trial in trials["MPPI in the model"]])
+
+
+def cloned() -> np.ndarray:
+    """Success [trainings, starts] of the policies cloned from 1,000 trajectories, from the same starts."""
+    place = ROOT / "experiments/results/planning_more"
+    first = read_trials(place / "trials.csv")["behaviour cloning of 1000 trajectories"]
+    found = {0: [trial["success"] for trial in first]}
+    with (place / "cloned.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            found.setdefault(int(row["seed"]), []).append(row["success"] == "1")
+    return np.array(list(found.values()), float)
+
+
+def test_plans_from_further_starts_are_as_their_page_says():
+    page = " ".join((ROOT / "docs" / "planning.md").read_text().split())
+    rows = table(ROOT / "docs" / "planning.md", "| way of acting |")
+    summary, plans, policies = planned("planning_more"), planned_by_mppi(), cloned()
+    assert policies.shape == (16, 120) and plans.shape == (120,)
+
+    def crossed(values: np.ndarray) -> Interval:
+        panel = Panel(np.zeros(120, str), np.arange(120), (values,), (tuple(range(len(values))),))
+        return bootstrap_intervals(panel)[0]
+
+    def told(mean: float, low: float, high: float) -> list[str]:
+        return [f"{mean:.2f}", f"{low:.2f} to {high:.2f}"]
+
+    for way in ("MPPI in the model", "random actions"):
+        assert rows[way] == told(*map(float, summary[way].values()))
+    of_all = crossed(policies)
+    assert rows["behaviour cloning of 1000 trajectories, sixteen trainings"] == told(of_all.mean, of_all.low, of_all.high)
+    assert of_all.high < float(summary["MPPI in the model"]["low"])
+    gain = crossed(plans - policies)
+    assert f"by {gain.mean:.2f} ({gain.low:.2f} to {gain.high:.2f}), start by start" in page
+    rates = policies.mean(1)
+    assert f"from {rates.min():.2f} to {rates.max():.2f}; the first, the one in the table of thirty, has {rates[0]:.2f}" in page
+    assert "came to {:.2f}, {:.2f} and {:.2f}".format(*rates[:3]) in page
+    assert f"which came to {plans.mean() - rates[:3].mean():.2f}." in page
 
 
 MODELS = {"first": "planning", "weighed": "planning_weighed", "grown, served": "planning_grown"}

@@ -232,7 +232,12 @@ def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(n
 
 @pytest.mark.parametrize(
     ("name", "model"),
-    [("planning", FIRST), ("planning_weighed", FIRST.with_name("simulator_weighed")), ("planning_grown", DRIVEN)],
+    [
+        ("planning", FIRST),
+        ("planning_weighed", FIRST.with_name("simulator_weighed")),
+        ("planning_grown", DRIVEN),
+        ("planning_more", DRIVEN),
+    ],
 )
 def test_the_committed_table_of_planners_follows_from_its_trials(name, model):
     place = RESULTS / name
