@@ -6,6 +6,7 @@ write several at once (`hma bench generate|train`) and end in `...`.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import itertools
@@ -139,7 +140,8 @@ def _complaint_of_hma(arguments: list[str], calls: list[dict], capsys, whole: bo
         return None if missing and not whole else said
     asked = calls[-1].get("asked") if calls else None
     if asked is not None and asked.set:
-        override(get_preset(asked.preset or "cpu"), list(asked.set))  # raises ConfigError
+        with contextlib.suppress(SystemExit):  # of --set help
+            override(get_preset(asked.preset or "cpu"), list(asked.set))  # raises ConfigError
     return None
 
 

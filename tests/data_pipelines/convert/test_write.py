@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import json
+import re
+import runpy
+import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
+from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.sources import robomimic, video
 from data_pipelines.sources.human import detections
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.units import Episode, Layout, LeftOut, UnitError, require_module
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import contents, number, picture, read_back
+
+PAGE = Path(__file__).parents[3] / "docs" / "own_data.md"
 
 
 @dataclass
@@ -187,3 +194,15 @@ def test_two_conversions_do_not_write_the_same_place(tmp_path):
 
     with pytest.raises(ConfigError, match="another conversion is writing"):
         convert(Nested(), tmp_path, "toy")
+
+
+def test_the_documented_script_writes_a_dataset_that_is_read(tmp_path, monkeypatch, capsys):
+    (text,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    (tmp_path / "my_robot.py").write_text(text)
+    monkeypatch.setattr(sys, "argv", ["my_robot.py", str(tmp_path)])
+    for _ in range(2):  # the second finds it done
+        runpy.run_path(str(tmp_path / "my_robot.py"))
+    facts = inspect_dataset(str(tmp_path / "my_robot"), episodes=2).facts
+    assert (facts.episodes, facts.lengths.longest) == (20, 30)
+    assert [(camera.key, camera.sizes) for camera in facts.cameras] == [("observation/image", ((64, 64),))]
+    assert [(action.key, len(action.dimensions)) for action in facts.actions] == [("action", 7)]
