@@ -30,6 +30,7 @@ from experiments.running.machine import describe_machine
 from experiments.running.run_options import CHECKPOINTS
 from experiments.running.workspace import Workspace
 from experiments.study import Study
+from experiments.words import plus_minus
 from hma_jax.config import ConfigError, TokenizerConfig, require
 from hma_jax.config.json import to_dict
 from hma_jax.runtime.files import write_file
@@ -124,7 +125,7 @@ def make_tokenizer(
             records=lambda index: frames(0).describe(index),
         )  # fmt: skip
         quality = reconstruction_psnr(tokenizer, held_out)
-    console.print(f"its reconstruction of held-out frames: {quality.mean:.2f} ± {quality.sem:.2f} dB PSNR")
+    console.print(f"its reconstruction of held-out frames: {plus_minus(quality.mean, quality.sem)} dB PSNR")
     write_file(aside / QUALITY, json.dumps(dataclasses.asdict(quality)))
     made_from.save(aside)
     publish(aside, workspace.tokenizer)

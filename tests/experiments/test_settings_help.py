@@ -19,7 +19,7 @@ class Inner:
 
     a: int = 1  # of things; a second half. Left out.
     # Above, over
-    # two lines (paper section 1.9). And more.
+    # two lines (see figure 2.9). And more.
     b: tuple[int, ...] = ()
     c: Literal["x", "y"] = "x"
 
@@ -33,7 +33,7 @@ class Outer:
 def test_a_setting_is_told_by_its_own_comment():
     assert list(describe_settings(Outer())) == [
         Described("inner.a", "1", "of things; a second half"),
-        Described("inner.b", "[]", "Above, over two lines (paper section 1.9)"),
+        Described("inner.b", "[]", "Above, over two lines (see figure 2.9)"),
         Described("inner.c", "x", "(x, y)"),
         Described("d", "# no comment", ""),
     ]
