@@ -115,14 +115,12 @@ class TidyTable(Table):
         for chosen in parts:
             part = self._of(chosen, chosen is parts[0], chosen is parts[-1])
             inside = [sizes[k] for k in chosen]
-            spare = room - sum(size.minimum + 2 for size in inside)
-            wished = sum(size.maximum - size.minimum for size in inside)
-            if 0 <= spare < wished:
-                for column, size in zip(part.columns, inside, strict=True):
-                    column.width = size.minimum + spare * (size.maximum - size.minimum) // wished
-            elif spare < 0:  # a very narrow terminal
+            if sum(size.minimum + 2 for size in inside) > room:  # a very narrow terminal
                 for column in part.columns:
                     column.no_wrap, column.overflow = False, "fold"
+            elif sum(size.maximum + 2 for size in inside) > room:
+                for column, width in zip(part.columns, _narrowed(inside, room - 2 * len(inside)), strict=True):
+                    column.width = width
             yield from Table.__rich_console__(part, console, options)
 
     def _of(self, chosen: Sequence[int], first: bool, last: bool) -> Table:
@@ -135,6 +133,15 @@ class TidyTable(Table):
         for cells in zip(*(of.cells for of in columns), strict=True):
             part.add_row(*cells)
         return part
+
+
+def _narrowed(sizes: Sequence[Measurement], room: int) -> list[int]:
+    """Widths that come to `room`: the widest columns become narrower first."""
+    widths = [min(size.maximum, room) for size in sizes]
+    while sum(widths) > room:
+        wider = [i for i, size in enumerate(sizes) if widths[i] > size.minimum]
+        widths[max(wider, key=widths.__getitem__)] -= 1
+    return widths
 
 
 def _sizes(column: Column, console: Console, options: ConsoleOptions) -> Measurement:

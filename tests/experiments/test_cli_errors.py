@@ -407,7 +407,7 @@ def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tm
 def test_evaluation_with_a_prompt_that_fills_the_window(study, refused):
     out, data = study
     settings = ("--set", "model.frames=5", "--set", "eval.prompt_frames=4")
-    message = refused(2, "evaluate", out / "model", *SMOKE, "--out", out, *data, *settings)
+    message = refused(2, "evaluate", out / "model", *SMOKE, "--out", out, *data, *settings, "--replace")
     assert "eval.prompt_frames 4 leaves nothing to predict in a window of 4 frames" in message
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import jax
 import pytest
 from jax._src import compiler
-from jax._src.config import enable_compilation_cache
 
 from hma_jax.runtime.exits import Exit, Terminated, exit_of_interrupt, raise_lost_request, terminated_like_interrupted
 
@@ -61,9 +60,10 @@ def test_a_request_to_stop_waits_for_the_program_that_is_compiled(number, code, 
         return compiled.append(real(*arguments, **options)) or compiled[-1]
 
     monkeypatch.setattr(compiler, "backend_compile_and_load", compile_and_load)
-    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted(), enable_compilation_cache(False):
-        jax.jit(lambda x: x + 1)(1.0)
-        time.sleep(60)
+    monkeypatch.setattr(compiler.compilation_cache, "is_cache_used", lambda backend: False)
+    with pytest.raises(KeyboardInterrupt) as stopped, terminated_like_interrupted():
+        jax.jit(lambda x: x + int(number))(1.0)
+        time.sleep(10)
     assert len(compiled) == 1 and exit_of_interrupt(stopped.value) == code
 
 
