@@ -32,7 +32,8 @@ def play(
 ) -> None:
     """Serve a page on which a trained model is driven with keys, gamepad or sliders.
 
-    Needs the extra `play`. Runs until it is interrupted, and ends with 130 then (SIGTERM: 143). docs/simulator.md describes the page.
+    Needs the extra `play`. Runs until it is interrupted, and ends with 130 then (SIGTERM: 143). docs/simulator.md
+    describes the page.
 
     Args:
         run: Directory of a training run; without it the one in experiments/results/simulator_grown.

@@ -73,7 +73,7 @@ def test_help_needs_no_jax():
         (["convert", "to-official", "{empty}", "--out", "{empty}/x"], 2, "{empty}/checkpoints"),
         (["convert", "from-safetensors", "{empty}", "--out", "{empty}/x"], 2, "{empty}/model.json"),
         (["convert", "to-safetensors", "{empty}", "--out", "{file}"], 2, "{file} exists already"),
-        (["convert", "to-stablehlo", "{empty}", "--out", "{empty}/x", "--prompt", "9"], 2, "exceed prompt"),
+        (["convert", "to-stablehlo", "{empty}", "--out", "{empty}/x", "--prompt", "9"], 2, "{empty}/checkpoints"),
     ],
 )
 def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp_path, capsys):

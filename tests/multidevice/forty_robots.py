@@ -1,7 +1,8 @@
 """Trains a model of forty robots on several meshes of the devices at hand; prints a JSON line.
 
 Arguments: the kind of model ("ids", "latents", "attended": ids, actions entering by cross-attention, "kept": ids,
-nothing computed twice, or "recipe": latents with recall and Muon, as the continuous study has them), the number of steps, the number of robots and the meshes, each as "data,fsdp,tensor".
+nothing computed twice, or "recipe": latents with recall and Muon, as the continuous study has them), the number of
+steps, the number of robots and the meshes, each as "data,fsdp,tensor".
 """
 
 import json
