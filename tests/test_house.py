@@ -81,6 +81,12 @@ def test_a_package_imports_only_those_below_it(package: str):
             assert not strangers, f"{name} imports {', '.join(sorted(strangers))}"
 
 
+def test_nothing_but_the_command_line_imports_it():
+    for name, imported in graph_of_imports().items():
+        if not name.startswith("experiments.cli"):
+            assert not [other for other in imported if other.startswith("experiments.cli")], name
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_files_of_a_package_import_each_other_in_a_circle(package: str):
     """What is imported in functions, or for type checkers alone, counts too."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.analysis.compare import Side
+from experiments.evaluated import STAMP
 from experiments.preparing.made_from import read_stamp
 from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of
@@ -83,8 +84,8 @@ def read_side(path: Path) -> Side:
 
 
 def _tokenizer_of(run: Path) -> str:
-    """That an evaluation was on, or of a training run's latest checkpoint; "" where neither says."""
-    from experiments.cli.evaluated import STAMP
+    """The identity of the tokenizer whose tokens were judged: by the stamp of `hma evaluate`, else by the run's latest
+    checkpoint; "" where neither says it."""
     from hma_jax.training.reading import list_steps, read_description
 
     if (stamp := read_stamp(run, STAMP)) is not None:

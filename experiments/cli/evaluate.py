@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
-from experiments.cli.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.cli.hosts import Hosts
+from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.progress import console, step, tidy_table
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, require_local, short
 from experiments.words import few, plus_minus
@@ -55,9 +55,11 @@ def evaluate(
     evaluate_model(make_setting(asked), run, weights, to, replace)
 
 
-def evaluate_model(setting: Setting, run: Path, weights: Weights, to: Path | None = None, replace: bool = False) -> None:
-    """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may be
-    replaced."""
+def evaluate_model(
+    setting: Setting, run: Path, weights: Weights, to: Path | None = None, replace: bool = False
+) -> None:
+    """Writes results into `to`, or else into `run`. Raises ConfigError where other results are there, unless they may
+    be replaced."""
     from hma_jax.runtime.processes import is_writer
     from hma_jax.training.claim import EVALUATION, locked_run
     from hma_jax.training.runs import load_model

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from experiments.cli.evaluated import STAMP, require_same_evaluation
+from experiments.evaluated import STAMP, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
 from hma_jax.config import ConfigError, EvalConfig
 from hma_jax.config.json import to_dict
@@ -56,7 +56,8 @@ def test_a_setting_of_the_protocol_that_came_later_is_no_difference(tmp_path):
 
 def test_results_that_do_not_say_what_they_are_of_are_known_by_their_windows(tmp_path):
     number = np.arange(2)
-    WindowTable(np.array(["arm", "arm"]), number, number, number + 4, {"psnr": number * 1.0}).save(tmp_path / FILE, "run")
+    names, values = np.array(["arm", "arm"]), {"psnr": number * 1.0}
+    WindowTable(names, number, number, number + 4, values).save(tmp_path / FILE, "run")
     require_same_evaluation(tmp_path, made_from())
     with pytest.raises(ConfigError, match="windows of arm: 2 -> 5"):
         require_same_evaluation(tmp_path, made_from(windows=5))

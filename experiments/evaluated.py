@@ -1,4 +1,5 @@
-"""What the results of `hma evaluate` are of, written beside them, so that those of other windows do not replace them."""
+"""A stamp beside the results of `hma evaluate`: of which model, windows and protocol they are. Results of others do not
+replace them unless that is asked for."""
 
 from __future__ import annotations
 
@@ -19,8 +20,8 @@ STAMP = "evaluation.made_from.json"
 
 
 def describe_evaluation(trained: Run, names: Sequence[str], materials: Materials, config: EvalConfig) -> MadeFrom:
-    """Model, windows of the datasets `names`, and protocol. The step is recorded only: of a run that trains on, later
-    results replace earlier ones."""
+    """The stamp of an evaluation on the windows of the datasets `names`. The step is recorded only: of a run that trains
+    on, later results replace earlier ones."""
     train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
     chosen = {d.dataset: d.windows for d in materials.manifest.datasets}
     data = {
@@ -62,12 +63,12 @@ def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:
 
 
 def _protocol(values: dict[str, Any]) -> dict[str, Any]:
-    """As this version writes it, with the batch of nobody: no result depends on that."""
+    """The protocol as this version writes it, with the default batch, on which no result depends."""
     return to_dict(replace(from_dict(EvalConfig, values), batch=EvalConfig.batch))
 
 
 def _differences_of_windows(place: Path, wanted: MadeFrom) -> list[str]:
-    """From results of an earlier version, which do not say what they are of: datasets, and how many windows of each."""
+    """For results of an earlier version, which have no stamp: lines on their datasets, and on how many windows of each."""
     from hma_jax.evaluation.windows import FILE, WindowTable
 
     try:
