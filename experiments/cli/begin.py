@@ -45,7 +45,7 @@ def known(trained: Run, setting: Setting) -> list[str]:
 
 
 def strangers(trained: Run, setting: Setting) -> list[str]:
-    """The others."""
+    """The datasets of a study whose robots a model does not know."""
     return [name for name in setting.study.dataset_names() if name not in trained.table.names]
 
 
@@ -55,7 +55,16 @@ def require_known(source: Path, trained: Run, setting: Setting) -> None:
     require(
         not new,
         f"{short(source)} knows {few(trained.table.names)}, not {few(new)}. To add them: "
-        f"{setting.command('adapt', source)}",
+        f"{setting.command('adapt', source)} --run NEW",
+    )
+
+
+def require_another_place(source: Path, run: Path) -> None:
+    """Raises ConfigError if the new run would lie where the model lies that it begins with."""
+    require(
+        run.resolve() != source.resolve(),
+        f"{short(source)} holds the model that the new run begins with; give the new run a directory of its own with "
+        "--run NEW",
     )
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
 from experiments.cli.arguments import OneModel, Remake
-from experiments.cli.begin import known, require_known, setting_of, strangers
+from experiments.cli.begin import known, require_another_place, require_known, setting_of, strangers
 from experiments.cli.hosts import Hosts
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step
@@ -55,13 +55,15 @@ def train(
         hosts.join()
     trained = None if begin is None else load_run(begin, "auto")
     setting = make_setting(asked) if trained is None else setting_of(begin, trained, asked)
+    run = one.directory() or setting.workspace.root / "model"
     if trained is not None:
         require_known(begin, trained, setting)
+        require_another_place(begin, run)
     if dry_run:
-        _check(setting, one.directory() or setting.workspace.root / "model", one.trajectories, options)
+        _check(setting, run, one.trajectories, options)
         _print_cost(setting, _single_trial(setting, one.trajectories), hosts.count())
         return
-    train_model(setting, one.directory(), options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
+    train_model(setting, run, options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
 
 
 def adapt(
@@ -102,7 +104,7 @@ def adapt(
 
 def train_model(
     setting: Setting,
-    run: Path | None,
+    run: Path,
     options: RunOptions,
     *,
     trajectories: int | None = None,
@@ -111,7 +113,6 @@ def train_model(
 ) -> None:
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
     the run `begin` on where one is given, which knows its robots."""
-    run = run or setting.workspace.root / "model"
     _check(setting, run, trajectories, options)
     _prepare(setting, replace)
     start = {}
@@ -144,9 +145,10 @@ def adapt_model(
     require(
         bool(strangers(trained, setting)),
         f"{short(source)} already knows {few(setting.study.dataset_names())}: there is nothing to add. To train it on: "
-        f"{setting.command('train', '--from', source)}",
+        f"{setting.command('train', '--from', source)} --run NEW",
     )
     run = run or setting.workspace.root / "model"
+    require_another_place(source, run)
     _check(setting, run, trajectories, options)
     _prepare(setting, replace)
     study, new = setting.study, strangers(trained, setting)

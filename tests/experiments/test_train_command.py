@@ -223,6 +223,17 @@ def test_a_converted_run_is_not_resumed(released, where, monkeypatch, capsys):
     assert f"hma train --from {released} --preset smoke " in said and said.endswith(" --run NEW\n")
 
 
+def test_a_new_run_does_not_lie_where_the_model_lies_that_it_begins_with(tmp_path, where, monkeypatch, capsys):
+    """By default both would be OUT/model."""
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
+    config, source = get_preset("smoke").tokenizer, make_released(tmp_path, *map(as_registered, (ARM, BASE)))
+    save_tokenizer(LfqTokenizer(config, declare_tokenizer(config).init(0)), tmp_path / "tokenizer")
+    given = [*SMOKE, *where[where.index("--data") :], "--out", str(tmp_path)]
+    for more in ((), ("--dry-run",)):
+        assert main(["train", "--from", str(source), *given, *more]) == 2
+        assert "give the new run a directory of its own with --run NEW" in capsys.readouterr().err
+
+
 def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where, tmp_path, monkeypatch, capsys):
     """What does not fit is said before a tokenizer is trained on the data."""
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
