@@ -23,7 +23,7 @@ from experiments.cli.tokenize import tokenize
 from experiments.cli.train import adapt, train
 from experiments.program import PROGRAM
 
-BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "plan", "play", "check")
+BEGIN_ANEW = ("evaluate", "compare", "report", "fit", "convert", "bench", "plan", "play", "check")
 """Commands that keep nothing of what they had begun when they are stopped."""
 
 app = SubcommandApp()

@@ -86,6 +86,16 @@ def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp
     assert message.format(**places) in said.err
 
 
+@pytest.mark.parametrize(("command", "word"), [("convert to-safetensors x --out", "begins anew"), ("adapt x", "goes on")])
+def test_a_command_that_is_stopped_says_what_the_same_will_do(command, word, tmp_path, monkeypatch, capsys):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("hma_jax.training.runs.load_run", stopped)
+    arguments = command.split() + ([str(tmp_path / "y")] if command.endswith("--out") else [])
+    assert main(arguments) == 130 and f"the same command {word}" in capsys.readouterr().err
+
+
 def test_wrong_choice_exits_with_2(capsys):
     with pytest.raises(SystemExit) as end:
         main(["sweep", "width", "--preset", "gpu"])
