@@ -12,10 +12,10 @@ def few(names: Sequence[str]) -> str:
 
 
 def number(value: float, error: float, sign: str = "") -> str:
-    """`value` to two digits of its standard error, and four after the point at most. `sign`: as in a format, "+" for one
-    before every value."""
+    """`value` to two digits of its standard error, and four after the point at most; what rounds to zero has no minus.
+    `sign`: "+" for one before every value."""
     digits = min(max(1 - math.floor(math.log10(error)), 0), 4)
-    return f"{value:{sign}.{digits}f}"
+    return f"{value:{sign}z.{digits}f}"
 
 
 def plus_minus(mean: float, error: float, sign: str = "") -> str:
