@@ -19,9 +19,9 @@ from rich.table import Table
 from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
 from experiments.progress import tidy_table
 from experiments.running.provenance import Provenance
+from experiments.running.run_options import UNWATCHED
 from experiments.running.shared_runs import share_runs
 from experiments.running.trial import Trial, trial_id
-from experiments.running.run_options import UNWATCHED
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
 from hma_jax.config import MeshConfig, ModelConfig
@@ -245,7 +245,8 @@ def _caption(
 
 
 def checkpoint_bytes(plan: TrialPlan) -> int:
-    """Of what a finished trial leaves: weights and two moments in float32, and their average where there is one."""
+    """Size of the checkpoints that a finished trial leaves: weights and two moments in float32, and the weights' average
+    where there is one."""
     copies = 3 + (plan.trial.train.ema_decay > 0)
     return UNWATCHED.keep_checkpoints * copies * 4 * plan.cost.parameters
 

@@ -153,7 +153,7 @@ class Study:
     """One scaling study. The reference trial, which most axes share, uses all datasets, the
     largest trajectory count and the base model."""
 
-    name: str  # in titles and of the preset
+    name: str  # that of the preset, shown in titles
     model: ModelConfig
     train: TrainConfig
     eval: EvalConfig
@@ -299,9 +299,8 @@ def override(study: Study, settings: Sequence[str], model: ModelConfig | None = 
         if not separator and path.split(".")[-1] == "help":
             _show(values, path.removesuffix("help").removesuffix("."))
             raise SystemExit(0)
-        require(
-            bool(separator), f"--set {setting}: write it as path=value, such as model.frames=4; --set help shows what there is"
-        )
+        advice = "write it as path=value, such as model.frames=4; --set help shows what there is"
+        require(bool(separator), f"--set {setting}: {advice}")
         _assign(values, path.strip(), text.strip())
     return from_dict(Study, values)
 

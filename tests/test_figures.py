@@ -170,12 +170,14 @@ def test_plans_from_further_starts_are_as_their_page_says():
     for way in ("MPPI in the model", "random actions"):
         assert rows[way] == told(*map(float, summary[way].values()))
     of_all = crossed(policies)
-    assert rows["behaviour cloning of 1000 trajectories, sixteen trainings"] == told(of_all.mean, of_all.low, of_all.high)
+    many = rows["behaviour cloning of 1000 trajectories, sixteen trainings"]
+    assert many == told(of_all.mean, of_all.low, of_all.high)
     assert of_all.high < float(summary["MPPI in the model"]["low"])
     gain = crossed(plans - policies)
     assert f"by {gain.mean:.2f} ({gain.low:.2f} to {gain.high:.2f}), start by start" in page
     rates = policies.mean(1)
-    assert f"from {rates.min():.2f} to {rates.max():.2f}; the first, the one in the table of thirty, has {rates[0]:.2f}" in page
+    first = f"the first, the one in the table of thirty, has {rates[0]:.2f}"
+    assert f"from {rates.min():.2f} to {rates.max():.2f}; {first}" in page
     assert "came to {:.2f}, {:.2f} and {:.2f}".format(*rates[:3]) in page
     assert f"which came to {plans.mean() - rates[:3].mean():.2f}." in page
 

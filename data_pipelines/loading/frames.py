@@ -71,7 +71,9 @@ def make_frame_loader(
         if not len(episodes):
             reasons[spec.name] = f"it has no {split} episode"
             if split == "val":
-                reasons[spec.name] += f": of {len(mask)} none is held out, which takes two and a max_val above 0"
+                reasons[spec.name] += (
+                    f": of {len(mask)} none is held out, for which there must be at least two, and a max_val above 0"
+                )
             continue
         order = stream_seed(seed, "frames", split, spec.name)
         streams[spec.name] = _Stream(source, spec.image_key, episodes, order)

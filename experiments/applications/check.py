@@ -59,23 +59,28 @@ def require_episodes(store: TokenStore, manifest: EvalManifest, robot: str, wind
     there = store.manifest(robot)
     held_out, settings = len(there.val.steps), there.settings
     if of_all >= FEWEST:
-        why = f"--windows {windows} takes {judged} of the {of_all} that the {len(frozen)} windows there are of; give more"
+        why = (
+            f"--windows {windows} takes {judged} of the {of_all} episodes that the {len(frozen)} windows there are of; "
+            "give more"
+        )
     elif held_out >= FEWEST:
         why = (
-            f"{held_out} are held out, of which the {len(frozen)} frozen windows are of {of_all}: eval.windows_per_dataset "
-            f"took no more, or the others are too short. Freeze more with `hma tokenize ... {command_words('--out', out)} "
-            "--set eval.windows_per_dataset=64 --replace windows`"
+            f"{held_out} are held out, and the {len(frozen)} frozen windows are of {of_all} of them: "
+            "eval.windows_per_dataset took no more, or the others are too short. Freeze more with `hma tokenize ... "
+            f"{command_words('--out', out)} --set eval.windows_per_dataset=64 --replace windows`"
         )
     elif there.spec.val_split:
         why = f"Its own split {there.spec.val_split} has {held_out}: leave val_split out of its entry"
     else:
         why = (
             f"{held_out} of {held_out + len(there.train.steps)} are held out, by store.min_val={settings.min_val}, "
-            f"store.val_fraction={settings.val_fraction:g} and at most store.max_val_fraction={settings.max_val_fraction:g}. "
+            f"store.val_fraction={settings.val_fraction:g} and at most "
+            f"store.max_val_fraction={settings.max_val_fraction:g}. "
             "It is judged on episodes that it was not trained on: tokenise and train in another --out, with --set "
             "store.min_val=8 from the first command on (4 of 16 episodes are held out then)"
         )
-    raise ConfigError(f"{robot} has {judged} episodes to be judged; what actions do is told from at least {FEWEST}. {why}")
+    needs = f"what actions do is told from at least {FEWEST}"
+    raise ConfigError(f"{robot} has {judged} episodes to be judged; {needs}. {why}")
 
 
 def _check(

@@ -33,7 +33,7 @@ from hma_jax.training.step import make_train_step
 LOCAL = "local"
 
 CORES_PER_CHIP = {"v2": 2, "v3": 2, "v4": 2, "v5p": 2, "v5e": 1, "v5litepod": 1, "v6e": 1}
-"""What the number in a cloud's name of TPUs counts, v4-32 or v5litepod-8: cores, or chips."""
+"""What a chip adds to the number in a cloud's name of TPUs: 2 where it counts cores (v4-32), else 1 (v5litepod-8)."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def find_devices(topology: str) -> list[Any]:
 
 
 def chips_of(topology: str) -> str:
-    """v4:2x2x4 of v4-32, v5e:2x4 of v5e-8: how the chips lie that a cloud's name counts, as close to a square or a cube
-    as powers of two do. Other names as they are. Raises ConfigError for a number that is none of a cloud's."""
+    """The topology of a cloud's name: v4:2x2x4 of v4-32, v5e:2x4 of v5e-8, as close to a square or a cube as powers of
+    two allow. Other names are returned as they are. Raises ConfigError for a number of chips that is not 4, 8, 16, ..."""
     found = re.fullmatch(r"(v\d\w*)-(\d+)", topology)
     if found is None or found[1] not in CORES_PER_CHIP:
         return topology

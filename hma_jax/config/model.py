@@ -108,8 +108,8 @@ class ModelConfig:
     chain_factors: bool = False
     mlp_ratio: float = 4.0  # width of a block's MLP over that of the trunk
     qkv_bias: bool = False  # of queries, keys and values
-    proj_bias: bool = True  # of what leaves attention
-    mlp_bias: bool = True  # of both products of the MLP
+    proj_bias: bool = True  # of the projection that leaves attention
+    mlp_bias: bool = True  # of both layers of the MLP
     qk_norm: bool = False  # norms of queries and keys
     trunk_gain: float = 0.1  # Xavier gain of trunk and modulation (reference section 1.10)
     stem_gain: float = 0.01  # Xavier gain of the action stems

@@ -103,7 +103,7 @@ class TokenizerTrainConfig:
     learning_rate: float = 3e-3  # after the warmup; falls as a cosine
     warmup_steps: int = 50  # over which the learning rate rises from 0
     final_fraction: float = 0.01  # of the learning rate, at the end of the cosine
-    weight_decay: float = 1e-4  # of weights that decay
+    weight_decay: float = 1e-4  # AdamW's, of matrices and kernels
     clip_norm: float = 1.0  # largest norm of a gradient
     seed: int = 0  # of initial values and order of frames
 

@@ -86,7 +86,7 @@ def test_one_episode_alone_is_refused_before_a_tokenizer_is_trained_on_it(tmp_pa
     monkeypatch.setattr(tokenizer_training, "train_tokenizer", lambda *_, **__: pytest.fail("it is trained"))
     rlds = write_rlds(tmp_path / "rlds", ARM, [12])
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
-    assert f"{ARM.name}: it has no val episode: of 1 none is held out, which takes two" in message
+    assert f"{ARM.name}: it has no val episode: of 1 none is held out, for which there must be at least two" in message
 
 
 # --- Data ------------------------------------------------------------------------------------

@@ -121,8 +121,8 @@ def test_gpus_are_not_taken_for_tpus_without_a_compiler(monkeypatch):
     [
         ("v4-8", "v4:2x2x1"), ("v4-16", "v4:2x2x2"), ("v4-32", "v4:2x2x4"), ("v4-64", "v4:2x4x4"),
         ("v5p-8", "v5p:2x2x1"), ("v5p-128", "v5p:4x4x4"), ("v3-8", "v3:2x2"), ("v5e-4", "v5e:2x2"),
-        ("v5e-8", "v5e:2x4"), ("v5litepod-16", "v5e:4x4"), ("v6e-32", "v6e:4x8"), ("v5e-256", "v5e:16x16"), ("v5e:2x4", "v5e:2x4"),
-        ("v9-8", "v9-8"),
+        ("v5e-8", "v5e:2x4"), ("v5litepod-16", "v5e:4x4"), ("v6e-32", "v6e:4x8"), ("v5e-256", "v5e:16x16"),
+        ("v5e:2x4", "v5e:2x4"), ("v9-8", "v9-8"),
     ],
 )  # fmt: skip
 def test_names_of_clouds_are_said_in_chips(cloud, chips):

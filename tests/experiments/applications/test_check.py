@@ -17,10 +17,10 @@ from tests.data_pipelines.windows.test_evalset import small_store
     [
         (2, 9, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 2 of 16 are held out, by "
                    "store.min_val=2, store.val_fraction=0.05 and at most store.max_val_fraction=0.5. It is judged on "),
-        (5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, of which the "
-                   "2 frozen windows are of 2: eval.windows_per_dataset took no more, or the others are too short. Freeze "
-                   "more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace windows`"),
-        (5, 9, 2, "--windows 2 takes 1 of the 5 that the 9 windows there are of; give more"),
+        (5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, and the "
+                   "2 frozen windows are of 2 of them: eval.windows_per_dataset took no more, or the others are too "
+                   "short. Freeze more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace windows`"),
+        (5, 9, 2, "--windows 2 takes 1 of the 5 episodes that the 9 windows there are of; give more"),
         (5, 25, 64, ""),
     ],
 )  # fmt: skip
