@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from pathlib import Path
 
 import jax
@@ -77,6 +78,7 @@ def test_a_directory_that_vanishes_keeps_what_it_had_and_is_not_made_anew(tmp_pa
         if step == 3:
             while not (run / "checkpoints" / "2" / "sha256.json").exists():
                 pass  # it is saved in the background
+            time.sleep(0.2)  # that file's directory is synchronised after it
             run.rename(elsewhere)
 
     with pytest.raises(SaveError, match=f"{run} is no longer there, .* nothing was saved at step 4. Put it back"):
