@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any, Literal
 
+from data_pipelines.sampling.splits import check_bounds
 from hma_jax.config import (
     AnyTokenizerConfig,
     ConfigError,
@@ -64,15 +65,7 @@ class StoreConfig:
             f"store.max_skipped must be a whole number of episodes or, below 1, a share of them, got {m:g}",
         )
         # As tokenising asks for them, which may come hours later.
-        require(0 <= self.val_fraction < 1, f"store.val_fraction must lie in [0, 1), got {self.val_fraction:g}")
-        require(
-            0 <= self.min_val <= self.max_val,
-            f"store.min_val must lie between 0 and store.max_val, {self.max_val}, got {self.min_val}",
-        )
-        require(
-            0 < self.max_val_fraction <= 0.5,
-            f"store.max_val_fraction must lie in (0, 0.5], got {self.max_val_fraction:g}",
-        )
+        check_bounds(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction, "store.")
         require(
             self.frame_step is None or self.frame_step >= 1,
             f"store.frame_step must be at least 1, got {self.frame_step}",

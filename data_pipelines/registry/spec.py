@@ -132,6 +132,10 @@ class DatasetSpec:
         """Native frames per model frame in a study at `rate` Hz (None: native), unless this entry has its own."""
         return stride_of(self.hz, rate if self.rate is None else self.rate)
 
+    def rate_for(self, stride: int) -> float:
+        """The rate, in Hz, that gives this stride; six digits, which do."""
+        return float(f"{self.hz / stride:.6g}")
+
     def check_like(self, robot: Embodiment, rate: float | None = FRAME_RATE) -> None:
         """Raises ConfigError, saying what to change, unless a study at `rate` Hz has the actions of a frame as this
         `robot` of a model has them."""
@@ -146,7 +150,7 @@ class DatasetSpec:
             )
         stride = self.stride_at(rate)
         if stride != robot.stride:
-            right = f"{self.hz / robot.stride:.6g}"
+            right = f"{self.rate_for(robot.stride):g}"
             raise ConfigError(
                 f"{name}: the model was made for frames at stride {robot.stride}, here they are at stride {stride} of "
                 f"{self.hz:g} Hz. Put `rate = {right}` into the entry of {name}, {again}; --set rate={right} does the "

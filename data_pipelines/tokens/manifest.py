@@ -19,7 +19,7 @@ import numpy as np
 from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
-from data_pipelines.sampling.splits import count_held_out
+from data_pipelines.sampling.splits import check_bounds, count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
 from hma_jax.config import require
@@ -80,13 +80,8 @@ class JobSettings:
     max_val_fraction: float = 0.5  # of a dataset, whatever min_val says
 
     def __post_init__(self):
-        require(0 <= self.val_fraction < 1, f"val_fraction must lie in [0, 1), got {self.val_fraction}")
+        check_bounds(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)
         require(self.frame_step >= 1, f"frame_step must be at least 1, got {self.frame_step}")
-        require(0 <= self.min_val <= self.max_val, f"min_val {self.min_val} exceeds max_val {self.max_val}")
-        require(
-            0 < self.max_val_fraction <= 0.5,
-            f"max_val_fraction must lie in (0, 0.5], got {self.max_val_fraction}",
-        )
         require(
             self.keep_frames in ("none", "val", "all"),
             f"keep_frames must be none, val or all, got {self.keep_frames!r}",

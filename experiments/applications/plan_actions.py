@@ -259,22 +259,18 @@ def main() -> None:
             if not path.exists():
                 write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
         trials[way] = json.loads(path.read_text())
-    if trials:
-        write_results(trials, out)
-    compared, last = tuple(PLANNERS)[:3], tuple(PLANNERS)[3:]  # these start by start, then MPPI
-    for ways in ([name for name in turn if name in wanted] for turn in (compared, last)):
-        if not ways:
-            continue
-        trials, pace = trials | {way: [] for way in ways}, Pace()
-        with step(f"{', '.join(ways)}: {settings.starts} episodes each") as update:
+    planners, pace = [name for name in PLANNERS if name in wanted], Pace()
+    trials |= {way: [] for way in planners}
+    if planners:
+        with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
             for k, seed in enumerate(seeds.tolist()):
-                for way in ways:
+                for way in planners:
                     path, (search_by, where) = out / "trials" / f"{way.replace(' ', '_')}-{k}.json", PLANNERS[way]
                     if not path.exists():
                         write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
                     trials[way].append(json.loads(path.read_text()))
                 update(k + 1, len(seeds), f"starts{pace(k + 1, len(seeds))}")
-        write_results({name: trials[name] for name in WAYS if name in trials}, out)
+    write_results({name: trials[name] for name in WAYS if name in trials}, out)
     wrote(out / "trials.csv", out / "summary.csv", out / "table.md", out / "planning.png")
 
 

@@ -30,9 +30,6 @@ Platform = Literal["cpu", "cuda", "rocm", "tpu"]
 
 RATES = "rates.toml"
 
-PROMPT = 4
-"""Frames that a program is given unless told otherwise."""
-
 
 @convert_app.command(name="from-official")
 def from_official(checkpoint: Positional[Path], out: Path) -> None:
@@ -172,7 +169,7 @@ def to_stablehlo(
     decode = DecodeConfig(unmask_steps, temperature, sampler=latents)
     loaded = load_run(run, weights)
     frames = loaded.model.frames if frames is None else frames
-    prompt = min(PROMPT, frames - 1) if prompt is None else prompt
+    prompt = min(ProgramConfig.prompt, frames - 1) if prompt is None else prompt
     config = ProgramConfig(batch, prompt, frames, decode, tuple(platforms))
     write_stablehlo(loaded, out, config)
     _describe(loaded)
@@ -193,7 +190,7 @@ def _write_rates(run: Run, path: Path) -> None:
         elif spec.action_dim != robot.action_dim:
             other.append(f"{robot.name} ({robot.action_dim} values, {spec.action_dim} here)")
         else:
-            entries.append(to_toml(replace(spec, rate=float(f"{spec.hz / robot.stride:.6g}"))))
+            entries.append(to_toml(replace(spec, rate=spec.rate_for(robot.stride))))
     write_file(path, "\n".join(entries))
     for names, why in ((unknown, "which the registry does not know"), (other, "of other actions than the registry's")):
         if names:

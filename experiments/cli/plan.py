@@ -29,19 +29,27 @@ class Planned(StudyArguments):
     """The study whose model, robots, batch and execution are planned."""
 
 
+USUAL = {"model": "base", "batch": 64, "robots": 1, "dtype": "bfloat16", "remat": "everything"}
+"""Of a fixed model, what is not asked for."""
+
+
+def _usual(name: str, metavar: str | None = None) -> object:
+    return arg(metavar=metavar, help_behavior_hint=f"(default: {USUAL[name]})")
+
+
 @dataclass(frozen=True)
 class Shape:
     """A model of `hma bench`, in place of a study's."""
 
-    model: Annotated[Model | None, arg(help_behavior_hint="(default: base)")] = None
+    model: Annotated[Model | None, _usual("model")] = None
     """base is width 256 with 32 layers, xl width 1024."""
-    batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 64)")] = None
+    batch: Annotated[int | None, _usual("batch", "N")] = None
     """Windows per step, over all devices."""
-    robots: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 1)")] = None
+    robots: Annotated[int | None, _usual("robots", "N")] = None
     """Embodiments of the model."""
-    dtype: Annotated[Dtype | None, arg(help_behavior_hint="(default: bfloat16)")] = None
+    dtype: Annotated[Dtype | None, _usual("dtype")] = None
     """What is computed in; parameters and moments are float32."""
-    remat: Annotated[Remat | None, arg(help_behavior_hint="(default: everything)")] = None
+    remat: Annotated[Remat | None, _usual("remat")] = None
     """What a block keeps for the backward pass; the rest is computed again."""
 
 
@@ -122,8 +130,7 @@ def _asked(
 
         others = replace(asked, mesh=None) == Planned()
         require(others, "only a study has these settings; add --preset, or choose by --model, --batch and --robots")
-        usual = {"model": "base", "batch": 64, "robots": 1, "dtype": "bfloat16", "remat": "everything"}
-        said = usual | {name: value for name, value in vars(shape).items() if value is not None}
+        said = USUAL | {name: value for name, value in vars(shape).items() if value is not None}
         config, table = make_shape(said["model"], said["robots"])
         execution = ExecutionConfig(said["dtype"], said["remat"], mesh=MeshConfig(*asked.mesh or (1, -1, 1)))
         return said["model"], config, table, replace(TrainConfig(), batch=said["batch"]), execution
