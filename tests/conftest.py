@@ -30,6 +30,7 @@ FAST_COMPILATION = [
 if tuple(map(int, version("jaxlib").split(".")[:3])) < (0, 11, 1):  # later ones end the process at a flag they do not know
     FAST_COMPILATION.append("--xla_cpu_use_fusion_emitters=false")  # half the time of the compiler
 os.environ.setdefault("XLA_FLAGS", " ".join(FAST_COMPILATION))
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "1")  # of each operation's origin one line: a tenth of the time
 # Tracing makes millions of objects that live on: looking through them again and again took an eighth of all time.
 gc.set_threshold(100_000, 20, 20)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell's background job, whose children would not hear Ctrl-C
@@ -49,6 +50,10 @@ LONG = ("tests/integration/test_kill.py", "tests/experiments/test_whole_study.py
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: not item.nodeid.startswith(LONG))
+
+
+def pytest_sessionfinish() -> None:
+    gc.freeze()  # five looks through all objects follow, of which none is needed any more
 
 
 KEPT = {

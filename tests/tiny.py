@@ -12,6 +12,7 @@ import numpy as np
 from hma_jax.config import DiffusionConfig, ExecutionConfig, ModelConfig, MupConfig, OptimizerConfig, TrainConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.objective.masking import mask_batch
 
 TABLE = EmbodimentTable(
     (
@@ -62,6 +63,10 @@ def in_float64(execution: ExecutionConfig = ExecutionConfig()) -> ExecutionConfi
     made = dataclasses.replace(execution)
     object.__setattr__(made, "dtype", "float64")
     return made
+
+
+mask = jax.jit(mask_batch, static_argnums=(3, 4, 5))
+"""`mask_batch` as one program: by itself it is a hundred."""
 
 
 def random_batch(seed: int, config: ModelConfig, batch: int = 8, table=TABLE) -> dict[str, np.ndarray]:

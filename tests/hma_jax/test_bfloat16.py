@@ -11,8 +11,7 @@ import pytest
 from hma_jax.config import DiffusionConfig, ExecutionConfig, MaskingConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import masked_loss
-from hma_jax.objective.masking import mask_batch
-from tests.tiny import TABLE, lively_params, model_config, random_batch
+from tests.tiny import TABLE, lively_params, mask, model_config, random_batch
 
 ROWS = 48
 LATENTS = DiffusionConfig(channels=2, patch=1, width=32, depth=2, steps=20)
@@ -30,7 +29,7 @@ def gradients(dtype: str, diffusion: DiffusionConfig | None, rounded: bool = Fal
         rare = np.random.default_rng(1).random(batch["tokens"].shape) < 0.03
         batch["tokens"] = np.where(rare, batch["tokens"], 7)
     masking = MaskingConfig("full", max_corrupt_rate=0.0)  # corrupted tokens would not be skewed
-    masked = mask_batch(jax.random.key(0), batch["tokens"], batch["embodiment"], config, masking, TABLE)
+    masked = mask(jax.random.key(0), batch["tokens"], batch["embodiment"], config, masking, TABLE)
     keys = jax.random.split(jax.random.key(1), ROWS)
 
     @jax.jit

@@ -218,7 +218,7 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
             batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden
         ).said
     )
-    fast = np.asarray(next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))
+    fast = jax.jit(lambda: next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))()
     for t in range(1, config.frames):
         masked = np.broadcast_to(np.arange(config.frames)[None, :, None] >= t, batch["tokens"].shape)
         slow = np.asarray(look(masked)[:, t])

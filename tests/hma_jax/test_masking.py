@@ -10,10 +10,10 @@ from hma_jax.config import ConfigError, MaskingConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.losses import count_targets, masked_loss
-from hma_jax.objective.masking import mask_batch, mask_tokens
+from hma_jax.objective.masking import mask_tokens
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
-from tests.tiny import DIFFUSION, TABLE, lively_params, random_batch, shallow_config, train_config
+from tests.tiny import DIFFUSION, TABLE, lively_params, mask, random_batch, shallow_config, train_config
 
 MIXED = EmbodimentTable(
     (
@@ -26,7 +26,7 @@ MIXED = EmbodimentTable(
 
 def masked_batch(config, masking, table=TABLE, seed=0, batch=64):
     data = random_batch(seed, config, batch, table)
-    return data, mask_batch(jax.random.key(0), data["tokens"], data["embodiment"], config, masking, table)
+    return data, mask(jax.random.key(0), data["tokens"], data["embodiment"], config, masking, table)
 
 
 def test_the_settings_differ_in_what_is_hidden_and_predicted():
@@ -59,7 +59,7 @@ def test_frame_zero_is_always_shown():
 def test_an_example_s_masks_do_not_depend_on_its_batch():
     config = shallow_config()
     data, whole = masked_batch(config, MaskingConfig(setting="full"), batch=8)
-    part = mask_batch(
+    part = mask(
         jax.random.key(0), data["tokens"][:3], data["embodiment"][:3], config, MaskingConfig(setting="full"), TABLE
     )
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3], b), whole, part)
@@ -157,11 +157,14 @@ def test_tokens_that_change_may_count_more():
     def found(weight, among=None):
         masking = MaskingConfig(change_weight=weight)
         counted = masked if among is None else masked._replace(targets_TS=masked.targets_TS & among)
-        sums = masked_loss(
-            declared.merge(params), counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8)
-        )
-        counts = count_targets(counted, tokens, masking)
-        return [float(x) for x in (sums.tokens, sums.correct, counts.tokens)]
+
+        @jax.jit
+        def sums_and_counts(counted):
+            model = declared.merge(params)
+            sums = masked_loss(model, counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8))
+            return sums.tokens, sums.correct, count_targets(counted, tokens, masking).tokens
+
+        return [float(x) for x in sums_and_counts(counted)]
 
     moving, standing = found(1.0, changed), found(1.0, ~changed)
     assert moving[2] > 20 and standing[2] > 20
@@ -220,6 +223,7 @@ def test_hidden_actions_are_predicted_without_being_seen():
     poisoned, _ = poison_hidden(data, masked)
     hma = declared.merge(params)
 
+    @jax.jit
     def read(batch):
         out = hma(masked.inputs, masked.masked, batch["actions"], batch["embodiment"], hidden_BT=masked.hidden_T)
         return hma.action_head(out.actions, batch["embodiment"])

@@ -69,6 +69,7 @@ def test_of_actions_attended_to_a_frame_s_own_weighs_as_much_as_all_earlier_ones
     feature = np.random.default_rng(0).normal(size=(2, 6, config.width)).astype(np.float32)
     shown = np.array([[True] * 6, [False, True, False, True, True, False]])
     x, slices = jnp.zeros((2, 6, 3, config.width)), jnp.zeros(2, int)
+    attend = jax.jit(attend)
     got, cache = attend(x, ActionFeature(feature, shown), slices, causal(6), None)
 
     def mixed(example, t):

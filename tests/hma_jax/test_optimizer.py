@@ -95,12 +95,17 @@ def test_with_everyone_present_it_is_adamw():
     reference = optax.adamw(
         1e-2, CONFIG.beta1, CONFIG.beta2, CONFIG.epsilon, weight_decay=0.1, mask=decayed
     )
+
+    @jax.jit
+    def step(gradient, opt, theirs):
+        updates, opt = reference.update(gradient, opt, theirs)
+        return optax.apply_updates(theirs, updates), opt
+
     theirs, opt = params, reference.init(params)
     ours, state = params, init_adam(params, TABLE.size)
     for seed in range(3):
         ours, state = update(ours, state, [True] * 3, seed)
-        updates, opt = reference.update(gradients(params, seed), opt, theirs)
-        theirs = optax.apply_updates(theirs, updates)
+        theirs, opt = step(gradients(params, seed), opt, theirs)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), ours, theirs)
 
 
@@ -136,13 +141,14 @@ def test_muon_moves_every_matrix_by_as_much_in_every_direction_and_all_else_as_a
 def test_under_mup_muon_s_updates_keep_their_spectral_norm_at_every_width():
     def norms(width: int) -> dict[str, float]:
         config = shallow_config(width=width, mup=MupConfig(base_width=32))
-        found = {}
-        for path, spec in declare_model(config, TABLE).leaves().items():
-            if spec.role == "hidden":
-                x = jnp.asarray(np.random.default_rng(0).normal(size=spec.shape), jnp.float32)
-                direction = muon_direction(x, spec, learning_rate_multiplier(spec, config))
-                found[path] = float(singular_values(direction, spec).max())
-        return found
+        hidden = {path: s for path, s in declare_model(config, TABLE).leaves().items() if s.role == "hidden"}
+        moved = {path: np.random.default_rng(0).normal(size=s.shape).astype(np.float32) for path, s in hidden.items()}
+
+        @jax.jit
+        def directions(moved):
+            return {p: muon_direction(moved[p], s, learning_rate_multiplier(s, config)) for p, s in hidden.items()}
+
+        return {p: float(singular_values(x, hidden[p]).max()) for p, x in directions(moved).items()}
 
     narrow, wide = norms(32), norms(128)
     assert narrow and narrow.keys() == wide.keys()

@@ -1,5 +1,7 @@
 """A past that the model drew itself: which frames it replaces, and with what."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,13 +69,14 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
     before, given = jnp.asarray(batch["tokens"])[:, :-1], (batch["actions"], batch["embodiment"])
     every_frame, frames = 1e9, before.shape[1]  # of each example u times this, above 1 for any u
 
-    def own_share(rounds: int) -> np.ndarray:
+    @partial(jax.jit, static_argnums=0)
+    def own_share(rounds: int) -> jax.Array:
         """Of each frame, the share of ids that the model says after the frames before it in what is drawn."""
         past = draw_own_past(model, before, *given, None, every_frame, rounds, noise_keys(jax.random.key(0), rows), given[1])
         whole = jnp.concatenate([past, past[:, -1:]], axis=1)
         digits, _ = model.frame_head.factors_in_turn(next_frame_outputs(model, whole, *given), likeliest)
         said = compose(digits, config.factor_vocab)[:, : frames - 1]
-        return np.asarray((said == past[:, 1:]).mean((0, 2)))
+        return (said == past[:, 1:]).mean((0, 2))
 
     shares = [own_share(rounds) for rounds in range(1, frames)]
     for rounds, share in enumerate(shares, start=1):

@@ -13,12 +13,11 @@ from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, MaskingConfig,
 from hma_jax.evaluation.evaluate import evaluate, held
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.objective.losses import seen_by_all
-from hma_jax.objective.masking import mask_batch
 from hma_jax.training.state import init_state
 from hma_jax.training.step import find_presence, make_train_step
 from hma_jax.training.validation import make_sums
 from tests.hma_jax.evaluation.fakes import GreyTokenizer, make_batches
-from tests.tiny import DIFFUSION, SMALLER, TABLE, lively_params, model_config, random_batch, train_config
+from tests.tiny import DIFFUSION, SMALLER, TABLE, lively_params, mask, model_config, random_batch, train_config
 
 FRAMES = 5
 MODEL = model_config(**SMALLER | {"frames": FRAMES})
@@ -103,7 +102,7 @@ def test_targets_stand_in_real_frames_alone():
     batch, masking = random_batch(0, MODEL, len(LENGTHS)), MaskingConfig(setting="full")
     key = jax.random.key(0)
     arguments = (key, batch["tokens"], batch["embodiment"], MODEL, masking, TABLE)
-    everything, masked = mask_batch(*arguments), mask_batch(*arguments, jnp.asarray(REAL))
+    everything, masked = mask(*arguments), mask(*arguments, jnp.asarray(REAL))
     np.testing.assert_array_equal(masked.targets_TS, everything.targets_TS & REAL[..., None])
     np.testing.assert_array_equal(masked.action_targets_T, everything.action_targets_T & REAL)
     assert masked.targets_TS.sum() < everything.targets_TS.sum()
@@ -119,7 +118,7 @@ def test_targets_stand_in_real_frames_alone():
 def test_actions_that_are_hidden_in_padding_only_concern_nobody():
     """Otherwise the weights for hidden actions would decay without a gradient."""
     batch = random_batch(0, MODEL, len(LENGTHS))
-    masked = mask_batch(jax.random.key(0), batch["tokens"], batch["embodiment"], MODEL, MaskingConfig(), TABLE)
+    masked = mask(jax.random.key(0), batch["tokens"], batch["embodiment"], MODEL, MaskingConfig(), TABLE)
     masked = masked._replace(hidden_T=jnp.asarray(~REAL))
     for real, concerned in ((None, True), (jnp.asarray(REAL), False)):
         presence = find_presence(masked, batch["embodiment"], np.ones(TABLE.size, bool), MODEL, real_BT=real)

@@ -39,7 +39,7 @@ def log_likelihood(head: nnx.Module, said: jax.Array, digits: jax.Array) -> jax.
 def of_every_token(head: nnx.Module, said: jax.Array) -> np.ndarray:
     """Probabilities [V^Q]."""
     every = jnp.broadcast_to(said, (len(EVERY), *said.shape))
-    return np.exp(np.asarray(log_likelihood(head, every, EVERY), np.float64))
+    return np.exp(np.asarray(jax.jit(lambda: log_likelihood(head, every, EVERY))(), np.float64))
 
 
 def test_probabilities_of_all_tokens_add_up_to_one_and_are_no_product():
@@ -52,9 +52,10 @@ def test_probabilities_of_all_tokens_add_up_to_one_and_are_no_product():
 
 def test_a_factor_is_given_those_before_it_and_none_after():
     head, said = lively_head()
-    before = logits(head, said, jnp.zeros(FACTORS, int))
+    asked, zeros = jax.jit(lambda digits: logits(head, said, digits)), np.zeros(FACTORS, int)
+    before = asked(zeros)
     for changed in range(FACTORS):
-        after = logits(head, said, jnp.zeros(FACTORS, int).at[changed].set(1))
+        after = asked(np.where(np.arange(FACTORS) == changed, 1, zeros))
         np.testing.assert_array_equal(after[: changed + 1], before[: changed + 1])
         assert (after[changed + 1 :] != before[changed + 1 :]).any(axis=-1).all()
 
@@ -63,7 +64,7 @@ def test_tokens_are_drawn_as_often_as_they_are_likely():
     head, said = lively_head()
     draws = 20_000
     told = jnp.broadcast_to(said, (draws, *said.shape))
-    digits, _ = head.factors_in_turn(told, drawing(jax.random.key(0), head.shape(told)))
+    digits, _ = jax.jit(lambda: head.factors_in_turn(told, drawing(jax.random.key(0), head.shape(told))))()
     share = np.bincount(np.asarray(compose(digits, ENTRIES)), minlength=ENTRIES**FACTORS) / draws
     wanted = of_every_token(head, said)
     ids = np.asarray(compose(EVERY, ENTRIES))
@@ -84,7 +85,7 @@ def test_it_begins_as_if_factors_were_independent():
     head = declared.merge(params)
     said = jax.random.normal(jax.random.key(1), (5, CONFIG.width))
     for digits in (jnp.zeros((5, FACTORS), int), jnp.ones((5, FACTORS), int)):
-        np.testing.assert_array_equal(logits(head, said, digits), head.alone(said))
+        np.testing.assert_array_equal(*jax.jit(lambda digits=digits: (logits(head, said, digits), head.alone(said)))())
 
 
 @pytest.mark.parametrize(("kind", "nats"), [(ChainedReadout, np.log(ENTRIES)), (Readout, FACTORS * np.log(ENTRIES))])

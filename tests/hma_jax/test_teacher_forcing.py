@@ -36,17 +36,24 @@ def test_of_wholly_masked_frames_it_is_the_loss_of_what_generation_is_asked_firs
     model, batch = make(diffusion=diffusion, action_alignment=alignment)
     tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
     key = jax.random.key(0)
-    masked = mask_batch(key, tokens, batch["embodiment"], model.config, WHOLLY, TABLE)
     keys = noise_keys(key, 3)
-    found = masked_loss(model, masked, tokens, *rest, WHOLLY, keys)
-    asked = next_frame_outputs(model, tokens, *rest)
-    if diffusion:
-        wanted = frame_diffusion_loss(model, asked, tokens[:, 1:], keys)
-    else:
+
+    @jax.jit
+    def found():
+        masked = mask_batch(key, tokens, batch["embodiment"], model.config, WHOLLY, TABLE)
+        return masked.targets_TS, masked_loss(model, masked, tokens, *rest, WHOLLY, keys).tokens
+
+    @jax.jit
+    def wanted():
+        asked = next_frame_outputs(model, tokens, *rest)
+        if diffusion:
+            return frame_diffusion_loss(model, asked, tokens[:, 1:], keys).sum()
         labels = factorise(tokens[:, 1:], model.config.factors, model.config.factor_vocab)
-        wanted, _ = smoothed_cross_entropy(asked, labels, WHOLLY.label_smoothing)
-    assert masked.targets_TS[:, 1:].all()
-    np.testing.assert_allclose(found.tokens, wanted.sum(), rtol=1e-5)
+        return smoothed_cross_entropy(asked, labels, WHOLLY.label_smoothing)[0].sum()
+
+    targets, loss = found()
+    assert targets[:, 1:].all()
+    np.testing.assert_allclose(loss, wanted(), rtol=1e-5)
 
 
 def test_a_frame_is_told_the_frames_before_it_and_not_their_masks():
@@ -54,8 +61,9 @@ def test_a_frame_is_told_the_frames_before_it_and_not_their_masks():
     tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
     some = jax.random.bernoulli(jax.random.key(1), 0.5, tokens[:, 1:].shape)
 
-    def said(before: jax.Array, masked: jax.Array) -> np.ndarray:
-        return np.asarray(look_beside(model, before, tokens[:, 1:], masked, *rest).said)
+    @jax.jit
+    def said(before: jax.Array, masked: jax.Array) -> jax.Array:
+        return look_beside(model, before, tokens[:, 1:], masked, *rest).said
 
     shown = said(tokens[:, :-1], some)
     other_masks = said(tokens[:, :-1], some.at[:, 0].set(~some[:, 0]))
@@ -72,8 +80,9 @@ def test_what_a_masked_token_recalls_is_the_frame_before_and_never_the_truth(dif
     tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
     before, masked = tokens[:, :-1], jnp.ones(tokens[:, 1:].shape[:3], bool)
 
-    def said(before: jax.Array, ahead: jax.Array) -> np.ndarray:
-        return np.asarray(look_beside(model, before, ahead, masked, *rest).said)
+    @jax.jit
+    def said(before: jax.Array, ahead: jax.Array) -> jax.Array:
+        return look_beside(model, before, ahead, masked, *rest).said
 
     told = said(before, tokens[:, 1:])
     np.testing.assert_array_equal(said(before, jnp.zeros_like(before)), told)
@@ -88,8 +97,9 @@ def test_in_one_pass_over_masked_frames_only_what_is_shown_is_recalled():
     tokens, rest = batch["tokens"], (batch["actions"], batch["embodiment"])
     masked = jnp.zeros(tokens.shape, bool).at[:, 2:].set(True)
 
-    def said(tokens: jax.Array) -> np.ndarray:
-        return np.asarray(model(tokens, masked, *rest).said)
+    @jax.jit
+    def said(tokens: jax.Array) -> jax.Array:
+        return model(tokens, masked, *rest).said
 
     np.testing.assert_array_equal(said(tokens.at[:, 2:].set(0)), said(tokens))
     changed = said(tokens.at[:, 1].set(0)) != said(tokens)

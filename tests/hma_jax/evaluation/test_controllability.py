@@ -113,23 +113,25 @@ def test_a_model_that_reads_actions_finds_the_true_ones():
         return {"loss": jnp.square(given - actions).mean((1, 2))}
 
     losses = under_each(judge, actions, others)["loss"]
-    found = told_apart(losses, jnp.ones((5, 15), bool))
+    tell_apart = jax.jit(told_apart)
+    found = tell_apart(losses, jnp.ones((5, 15), bool))
     assert losses.shape == (16, 5)
     np.testing.assert_array_equal(found["retrieval"], 1)
     np.testing.assert_array_equal(found["retrieval_rank"], 1)
     np.testing.assert_allclose(found["action_nats"], losses[1:].mean(0), rtol=1e-6)
-    shifted = told_apart(under_each(judge, others[:, 0], others)["loss"], jnp.ones((5, 15), bool))
+    shifted = tell_apart(under_each(judge, others[:, 0], others)["loss"], jnp.ones((5, 15), bool))
     assert (shifted["retrieval_rank"] > 1).all()  # the control: they made other frames
 
 
 def test_ranks_count_better_ones_and_halve_ties():
     losses = jnp.asarray([[2.0], [1.0], [2.0], [3.0], [0.0]])  # the truth, then four others
     valid = jnp.asarray([[True, True, True, False]])
-    found = {name: float(x[0]) for name, x in told_apart(losses, valid).items()}
+    tell_apart = jax.jit(told_apart)
+    found = {name: float(x[0]) for name, x in tell_apart(losses, valid).items()}
     assert found == {"action_nats": 0.0, "retrieval": 0.0, "retrieval_rank": 2.5, "retrieval_chance": 0.25}
-    tied = told_apart(jnp.asarray([[1.0], [1.0], [4.0]]), jnp.ones((1, 2), bool))
+    tied = tell_apart(jnp.asarray([[1.0], [1.0], [4.0]]), jnp.ones((1, 2), bool))
     assert float(tied["retrieval"][0]) == 0.5
-    nobody = told_apart(losses, jnp.zeros((1, 4), bool))
+    nobody = tell_apart(losses, jnp.zeros((1, 4), bool))
     assert all(np.isnan(x).all() for x in nobody.values()) and set(nobody) < set(OPTIONAL)
 
 
@@ -137,11 +139,12 @@ def test_a_rollout_that_goes_where_the_other_actions_lead_gains():
     rng = np.random.default_rng(0)
     truth, shown, before = (jnp.asarray(rng.integers(0, 255, (3, n, 8, 8, 3)), jnp.uint8) for n in (4, 4, 1))
     real = jnp.asarray([[True] * 4, [True, True, False, False], [True] * 4])
-    right = counterfactual(shown, truth, truth, before, jnp.asarray([True, True, False]), real)
+    judge = jax.jit(counterfactual)
+    right = judge(shown, truth, truth, before, jnp.asarray([True, True, False]), real)
     np.testing.assert_allclose(right["counterfactual_psnr"], [MAX_PSNR, MAX_PSNR, np.nan], rtol=1e-6)
     want = MAX_PSNR - psnr(np.asarray(shown), np.asarray(truth))
     np.testing.assert_allclose(right["counterfactual_gain"][:2], [want[0].mean(), want[1, :2].mean()], rtol=1e-5)
-    ignores = counterfactual(shown, shown, truth, before, jnp.ones(3, bool), real)
+    ignores = judge(shown, shown, truth, before, jnp.ones(3, bool), real)
     np.testing.assert_array_equal(ignores["counterfactual_gain"], 0)
     copied = psnr(np.repeat(np.asarray(before), 4, axis=1), np.asarray(truth)).mean(1)
     np.testing.assert_allclose(np.asarray(ignores["counterfactual_copy"])[[0, 2]], copied[[0, 2]], rtol=1e-5)
