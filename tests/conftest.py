@@ -56,6 +56,17 @@ def pytest_sessionfinish() -> None:
     gc.freeze()  # five looks through all objects follow, of which none is needed any more
 
 
+@pytest.fixture(autouse=True)
+def no_entries_of_other_tests():
+    """What a test registers is for the rest of the process: here for the rest of the test."""
+    table = "data_pipelines.registry.table"
+    kept = dict(sys.modules[table]._registered) if table in sys.modules else {}
+    yield
+    if table in sys.modules:
+        sys.modules[table]._registered.clear()
+        sys.modules[table]._registered.update(kept)
+
+
 KEPT = {
     "hma_jax.model.hma": "declare_model",
     "hma_jax.tokenizers.autoencoder": "declare_tokenizer",
