@@ -33,18 +33,25 @@ play: $(VENV)/installed-play
 	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play $(RUN) --port $(PORT)
 
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
-PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist worksteal
+PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q
+PER_CORE = -n auto --maxprocesses 8 --dist worksteal
 
-# Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py.
+# Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py: in a process beside the
+# others, which says what it found after them.
 EXACT = $(shell grep -rl --include='test_*.py' 'mark.exact' tests)
+EXACT_LOG = $(VENV)/exact.log
 
 test: $(VENV)/installed-test
-	XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT)
-	$(PYTEST) -m "not exact and not slow"
+	@echo "beside these tests, those of equal numbers run in a process of their own"; \
+	XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT) >$(EXACT_LOG) 2>&1 & exact=$$!; \
+	$(PYTEST) $(PER_CORE) -m "not exact and not slow" && others=0 || others=$$?; \
+	wait $$exact && found=0 || found=$$?; \
+	echo "tests of equal numbers:"; cat $(EXACT_LOG); \
+	exit $$((others > found ? others : found))
 
 test-slow: $(VENV)/installed-test
-	XLA_FLAGS= $(PYTEST) -m exact $(EXACT)
-	$(PYTEST) -m "not exact"
+	XLA_FLAGS= $(PYTEST) $(PER_CORE) -m exact $(EXACT)
+	$(PYTEST) $(PER_CORE) -m "not exact"
 
 # constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves. uv installs in a quarter of the
 # time, and knows nothing of pip's own configuration: where uv finds no packages, pip looks for them, and says so. Modules are

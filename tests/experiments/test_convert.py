@@ -12,12 +12,17 @@ import pytest
 from data_pipelines.registry import get_spec
 from data_pipelines.registry.toml_file import load_entries
 from experiments.cli.main import main
+from experiments.presets import PRESETS
+from hma_jax.config import ConfigError
+from hma_jax.convert.release_limits import require_official
 from hma_jax.convert.run_directory import fresh_state
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.runs import describe_run, load_run
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
+from tests.tiny import TABLE
 
-CHECKPOINT = Path(__file__).parent.parent / "golden" / "04_discrete_mlp"
+ROOT = Path(__file__).parents[2]
+CHECKPOINT = ROOT / "tests" / "golden" / "04_discrete_mlp"
 
 
 def test_a_checkpoint_goes_through_every_format_and_back(tmp_path, capsys):
@@ -89,3 +94,24 @@ def test_the_average_of_the_weights_is_what_is_converted_unless_told_otherwise(a
         np.testing.assert_array_equal(x, y)
     assert convert("to-safetensors", "plain", "none", "--weights", "ema") == 2
     assert "keeps no average of its weights" in capsys.readouterr().err
+
+
+def test_the_presets_that_can_go_out_are_those_that_the_page_names():
+    """The others can with the settings that it gives, and need all of them."""
+    page = " ".join((ROOT / "docs" / "checkpoints.md").read_text().split())
+    released, forgetful = {"action_alignment": "released"}, {"recall": False}
+
+    def leaves(changes: dict) -> bool:
+        try:
+            require_official(replace(preset.model, **changes), TABLE)
+        except ConfigError:
+            return False
+        return True
+
+    needed: dict[tuple[str, ...], list[str]] = {}
+    for name, preset in PRESETS.items():
+        ways = ({}, released, released | forgetful)
+        needed.setdefault(tuple(next(way for way in ways if leaves(way))), []).append(name)
+    as_they_are, and_both = sorted(needed[()]), sorted(needed["action_alignment", "recall"])
+    assert f"The presets {', '.join(as_they_are[:-1])} and {as_they_are[-1]} have all of it. The others want" in page
+    assert f"{', '.join(and_both[:-1])} and {and_both[-1]} also `--set model.recall=false`" in page

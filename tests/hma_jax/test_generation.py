@@ -104,10 +104,10 @@ def test_the_cached_rollout_is_exact_with_everything_that_the_release_lacks_at_o
     """Past the window, and drawn with the same random numbers; and each counts."""
     config = shallow_config(conditioning="cross_attention", recall=True, chain_factors=True, frames=4)
     decode = DecodeConfig(2, temperature=1.0)
-    got = compare_with_naive(config, decode, 2, frames=6)
+    got = compare_with_naive(config, decode, 2, frames=5)
     assert (got[:, 0] != got[:, 1]).any()
     for change in ({"recall": False}, {"chain_factors": False}):
-        assert (got != rolled_out(replace(config, **change), decode, 2, frames=6)[0]).any(), change
+        assert (got != rolled_out(replace(config, **change), decode, 2, frames=5)[0]).any(), change
 
 
 @pytest.mark.slow
@@ -314,7 +314,8 @@ def test_the_sliding_rollout_equals_recomputing_every_window(options: dict, deco
     np.testing.assert_array_equal(got, want)
 
 
-NEW = 24
+NEW, FEWER = 24, 9
+"""Frames past a window of 4; what recomputes it is written out frame by frame, and so is its compilation."""
 GREEDY, SAMPLED = DecodeConfig(2), DecodeConfig(2, 1.0, top_k=4)
 
 
@@ -333,17 +334,18 @@ def case(conditioning: str, decode: DecodeConfig, alignment: str = "released", s
         *(case(name, how) for name in ("modulate", "concat", "add", "cross_attention") for how in (GREEDY, SAMPLED)),
     ],
 )
-def test_one_to_twenty_four_frames_of_different_robots_equal_the_oracle_s(
+def test_any_number_of_frames_of_different_robots_equals_the_oracle_s(
     conditioning: str, decode: DecodeConfig, alignment: str
 ):
     config = model_config(conditioning=conditioning, frames=4, action_alignment=alignment)
     declared, params = lively_params(config)
-    batch = random_batch(0, model_config(frames=1 + NEW), TABLE.size)
+    most = FEWER if alignment == "causal" else NEW
+    batch = random_batch(0, model_config(frames=1 + most), TABLE.size)
     robots, keys = np.arange(TABLE.size), jax.random.split(jax.random.key(0), TABLE.size)
     start, actions = batch["tokens"][:, :1], batch["actions"]
     naive = jax.jit(lambda p: rollout_naive(declared.merge(p), start, actions, robots, keys, decode))
     want = np.asarray(naive(params))
-    for new in (1, NEW) if decode == SAMPLED and alignment == "released" else (NEW,):
+    for new in (1, most) if decode == SAMPLED and alignment == "released" else (most,):
         chunks = actions[:, None, : 1 + new]
         fast = jax.jit(lambda p, a=chunks: rollout(declared.merge(p), start, a, robots, keys, decode)[:, 0])
         np.testing.assert_array_equal(fast(params), want[:, :new])

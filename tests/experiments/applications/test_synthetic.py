@@ -220,14 +220,35 @@ def from_settings(kind: type, path: Path, model: Path = FIRST):
     return from_dict(kind, values)
 
 
-@pytest.mark.parametrize("name", ["synthetic", "synthetic_given"])
-def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
+def summary_of(name: str, model: Path) -> list[conditions.Summary]:
+    """Of committed trials, which `name`/table.md shows."""
     place = RESULTS / name
-    settings, trials = from_settings(Settings, place / "settings.json"), conditions.read_trials(place)
+    settings, trials = from_settings(Settings, place / "settings.json", model), conditions.read_trials(place)
     assert set(trials) == {(i, s) for i in conditions.places(trials) for s in settings.seeds}
     assert settings.starts >= 50 and len(settings.seeds) >= 3
-    table = conditions.markdown(conditions.summarise(trials, settings.seeds))
-    assert table == (place / "table.md").read_text() and table in (ROOT / "docs" / "generating.md").read_text()
+    found = conditions.summarise(trials, settings.seeds)
+    assert conditions.markdown(found) == (place / "table.md").read_text()
+    return found
+
+
+@pytest.mark.parametrize("name", ["synthetic", "synthetic_given"])
+def test_the_committed_table_of_generated_trajectories_follows_from_its_trials(name):
+    assert conditions.markdown(summary_of(name, FIRST)) in (ROOT / "docs" / "generating.md").read_text()
+
+
+def test_what_the_served_model_s_trajectories_are_worth_is_as_the_page_says():
+    """Success under three ways to begin side by side, and the shares of the gap in the error of actions."""
+    page = (ROOT / "docs" / "generating.md").read_text()
+    ways = [summary_of(f"synthetic_grown{end}", DRIVEN) for end in ("", "_given", "_three")]
+
+    def said(summary: conditions.Summary, what: str) -> str:
+        r = summary.measured[what]
+        return f"{r.mean:.2f} ({r.low:.2f} to {r.high:.2f})"
+
+    rows = [f"| {row[0].name} | {' | '.join(said(one, 'success') for one in row)} |" for row in zip(*ways, strict=True)]
+    assert "\n".join(rows) in page
+    closed = [next(s for s in way if s.name == "share of the gap: 10 + 90 generated") for way in ways]
+    assert ", ".join(said(one, "error") for one in closed) in page.replace("\n", " ")
 
 
 @pytest.mark.parametrize(
