@@ -145,8 +145,8 @@ def test_nothing_is_sent_before_the_greeting():
         page = await opened(browser, address)
         await page.evaluate("""window.sent = []; window.WebSocket = class {
             static OPEN = 1;
-            readyState = 1;
-            constructor() { setTimeout(() => { this.onopen?.(); window.open_ = true; }); }
+            readyState = 0;
+            constructor() { setTimeout(() => { this.readyState = 1; this.onopen?.(); window.open_ = true; }); }
             send(text) { sent.push(JSON.parse(text).type); }
         }; state.socket.close()""")
         await page.keyboard.down("ArrowUp")
