@@ -65,10 +65,11 @@ def test_heads_are_added_and_nothing_else_changes():
         np.testing.assert_array_equal(made[name], x)
 
 
-def test_the_page_says_what_came():
+@pytest.mark.parametrize("name", ["own_policy", "own_policy_grown"])
+def test_the_page_says_what_came(name):
     root = Path(__file__).parents[4]
-    table = markdown(summarise(read_trials(root / "experiments/results/own_policy/trials.csv")))
-    assert table == (root / "experiments/results/own_policy/table.md").read_text()
+    table = markdown(summarise(read_trials(root / "experiments/results" / name / "trials.csv")))
+    assert table == (root / "experiments/results" / name / "table.md").read_text()
     assert table in (root / "docs/policies.md").read_text()
 
 
