@@ -106,7 +106,8 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     summary = evaluation.summary
     metrics = [m for m in SHOWN if m in summary.overall]
     which = ", averaged weights" if trained.weights == "ema" else ""
-    table = tidy_table(f"{short(run)}, step {trained.step:,}{which}", "dataset", *metrics)
+    when = f", step {trained.step:,}" if trained.step else ""  # a run that was converted has made no step here
+    table = tidy_table(f"{short(run)}{when}{which}", "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
         table.add_row(name, *(plus_minus(stats[m].mean, stats[m].sem) if m in stats else "" for m in metrics))
     if alone := [n for n, stats in summary.datasets.items() if all(s.clusters == 1 for s in stats.values())]:
@@ -140,18 +141,22 @@ def require_prepared(setting: Setting) -> None:
 
 def check_fits(trained: Run, materials: Materials) -> None:
     """Raises ConfigError when a model was trained for other tokens, windows or datasets than these."""
-    advice = "; evaluate it with the --out it was trained in"
-    check_tokenizer(trained, materials.tokenizer, advice)
     frames, manifest = trained.model.frames, materials.manifest
+    tokens = windows = data = "; evaluate it with the --out it was trained in"
+    if _converted(trained):  # it was trained in none
+        tokens = "; prepare a study with --tokenizer and the directory of the one that it was trained with"
+        windows = f"; prepare a study with --set model.frames={frames}"
+        data = "; prepare a study with --data of one of them"
+    check_tokenizer(trained, materials.tokenizer, tokens)
     if frames != manifest.frames:
         raise ConfigError(
             f"the model sees windows of {frames} frames, those frozen for evaluation here have "
-            f"{manifest.frames}{advice}"
+            f"{manifest.frames}{windows}"
         )
     if not set(trained.table.names) & {d.dataset for d in manifest.datasets}:
         raise ConfigError(
             f"the model was trained on {', '.join(trained.table.names)}, of which the study here has no "
-            f"windows{advice}"
+            f"windows{data}"
         )
 
 
@@ -161,8 +166,8 @@ def check_tokenizer(trained: Run, tokenizer: Tokenizer, advice: str) -> None:
         raise ConfigError(why + advice)
     if _converted(trained):
         console.print(
-            f"note: the model comes from the official release and does not say on which tokens it was trained; "
-            f"taken for those of the tokenizer here, {tokenizer.identity}",
+            f"note: the model was read in the official release's format, which does not say on which tokens it was "
+            f"trained; taken for those of the tokenizer here, {tokenizer.identity}",
             soft_wrap=True,
         )
 

@@ -24,9 +24,11 @@ from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
 from experiments.preparing import tokenizer, windows
+from hma_jax.convert import read_official, write_run
 from hma_jax.tokenizers import train as tokenizer_training
 from hma_jax.training import train as model_training
 from tests.data_pipelines.fakes import make_spec, write_rlds
+from tests.hma_jax.convert.fakes import DISCRETE, make_checkpoint
 
 ARM, BASE = map(get_spec, ("berkeley_gnm_cory_hall", "ucsd_pick_and_place_dataset_converted_externally_to_rlds"))
 LENGTHS = [12, 13, 14, 15, 12, 13]  # a whole window of the smoke study takes 12 native frames
@@ -396,6 +398,24 @@ def test_evaluation_on_windows_of_another_length(study, tmp_path, refused):
     other = prepared_otherwise(study, tmp_path, "model.frames=3")
     message = refused(2, "evaluate", study[0] / "model", *SMOKE, "--out", other, *study[1])
     assert "windows of 4 frames" in message and "have 3" in message and "the --out it was" in message
+
+
+@pytest.mark.parametrize(
+    ("changes", "robot", "why", "advice"),
+    [
+        ({"S": 64}, ARM.name, "the model takes 64 tokens", "--tokenizer and the directory of the one that it was trained"),
+        ({"T": 3}, ARM.name, "windows of 3 frames, those frozen for evaluation here have 4", "--set model.frames=3"),
+        ({}, "push2", "trained on push2, of which the study here has no windows", "--data of one of them"),
+    ],
+    ids=["tokens", "frames", "data"],
+)
+def test_evaluation_of_a_converted_model_on_what_does_not_fit_it(changes, robot, why, advice, study, tmp_path, refused):
+    """It was trained in no --out of ours."""
+    smoke = {"d_model": 8, "T": 4, "S": 16, "image_vocab_size": 256}
+    robots = [(robot, ARM.action_dim, ARM.stride)]
+    write_run(read_official(make_checkpoint(tmp_path / "a", DISCRETE | smoke | changes, robots)), tmp_path / "run")
+    message = refused(2, "evaluate", tmp_path / "run", *SMOKE, "--out", study[0], *study[1])
+    assert why in message and f"; prepare a study with {advice}" in message and "trained in" not in message
 
 
 def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tmp_path, capsys):
