@@ -2,8 +2,11 @@
 
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -15,6 +18,7 @@ from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.io import DESCRIPTION, WEIGHTS, load_tokenizer, save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 
+PAGE = Path(__file__).parents[2] / "docs" / "checkpoints.md"
 CONFIG = TokenizerConfig(
     image_size=8, downsample=4, bits=4, factors=2, channels=4, encoder_blocks=1, decoder_blocks=1
 )
@@ -51,6 +55,26 @@ def refusal(directory, **options) -> str:
     message = str(error.value)
     assert str(directory) in message, "it does not say where"
     return message
+
+
+@pytest.mark.parametrize("config", BOTH.values(), ids=BOTH)
+def test_the_program_of_the_page_computes_the_same_without_this_project(config, tmp_path, monkeypatch):
+    """With NumPy: the methods that it calls are PyTorch's too."""
+    rng = np.random.default_rng(0)
+    config = replace(config, image_size=12, decoder_blocks=2)
+    shapes = declare_tokenizer(config).shapes()
+    there = make(config, params=jax.tree.map(lambda x: np.float32(rng.normal(size=x.shape)) / 2, shapes))
+    save_tokenizer(there, tmp_path / "tokenizer")
+    (program,) = (text for text in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if WEIGHTS in text)
+    assert "hma_jax" not in program and "import torch as xp" in program
+    monkeypatch.chdir(tmp_path)
+    here: dict[str, Any] = {}
+    exec(program.replace("import torch as xp", "import numpy as xp"), here)
+    images = rng.integers(0, 256, (5, 12, 12, 3), np.uint8)
+    tokens = there.encode(images)
+    np.testing.assert_allclose(here["encode"](images), tokens, atol=1e-5)
+    frames = here["decode"](tokens)
+    assert frames.dtype == np.uint8 and np.abs(frames.astype(int) - there.decode(tokens)).max() <= 1
 
 
 def test_what_was_saved_comes_back(tokenizer, saved):
