@@ -29,11 +29,12 @@ def claim(
     settings: Mapping[str, Any],
     *,
     grows: Collection[str] = (),
+    unused: Collection[str] = (),
     file: str = FILE,
 ) -> None:
     """Makes `out` the directory of what the `simulator` of `run` gives with `settings`. To be called when both are
-    known to be good. Fields that `grows` names say how many results there are: with others of these, those that are
-    kept stay what they are.
+    known to be good. Fields that `grows` names say how many results there are, those that `unused` names (and what is
+    under them) had no part in any: with others of these, results that are kept stay what they are.
 
     Raises ConfigError, naming the differences, where `out` holds what was made otherwise, and where its file is of a
     time when it did not yet say how frames are filled.
@@ -42,7 +43,8 @@ def claim(
     if path.exists():
         known = json.loads(path.read_text())
         comparable = said if SIMULATOR in known else {name: x for name, x in said.items() if name != SIMULATOR}
-        differences = [line for line in diff(known, comparable) if line.split(":")[0] not in grows]
+        free = tuple(f"{name}{end}" for name in (*grows, *unused) for end in ":.")
+        differences = [line for line in diff(known, comparable) if not line.startswith(free)]
         require(
             not differences,
             f"{out} holds results of other settings ({'; '.join(differences)}); choose another --out or remove it",

@@ -181,7 +181,7 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
     were made with other settings."""
     simulator = load_simulator(run)
     robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
-    claim(out, run, simulator, asdict(settings))
+    claim(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():
         with step(f"record {settings.demonstrations} demonstrations"):

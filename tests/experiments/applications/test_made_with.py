@@ -49,6 +49,9 @@ def test_other_decode_settings_and_other_ranges_of_the_same_weights_are_refused(
     claim(out, run, simulator(), SETTINGS)
     with pytest.raises(ConfigError, match="simulator.decode.temperature: 0.7 -> 0.0"):
         claim(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS)
+    claim(out, run, simulator(decode=DecodeConfig(4)), SETTINGS, unused=("simulator.decode",))
+    with pytest.raises(ConfigError, match="simulator.decode.temperature: 0.7 -> 0.0"):
+        claim(out, run, simulator(decode=DecodeConfig(8, temperature=0.0)), SETTINGS, unused=("simulator.dec",))
     with pytest.raises(ConfigError, match="simulator.robots.arm: "):
         claim(out, run, simulator(robot=replace(ARM, high=(2.0,))), SETTINGS)
 

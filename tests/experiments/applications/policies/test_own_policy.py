@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -21,7 +22,7 @@ from experiments.applications.own_policy import (
     write_results,
 )
 from experiments.applications.policies.demonstrations import Demonstrations
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import path_name
 from tests.experiments.applications.runs import make_run
@@ -63,6 +64,24 @@ def test_heads_are_added_and_nothing_else_changes():
     assert config.action_heads and known.keys() < made.keys()
     for name, x in known.items():
         np.testing.assert_array_equal(made[name], x)
+
+
+def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_path, monkeypatch):
+    model, tokenizer = parts()
+    robot = replace(ROBOTS[0], name=FEW.robot)
+    monkeypatch.setattr(own_policy, "POLICIES", (RANDOM,))
+    monkeypatch.setattr(own_policy, "record", lambda *_, **__: None)
+    for name in ("save_demonstrations", "load_demonstrations"):
+        monkeypatch.setattr(own_policy, name, lambda *_: None)
+    trials = []
+    for temperature in (0.0, 1.0):
+        decode = DecodeConfig(temperature=temperature)
+        made = SimpleNamespace(
+            model=model, tokenizer=tokenizer, decode=decode, robots={robot.name: robot}, robot=lambda _: robot
+        )
+        monkeypatch.setattr(own_policy, "load_simulator", lambda _, made=made: made)
+        trials.append(compare(tmp_path / "run", tmp_path / "out", FEW))
+    assert trials[0] == trials[1] and len(trials[0][RANDOM]) == FEW.starts
 
 
 @pytest.mark.parametrize("name", ["own_policy", "own_policy_grown"])
