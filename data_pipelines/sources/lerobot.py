@@ -10,8 +10,8 @@ Depth cameras are left out.
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,15 @@ import numpy as np
 
 from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import inside, shown
-from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta, read_table
+from data_pipelines.sources.lerobot_meta import EpisodeEntry, read_meta
+from data_pipelines.sources.parquet_rows import ParquetRows
 from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.settings import LeRobotSettings
 from data_pipelines.sources.units import Episode, Layout, UnitError, choose
 from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
-SUCCESS, REWARD = "next.success", "next.reward"
+EPISODE, TIME, TASK, SUCCESS, REWARD = "episode_index", "timestamp", "task_index", "next.success", "next.reward"
 
 
 class LeRobotSource:
@@ -60,8 +61,7 @@ class LeRobotSource:
         self.hz = self.meta.fps
         self.units = [f"episode {entry.index}" for entry in self.meta.episodes]
         self.description = f"LeRobot dataset {self.root.name} ({self.meta.version}), {self.hz:g} Hz."
-        self._open_table: tuple[Path, Any] | None = None
-        self._lock = threading.Lock()
+        self._tables = ParquetRows(EPISODE)
 
     def identity(self) -> dict[str, Any]:
         files = {e.data for e in self.meta.episodes} | {
@@ -81,12 +81,12 @@ class LeRobotSource:
     def read(self, unit: int) -> Iterator[Episode]:
         entry = self.meta.episodes[unit]
         where = f"{entry.data}: episode {entry.index}"
-        table = self.rows(entry)
+        table = self.rows(entry, [TASK, SUCCESS, REWARD, *self.vectors.values()])
         steps = table.num_rows
         if steps != entry.length:
             raise UnitError(f"{where} has {steps} rows, but the meta folder says {entry.length}. {ADVICE}")
         times = self.times(table, where)
-        images = {key: self._images(entry, name, table, times, where) for key, name in self.cameras.items()}
+        images = {key: self._images(entry, name, times, where) for key, name in self.cameras.items()}
         vectors = {key: self.numbers(table, name, where) for key, name in self.vectors.items()}
         has_reward = REWARD in table.column_names
         yield Episode(
@@ -98,48 +98,41 @@ class LeRobotSource:
             success=self.success(table, where),
         )
 
-    def rows(self, entry: EpisodeEntry) -> Any:
-        """The episode's rows, in order; the last file is kept, as its neighbours lie in it too."""
-        with self._lock:
-            table = self._table(entry)
-        mask = np.asarray(table["episode_index"]) == entry.index
-        rows = np.flatnonzero(mask)
-        if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
+    def rows(self, entry: EpisodeEntry, columns: Iterable[str]) -> Any:
+        """The episode's rows, in order: when, and those of `columns` that the file has."""
+        with _as_units():
+            first, count = self._place(entry)
+            there = self._tables.columns(entry.data)
+            return self._tables.read(entry.data, [TIME, *(n for n in columns if n in there)], first, count)
+
+    def image(self, entry: EpisodeEntry, camera: str, n: int, where: str) -> bytes:
+        """Frame `n` of a camera whose images the table holds or names."""
+        with _as_units():
+            first, _ = self._place(entry)
+            self._check_camera(entry, camera, where)
+            (value,) = self._tables.read(entry.data, [camera], first + n, 1)[camera].to_pylist()
+        return self._image_bytes(value, f"{where}: {shown(camera)} at row {n}")
+
+    def _place(self, entry: EpisodeEntry) -> tuple[int, int]:
+        """(first row, rows) in the episode's file."""
+        there = self._tables.columns(entry.data)
+        missing = [n for n in (EPISODE, TIME, *self.vectors.values()) if n not in there]
+        if missing:
+            raise UnitError(f"{entry.data}: no column {shown(missing[0])}. {ADVICE}")
+        place = self._tables.find(entry.data, entry.index)
+        if place is None:
             raise UnitError(
                 f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}"
             )
-        return table.slice(int(rows[0]), len(rows))
+        return place
 
-    def _table(self, entry: EpisodeEntry) -> Any:
-        if self._open_table is None or self._open_table[0] != entry.data:
-            self._open_table = None  # freed before the next one is read
-            names = ["episode_index", "frame_index", "timestamp", "task_index", SUCCESS, REWARD]
-            names += [*self.vectors.values(), *self.cameras.values()]
-            try:
-                table = read_table(entry.data)
-            except UnreachableError:
-                raise
-            except DataError as error:
-                raise UnitError(str(error)) from error
-            missing = [
-                n
-                for n in ("episode_index", "timestamp", *self.vectors.values())
-                if n not in table.column_names
-            ]
-            if missing:
-                raise UnitError(f"{entry.data}: no column {shown(missing[0])}. {ADVICE}")
-            self._open_table = entry.data, table.select([n for n in names if n in table.column_names])
-        return self._open_table[1]
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k not in ("_lock", "_open_table")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _open_table=None, _lock=threading.Lock())
+    def _check_camera(self, entry: EpisodeEntry, name: str, where: str) -> None:
+        if name not in self._tables.columns(entry.data):
+            raise UnitError(f"{where} has no column {shown(name)}, though the feature is an image. {ADVICE}")
 
     def times(self, table: Any, where: str) -> np.ndarray:
         """Seconds since the episode's first frame. Raises UnitError for a row out of step."""
-        times = np.asarray(table["timestamp"], np.float64)
+        times = np.asarray(table[TIME], np.float64)
         expected = np.arange(len(times)) / self.hz
         wrong = np.flatnonzero(~(np.abs(times - expected) < 0.5 / self.hz))
         if len(wrong):
@@ -150,22 +143,19 @@ class LeRobotSource:
             )
         return times
 
-    def _images(
-        self, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str
-    ) -> list[bytes]:
+    def _images(self, entry: EpisodeEntry, name: str, times: np.ndarray, where: str) -> list[bytes]:
         if name in entry.videos:
             path, begin = entry.videos[name]
             with open_video(path) as video:
                 return [encode_jpeg(shrink(f, self.short_side)) for f in video.frames(times + begin)]
-        if name not in table.column_names:
-            raise UnitError(f"{where} has no column {shown(name)}, though the feature is an image. {ADVICE}")
+        self._check_camera(entry, name, where)
         images = []
-        for row, value in enumerate(table[name].to_pylist()):
+        for row, value in enumerate(self.rows(entry, [name])[name].to_pylist()):
             here = f"{where}: {shown(name)} at row {row}"
-            images.append(stored_jpeg(self.image_bytes(value, here), self.short_side, here))
+            images.append(stored_jpeg(self._image_bytes(value, here), self.short_side, here))
         return images
 
-    def image_bytes(self, value: Any, where: str) -> bytes:
+    def _image_bytes(self, value: Any, where: str) -> bytes:
         """The bytes of an image, which lie in the table or in a file that it names."""
         if isinstance(value, dict) and value.get("bytes"):
             return value["bytes"]
@@ -198,9 +188,9 @@ class LeRobotSource:
         return bool(last.any()) if np.isfinite(last).all() else None
 
     def texts(self, entry: EpisodeEntry, table: Any, where: str) -> list[str]:
-        if "task_index" not in table.column_names or not self.meta.tasks:
+        if TASK not in table.column_names or not self.meta.tasks:
             return [entry.tasks[0] if entry.tasks else ""] * table.num_rows
-        indices = table["task_index"].to_pylist()
+        indices = table[TASK].to_pylist()
         unknown = [(row, i) for row, i in enumerate(indices) if i not in self.meta.tasks]
         if unknown:
             row, index = unknown[0]
@@ -208,6 +198,17 @@ class LeRobotSource:
                 f"{where}: task_index {index} at row {row} is not among the tasks of meta. {ADVICE}"
             )
         return [self.meta.tasks[i] for i in indices]
+
+
+@contextmanager
+def _as_units() -> Iterator[None]:
+    """A file that is missing or damaged is damage of the episode that is read; one that cannot be read is not."""
+    try:
+        yield
+    except (UnreachableError, UnitError):
+        raise
+    except DataError as error:
+        raise UnitError(str(error)) from error
 
 
 def _is_camera(feature: dict[str, Any]) -> bool:

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.errors import EpisodeError
-from data_pipelines.names import shown
 from data_pipelines.sources.identity import EpisodeRun
-from data_pipelines.sources.lerobot import LeRobotSource
+from data_pipelines.sources.lerobot import SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
@@ -109,27 +108,28 @@ class LeRobotDataset(EpisodeSource):
         with ExitStack() as stack:
             if not keys and self._cameras[camera] in entry.videos:  # frames alone: no table is needed
                 steps, actions, success = entry.length, np.zeros((entry.length, 0), np.float32), None
-                table, times = None, np.arange(steps) / self.hz
+                times = np.arange(steps) / self.hz
             else:
-                table = self._table(i)
-                steps, times, success = table.num_rows, self._read.times(table, where), self._read.success(table, where)
                 fields = {field_slice(key)[0] for key in keys}
+                table = self._table(i, [SUCCESS, *(self._vectors[f] for f in fields)])
+                steps, times, success = table.num_rows, self._read.times(table, where), self._read.success(table, where)
                 record = {f: self._read.numbers(table, self._vectors[f], where) for f in fields}
                 actions = join_actions(
                     record, keys, self.features, steps, lambda what: EpisodeError(f"{where}: {what}").at(entry.data, -1)
                 )
-            fetch = self._fetch(stack, entry, self._cameras[camera], table, times, where)
+            fetch = self._fetch(stack, entry, self._cameras[camera], times, where)
             yield OpenEpisode(i, actions, success, fetch, lambda n, data: _decode(data, f"{where}, step {n}"))
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
-        table, where, entry = self._table(i), self._where(i), self._entries[i]
+        where, entry = self._where(i), self._entries[i]
+        table = self._table(i, [TASK, SUCCESS, *(self._vectors[key] for key in keys if key in self._vectors)])
         times = self._read.times(table, where)
         found: dict[str, Any] = {}
         for key in keys:
             if key in self._vectors:
                 found[key] = self._read.numbers(table, self._vectors[key], where).astype(np.float32).ravel()
             elif key in self._cameras:
-                found[key] = _Frames(self, entry, self._cameras[key], table, times, where)
+                found[key] = _Frames(self, entry, self._cameras[key], times, where)
             elif key == INSTRUCTION_KEY:
                 found[key] = [text.encode() for text in self._read.texts(entry, table, where)]
             elif key == SUCCESS_KEY and (success := self._read.success(table, where)) is not None:
@@ -139,9 +139,9 @@ class LeRobotDataset(EpisodeSource):
     def _where(self, i: int) -> str:
         return f"{self.name}, episode {self._entries[i].index} ({self._entries[i].data.name})"
 
-    def _table(self, i: int) -> Any:
+    def _table(self, i: int, columns: Sequence[str]) -> Any:
         entry = self._entries[i]
-        table = self._read.rows(entry)
+        table = self._read.rows(entry, columns)
         if table.num_rows != entry.length:
             raise EpisodeError(
                 f"{self._where(i)} has {table.num_rows} rows, but the meta folder says {entry.length}. "
@@ -150,16 +150,14 @@ class LeRobotDataset(EpisodeSource):
         return table
 
     def _fetch(
-        self, stack: ExitStack, entry: EpisodeEntry, name: str, table: Any, times: np.ndarray, where: str
+        self, stack: ExitStack, entry: EpisodeEntry, name: str, times: np.ndarray, where: str
     ) -> Callable[[int], Fetched]:
         """Frames of one camera while `stack` is open."""
         if name in entry.videos:
             path, begin = entry.videos[name]
             video = stack.enter_context(open_video(path))
             return lambda n: video.at(float(times[n] + begin))
-        if name not in table.column_names:
-            raise EpisodeError(f"{where}: no column {shown(name)}, though the feature is an image. Fetch it again.")
-        return lambda n: self._read.image_bytes(table[name][n].as_py(), f"{where}: {shown(name)} at row {n}")
+        return lambda n: self._read.image(entry, name, n, where)
 
 
 class _Frames(Sequence[Fetched]):

@@ -17,11 +17,9 @@ from typing import Any
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_lines, read_object
 from data_pipelines.names import brief, inside, shown
-from data_pipelines.sources.parquet_pages import check_pages
-from data_pipelines.sources.rlds.location import is_failure, retried
+from data_pipelines.sources.parquet_rows import ADVICE, read_table
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
-ADVICE = "Fetch the dataset again, meta folder included."
 
 MOST = 10**9
 """Of an episode's number, its length, a chunk, a task, or the values of a feature."""
@@ -140,26 +138,6 @@ def _rows(table: Any, path: Path) -> list[dict[str, Any]]:
         return table.to_pylist()
     except ValueError as error:  # texts that are none; of pyarrow's errors most are ValueErrors too
         raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
-
-
-def read_table(path: Path, columns: list[str] | None = None, **options: Any) -> Any:
-    """A pyarrow table. Raises DataError for a file that is missing or damaged."""
-    import pyarrow as arrow
-    from pyarrow import parquet
-
-    def read() -> Any:
-        try:
-            with path.open("rb") as file:
-                check_pages(file)
-            table = parquet.read_table(path, columns=columns, partitioning=None, **options)
-            table.column_names  # noqa: B018  that they are text is found out here
-            return table
-        except (OSError, ValueError, arrow.ArrowException) as error:
-            if is_failure(error):
-                raise  # to be tried again
-            raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
-
-    return retried(path, read)
 
 
 _PLACE = re.compile(r"\{(\w+)(?::0?(\d)d)?\}")

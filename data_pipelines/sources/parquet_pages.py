@@ -8,7 +8,8 @@ over some that are damaged.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 MOST_UNPACKED = 32 * 2**20
@@ -21,16 +22,45 @@ MAGIC, END = b"PAR1", 8
 """A file ends with the footer's length, in four bytes, and the magic."""
 
 # Fields of FileMetaData, RowGroup, ColumnChunk, ColumnMetaData and PageHeader.
-ROW_GROUPS, COLUMNS, META, CHUNK_SIZE, DATA_AT, DICTIONARY_AT, UNPACKED, PACKED = 4, 1, 3, 7, 9, 11, 2, 3
+ROW_GROUPS, COLUMNS, ROWS, META = 4, 1, 3, 3
+PLACE, CHUNK_SIZE, DATA_AT, DICTIONARY_AT, UNPACKED, PACKED = 3, 7, 9, 11, 2, 3
 
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 DEEPEST = 12
 
 
-def check_pages(file: BinaryIO) -> None:
-    """Raises ValueError for a page that is damaged, lies outside of its column, or says that it holds more than
-    MOST_UNPACKED bytes."""
-    for start, size in _chunks(_read_footer(file)):
+Chunk = tuple[int, int]
+"""First byte and bytes of what a group of rows holds of a column, or of one field of it."""
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """Rows that lie together: how many, and where each column of theirs does."""
+
+    rows: int
+    columns: dict[str, list[Chunk]]
+
+
+def read_groups(file: BinaryIO) -> list[RowGroup]:
+    """What the footer says. Raises ValueError for one that is damaged."""
+    groups = []
+    for group in _structs(_read_footer(file), ROW_GROUPS):
+        columns: dict[str, list[Chunk]] = {}
+        for column in _structs(group, COLUMNS):
+            meta = column.get(META)
+            if not isinstance(meta, dict):
+                raise ValueError("the footer says of a column nothing")
+            columns.setdefault(_column(meta), []).append(_chunk(meta))
+        groups.append(RowGroup(_number(group, ROWS), columns))
+    return groups
+
+
+def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
+    """Raises ValueError for a page of `chunks`, by default of all, that is damaged, lies outside of its column, or says
+    that it holds more than MOST_UNPACKED bytes."""
+    if chunks is None:
+        chunks = [chunk for group in read_groups(file) for column in group.columns.values() for chunk in column]
+    for start, size in chunks:
         at, end = start, start + size
         while at < end:
             file.seek(at)
@@ -57,15 +87,16 @@ def _read_footer(file: BinaryIO) -> dict[int, Any]:
     return _Compact(file.read(length)).read_struct()
 
 
-def _chunks(footer: dict[int, Any]) -> Iterator[tuple[int, int]]:
-    """(first byte, bytes) of every column of every group of rows."""
-    for group in _structs(footer, ROW_GROUPS):
-        for column in _structs(group, COLUMNS):
-            meta = column.get(META)
-            if not isinstance(meta, dict):
-                raise ValueError("the footer says of a column nothing")
-            starts = [at for at in (_number(meta, DATA_AT), _number(meta, DICTIONARY_AT)) if at > 0]
-            yield min(starts, default=0), _number(meta, CHUNK_SIZE)
+def _column(meta: dict[int, Any]) -> str:
+    """The column that a part of it, a field of a struct or what a list holds, belongs to; "" if it does not say."""
+    place = meta.get(PLACE)
+    first = place[0] if isinstance(place, list) and place else b""
+    return first.decode(errors="replace") if isinstance(first, bytes) else ""
+
+
+def _chunk(meta: dict[int, Any]) -> Chunk:
+    starts = [at for at in (_number(meta, DATA_AT), _number(meta, DICTIONARY_AT)) if at > 0]
+    return min(starts, default=0), _number(meta, CHUNK_SIZE)
 
 
 def _structs(values: dict[int, Any], field: int) -> list[dict[int, Any]]:
@@ -88,7 +119,7 @@ class _Compact:
         self.data, self.at = data, 0
 
     def read_struct(self, depth: int = 0) -> dict[int, Any]:
-        """Field -> value; of texts and truth values None."""
+        """Field -> value; of truth values None."""
         fields: dict[int, Any] = {}
         field = 0
         while (byte := self._byte()) != 0:
@@ -108,7 +139,9 @@ class _Compact:
         if kind == DOUBLE:
             return self._pass(8)
         if kind == BINARY:
-            return self._pass(self._varint())
+            count = self._varint()
+            self._pass(count)
+            return self.data[self.at - count : self.at]
         if kind in (LIST, SET):
             byte = self._byte()
             count = byte >> 4

@@ -81,6 +81,27 @@ def test_an_episode_of_lerobot_keeps_its_name_when_others_are_gone(tmp_path):
     assert open_source(root).ids.tolist() == [ids[0], ids[2]]
 
 
+def test_a_draw_of_images_reads_its_own_rows_alone(tmp_path):
+    """What is damaged elsewhere in the file, other columns and other episodes, is not met."""
+    root = write_lerobot(tmp_path / "toy-arm", "v3.0", camera="image")
+    (path,) = (root / "data").rglob("*.parquet")
+    pq = pytest.importorskip("pyarrow.parquet")
+    pq.write_table(pq.read_table(path), path, row_group_size=3, compression="none")
+    data, meta = bytearray(path.read_bytes()), pq.read_metadata(path)
+    for g in range(meta.num_row_groups):
+        for column in map(meta.row_group(g).column, range(meta.num_columns)):
+            name = column.path_in_schema.partition(".list")[0]
+            if name == "action" or g >= 4 and name.startswith("observation.images"):
+                data[column.dictionary_page_offset or column.data_page_offset] = 0x1D
+    path.write_bytes(data)
+    source = open_source(root, corrupt="skip")
+    assert [number(image) for image in source.frames(0, TOP.image_key, lambda n: [n - 1, 0])] == [11, 0]
+    with pytest.raises(EpisodeError, match="file-000.parquet: the table cannot be read"):
+        source.frames(1, TOP.image_key, lambda n: [0])
+    with pytest.raises(EpisodeError, match="file-000.parquet: the table cannot be read"):
+        source.episode(0, TOP.image_key, TOP.action_keys)
+
+
 def test_robomimic_is_read_where_it_lies(tmp_path):
     path = write_robomimic(tmp_path / "image.hdf5", lengths=(5, 23, 4))
     assert find_format(path) == "robomimic" and source_name(str(path)) == "robomimic_lift"

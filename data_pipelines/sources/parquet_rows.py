@@ -1,0 +1,170 @@
+"""Rows of Parquet files: of the columns and groups of rows that hold what is asked for, and of no others.
+
+Owns what is kept in memory of them. A group of rows is the least that can be read of a column; writers make one per
+episode, per hundred images or per file.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from data_pipelines.errors import DataError
+from data_pipelines.sources.parquet_pages import RowGroup, check_pages, read_groups
+from data_pipelines.sources.rlds.location import is_failure, retried
+
+T = TypeVar("T")
+
+ADVICE = "Fetch the dataset again, meta folder included."
+
+KEPT = 64 * 2**20
+"""Bytes of columns that stay in memory, beside those of the group that was asked for last, whatever it takes."""
+
+FILES = 256
+"""Files of which it is remembered how they are laid out: some kilobytes each."""
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """`ends` int64 [groups]: rows up to and including each; the runs of equal numbers in the column of labels."""
+
+    columns: tuple[str, ...]
+    groups: tuple[RowGroup, ...]
+    ends: np.ndarray
+    labels: np.ndarray  # of each run
+    starts: np.ndarray  # int64 [runs + 1]: its first row, and the number of rows
+
+
+class ParquetRows:
+    """Columns of any files, read when they are asked for. `label`: the column of integers whose runs can be found.
+
+    Thread-safe; pickles as an empty one. Every method raises DataError for a file that is missing or damaged,
+    UnreachableError for one that cannot be read.
+    """
+
+    def __init__(self, label: str):
+        self._label, self._lock = label, threading.RLock()
+        self._layouts: OrderedDict[Path, _Layout] = OrderedDict()
+        self._groups: OrderedDict[tuple[Path, int], dict[str, Any]] = OrderedDict()  # by column
+        self._held = 0
+
+    def __reduce__(self):
+        return type(self), (self._label,)
+
+    def columns(self, path: Path) -> tuple[str, ...]:
+        return self._layout(path).columns
+
+    def find(self, path: Path, label: int) -> tuple[int, int] | None:
+        """(first row, rows) labelled so; None if there are none, or if others lie between them."""
+        layout = self._layout(path)
+        at = np.flatnonzero(layout.labels == label)
+        if len(at) != 1:
+            return None
+        first, end = layout.starts[at[0] : at[0] + 2].tolist()
+        return first, end - first
+
+    def read(self, path: Path, columns: Sequence[str], first: int, count: int) -> Any:
+        """A pyarrow table of `count` rows, one at least, of `columns` that the file has."""
+        import pyarrow as arrow
+
+        with self._lock:
+            ends = self._layout(path).ends
+            begin, last = np.searchsorted(ends, [first, first + count - 1], side="right").tolist()
+            held = self._load(path, range(begin, last + 1), columns)
+        pieces = []
+        for group, found in held.items():
+            before = int(ends[group - 1]) if group else 0
+            a, b = max(first - before, 0), min(first + count, int(ends[group])) - before
+            pieces.append(arrow.table({name: found[name] for name in columns}).slice(a, b - a))
+        return arrow.concat_tables(pieces)
+
+    def _layout(self, path: Path) -> _Layout:
+        with self._lock:
+            if path not in self._layouts:
+                self._layouts[path] = _reading(path, lambda: _read_layout(path, self._label))
+                if len(self._layouts) > FILES:
+                    self._layouts.popitem(last=False)
+            self._layouts.move_to_end(path)
+            return self._layouts[path]
+
+    def _load(self, path: Path, groups: Sequence[int], columns: Sequence[str]) -> dict[int, dict[str, Any]]:
+        """The groups' `columns`, those that are not kept read from the file."""
+        held = {g: self._groups.setdefault((path, g), {}) for g in groups}
+        missing = {g: [name for name in columns if name not in held[g]] for g in groups}
+        missing = {g: names for g, names in missing.items() if names}
+        layout = self._layout(path)
+        for g, found in (_reading(path, lambda: _read_groups(path, layout, missing)) if missing else {}).items():
+            held[g].update(found)
+            self._held += sum(column.nbytes for column in found.values())
+        for g in groups:
+            self._groups.move_to_end((path, g))
+        while self._held > KEPT and len(self._groups) > 1:
+            _, given_up = self._groups.popitem(last=False)
+            self._held -= sum(column.nbytes for column in given_up.values())
+        return held
+
+
+def read_table(path: Path) -> Any:
+    """All of a file, as a pyarrow table. Raises what `ParquetRows` does."""
+    from pyarrow import parquet
+
+    def read() -> Any:
+        with path.open("rb") as file:
+            check_pages(file)
+        table = parquet.read_table(path, partitioning=None)
+        table.column_names  # noqa: B018  that they are text is found out here
+        return table
+
+    return _reading(path, read)
+
+
+def _reading(path: Path, read: Callable[[], T]) -> T:
+    import pyarrow as arrow
+
+    def attempt() -> T:
+        try:
+            return read()
+        except (OSError, ValueError, arrow.ArrowException) as error:
+            if is_failure(error):
+                raise  # to be tried again
+            raise DataError(f"{path}: the table cannot be read ({str(error).strip()}). {ADVICE}") from error
+
+    return retried(path, attempt)
+
+
+def _read_layout(path: Path, label: str) -> _Layout:
+    from pyarrow import parquet
+
+    with path.open("rb") as file:
+        groups = read_groups(file)
+        check_pages(file, [chunk for group in groups for chunk in group.columns.get(label, ())])
+    rows = np.asarray([group.rows for group in groups], np.int64)
+    with parquet.ParquetFile(path) as file:
+        columns = tuple(file.schema_arrow.names)
+        values = np.asarray(file.read([label])[label]) if label in columns else np.zeros(0, np.int64)
+    if (rows < 0).any() or len(values) not in (0, rows.sum()):
+        raise ValueError(f"its groups have {rows.tolist()} rows, {label} has {len(values)}")
+    starts = np.flatnonzero(np.append(True, values[1:] != values[:-1])[: len(values)])
+    return _Layout(columns, tuple(groups), np.cumsum(rows), values[starts], np.append(starts, len(values)))
+
+
+def _read_groups(path: Path, layout: _Layout, wanted: dict[int, list[str]]) -> dict[int, dict[str, Any]]:
+    from pyarrow import parquet
+
+    with path.open("rb") as file:
+        places = [layout.groups[g].columns.get(name, ()) for g, names in wanted.items() for name in names]
+        check_pages(file, [chunk for place in places for chunk in place])
+    found = {}
+    with parquet.ParquetFile(path) as file:
+        for g, names in wanted.items():
+            table = file.read_row_group(g, columns=names)
+            if table.num_rows != layout.groups[g].rows:
+                raise ValueError(f"a group of {layout.groups[g].rows} rows has {table.num_rows}")
+            found[g] = {name: table[name] for name in names}
+    return found
