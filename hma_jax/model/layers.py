@@ -46,8 +46,9 @@ class Linear(nnx.Module):
         init: Initializer,
         role: Role,
         with_bias: bool = True,
+        precise: bool = False,
     ):
-        self.kernel = param(sizes, axes, init, role=role)
+        self.kernel = param(sizes, axes, init, role=role, precise=precise)
         self.bias = bias((sizes[1],), (axes[1],)) if with_bias else None
 
     def __call__(self, x: jax.Array, dtype: jnp.dtype | None = None) -> jax.Array:

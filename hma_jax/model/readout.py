@@ -22,11 +22,11 @@ Choose = Callable[[int, jax.Array], jax.Array]
 class Readout(nnx.Module):
     """Trunk outputs [..., D] -> what is said of tokens: float32 logits [..., Q, V] of factors, independent of each other."""
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: ModelConfig, precise: bool = False):
         self.factors, self.multiplier = config.factors, config.mup_multiplier("readout")
         entries = config.factors * config.factor_vocab
         init = readout_init(config, entries)
-        self.linear = Linear((config.width, entries), ("D", "V"), init=init, role="output")
+        self.linear = Linear((config.width, entries), ("D", "V"), init=init, role="output", precise=precise)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         y = self.linear(x / self.multiplier, dtype=jnp.float32)
@@ -44,16 +44,17 @@ class Readout(nnx.Module):
 
 class ChainedReadout(nnx.Module):
     """The same, each factor given those before it (`ModelConfig.chain_factors`): to what `Readout` says of a factor is
-    added what a layer of width D makes of the trunk's output and of the digits chosen so far.
+    added what a layer of width D makes of the trunk's output and of the digits chosen so far. All of it in float32.
     """
 
     def __init__(self, config: ModelConfig):
         q, v, d = config.factors, config.factor_vocab, config.width
-        self.alone = Readout(config)
-        self.condition = Linear((d, d), ("D", "D_out"), init=trunk_init(config, d, d), role="hidden")
+        self.alone = Readout(config, precise=True)
+        init = trunk_init(config, d, d)
+        self.condition = Linear((d, d), ("D", "D_out"), init=init, role="hidden", precise=True)
         self.norm = LayerNorm(d)
         self.tables = param((q - 1, v, d), ("Q", "V", "D"), normal(1.0), role="vector", precise=True)
-        self.out = param((q - 1, d, v), ("Q", "D", "V"), zeros, role="output")
+        self.out = param((q - 1, d, v), ("Q", "D", "V"), zeros, role="output", precise=True)
 
     def __call__(self, x: jax.Array) -> jax.Array:
         """The trunk's outputs [..., D] themselves: factors are said one by one."""

@@ -132,7 +132,9 @@ def test_a_model_is_loaded_as_it_is_executed(dtype: str, averaged):
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, pytest.param({"diffusion": DIFFUSION}, marks=pytest.mark.slow)], ids=["discrete", "continuous"]
+    "changes",
+    [{}, {"chain_factors": True}, pytest.param({"diffusion": DIFFUSION}, marks=pytest.mark.slow)],
+    ids=["discrete", "chained", "continuous"],
 )
 def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
     """Nothing that is cast is used in a finer type."""
@@ -145,7 +147,7 @@ def test_casting_parameters_once_changes_nothing_that_is_computed(changes):
         model = declared.merge(params)
         out = model(batch["tokens"], None, model.align(batch["actions"]), batch["embodiment"])
         if not config.diffusion:
-            return out.said, out.actions
+            return model.logits(out.said, batch["tokens"]), out.actions
         times = jnp.full((4, config.frames), 3)
         tokens, actions = batch["tokens"], batch["actions"]
         return (
