@@ -86,8 +86,8 @@ def training_embodiment(
     all_of_them = not len(used) or len(used) == len(manifest.train.episodes)
     if all_of_them or not manifest.spec.action_dim:
         return manifest.embodiment(config.rate, scale=scale)
-    quantiles = store.action_quantiles(name, used) if scale == "quantiles" else None
-    return manifest.embodiment(config.rate, store.action_moments(name, used), scale, quantiles)
+    spread = store.action_spread(name, used) if scale == "quantiles" else None
+    return manifest.embodiment(config.rate, store.action_moments(name, used), scale, spread)
 
 
 def _windows(store: TokenStore, name: str, config: LoaderConfig, limit: int | None) -> WindowSet:

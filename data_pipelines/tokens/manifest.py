@@ -22,6 +22,7 @@ from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sampling.splits import check_bounds, count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
+from data_pipelines.tokens.row_sample import Spread
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.config.training import ActionScale
@@ -179,15 +180,15 @@ class Manifest:
         rate: float | None = FRAME_RATE,
         moments: Moments | None = None,
         scale: ActionScale = "deviation",
-        quantiles: Sequence[Sequence[float]] | None = None,
+        spread: Spread | None = None,
     ) -> Embodiment:
-        """The model's view of this dataset's actions at `rate`. `moments`, and `quantiles` as
-        `row_sample.QUANTILES` lists them, are of the actions that count, if those are not all of the train split's.
+        """The model's view of this dataset's actions at `rate`. `moments` and `spread` are of the actions that count, if
+        those are not all of the train split's.
 
         By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
         extremes. Raises DataError for a manifest of a version that kept no quantiles.
         """
-        return self._embodiment(self.stride_at(rate), moments, scale, quantiles)
+        return self._embodiment(self.stride_at(rate), moments, scale, spread)
 
     def check(self) -> None:
         """Raises ConfigError unless its parts fit each other."""
@@ -198,9 +199,10 @@ class Manifest:
         stride: int,
         moments: Moments | None,
         scale: ActionScale,
-        quantiles: Sequence[Sequence[float]] | None,
+        spread: Spread | None,
     ) -> Embodiment:
-        low, high = self._quantile_scale(quantiles or self.action_quantiles) if scale == "quantiles" else ((), ())
+        spread = spread or Spread(self.action_quantiles, self.action_min, self.action_max)
+        low, high = self._quantile_scale(spread) if scale == "quantiles" else ((), ())
         return Embodiment(
             self.spec.name,
             self.spec.action_dim,
@@ -213,17 +215,15 @@ class Manifest:
             layout=self.spec.action_layout(),
         )
 
-    def _quantile_scale(
-        self, quantiles: Sequence[Sequence[float]]
-    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _quantile_scale(self, spread: Spread) -> tuple[tuple[float, ...], tuple[float, ...]]:
         if not self.action_mean:
             return (), ()
-        if not quantiles:
+        if not spread.quantiles:
             raise DataError(
                 f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
                 "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
-        pairs = zip(quantiles[0], quantiles[-1], self.action_min, self.action_max, strict=True)
+        pairs = zip(spread.quantiles[0], spread.quantiles[-1], spread.low, spread.high, strict=True)
         chosen = [(a, b) if b > a else (least, most) for a, b, least, most in pairs]
         return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 

@@ -31,6 +31,16 @@ SEED = stream_seed("quantiles")
 
 
 @dataclass(frozen=True)
+class Spread:
+    """Over which values rows of actions extend, per column: `quantiles` as `QUANTILES` lists them, the smallest and the
+    largest. All () without rows."""
+
+    quantiles: tuple[tuple[float, ...], ...] = ()
+    low: tuple[float, ...] = ()
+    high: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
 class RowSample:
     """Rows of actions by increasing hash; JSON keeps them as text."""
 

@@ -19,7 +19,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
-from data_pipelines.tokens.row_sample import RowSampler
+from data_pipelines.tokens.row_sample import RowSampler, Spread
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
 from hma_jax.config.training import ActionScale
@@ -96,16 +96,21 @@ class TokenStore:
                 f"Remove {path.parent} and tokenise the dataset again."
             ) from error
 
-    def action_quantiles(self, name: str, episodes: Sequence[int]) -> tuple[tuple[float, ...], ...]:
-        """Those of `row_sample.QUANTILES`, of the actions of these training episodes alone (positions in the store).
+    def action_spread(self, name: str, episodes: Sequence[int]) -> Spread:
+        """Over which values the actions of these training episodes alone extend (positions in the store).
 
         Reads the episodes. Raises DataError for a damaged record.
         """
-        sampler = RowSampler()
+        sampler, extremes = RowSampler(), []
         for i in episodes:
             item = self.episode(name, "train", int(i))
             sampler.add(item.actions, item.episode)
-        return sampler.sample().quantiles()
+            if item.actions.size:
+                extremes.append((item.actions.min(axis=0), item.actions.max(axis=0)))
+        if not extremes:
+            return Spread()
+        low, high = np.min([a for a, _ in extremes], axis=0), np.max([b for _, b in extremes], axis=0)
+        return Spread(sampler.sample().quantiles(), tuple(low.tolist()), tuple(high.tolist()))
 
     def action_moments(self, name: str, episodes: np.ndarray) -> Moments:
         """Statistics of the actions of these training episodes alone (int [N], positions in the store).

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.errors import DataError
+from data_pipelines.loading.selection import LoaderConfig, select_windows, training_table
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, merge_samples, rows_of_part
 from data_pipelines.tokens.store import TokenStore
@@ -126,14 +127,26 @@ def test_a_value_that_moves_in_less_than_a_hundredth_is_measured_by_its_extremes
 
 
 def test_quantiles_of_some_trajectories_are_of_those_alone(tmp_path):
-    manifest = tokenize_dataset(SPEC, write_rlds(tmp_path, SPEC, [30] * 8), FakeTokenizer(), tmp_path / "store")
+    """Their extremes too, which stand in where a value moves in less than a hundredth of the steps."""
+
+    def change(episode, features):
+        features["steps/action"][0, 2] = 1 + episode
+
+    rlds = write_rlds(tmp_path, SPEC, [120] * 8, change=change)
+    manifest = tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store")
     store = TokenStore(tmp_path / "store")
-    everything = range(len(manifest.train.episodes))
-    assert store.action_quantiles("toy", everything) == manifest.action_quantiles
-    first = store.action_quantiles("toy", [0])
-    number = manifest.train.episodes[0]
-    assert (first[0][0], first[-1][0], first[2][1]) == (number, number, 14)
-    assert manifest.embodiment(scale="quantiles", quantiles=first).high[1] == first[-1][1]
+    whole = store.action_spread("toy", range(len(manifest.train.episodes)))
+    assert (whole.quantiles, whole.low, whole.high) == (
+        manifest.action_quantiles, manifest.action_min, manifest.action_max,
+    )  # fmt: skip
+    config = LoaderConfig(frames=6, max_trajectories=1)
+    (used,) = select_windows(store, config).sets["toy"].episodes.tolist()
+    (scaled,) = training_table(store, config, "quantiles").entries
+    number = manifest.train.episodes[used]
+    assert (scaled.low[0], scaled.high[0], scaled.high[1], scaled.low[2], scaled.high[2]) == (
+        number, number, 118, 0, 1 + number,
+    )  # fmt: skip
+    assert number + 1 < manifest.action_max[2]
 
 
 def test_a_store_without_quantiles_is_read_and_says_what_it_lacks(tmp_path):
