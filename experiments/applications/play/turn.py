@@ -101,7 +101,7 @@ def _start(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> N
     require(number < len(starts), f"{robot.name} has {len(starts)} starts, no {number}")
     true = None if seat.truth is None else _begun(truth, robot, starts[number])  # may fail: before anything changes
     simulator.reset(starts[number], seeds=[seed], episodes=[seat.episode])
-    seat.robot, seat.start, seat.truth, seat.recorded, seat.recording = robot, number, true, False, None
+    seat.robot, seat.start, seat.truth, seat.recorded = robot, number, true, False
 
 
 def _begun(truth: Truth, robot: Robot, start: Any) -> TrueSimulator | None:
@@ -144,7 +144,7 @@ def _truth(simulator: Simulator, truth: Truth, seat: Seat, values: Message) -> N
     seat.truth = _begun(truth, seat.robot, starts[seat.start])
     require(seat.truth is not None, f"{seat.robot.name} has no true simulator here")
     simulator.reset(starts[seat.start], episodes=[seat.episode])
-    seat.recorded, seat.recording = False, None
+    seat.recorded = False
 
 
 CHANGES = {"start": _start, "rewind": _rewind, "record": _record, "truth": _truth}

@@ -20,7 +20,7 @@ from PIL import Image  # noqa: E402
 
 from experiments.applications.play.server import CROWD  # noqa: E402
 from tests.experiments.applications.serving import serving  # noqa: E402
-from tests.experiments.applications.test_play_server import FakeTruth, shared_programs, until  # noqa: E402, F401
+from tests.experiments.applications.test_play_server import FakeTruth, until  # noqa: E402
 
 CHROMIUM = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 PATIENCE = 60_000
@@ -199,6 +199,22 @@ def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_one
     browsing(test)
 
 
+def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robot_chosen_after_it():
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.wait_for_function("document.body.dataset.count > 5")
+        talk = await overheard(page)
+        told = talk.count("rewind")  # by the new connection
+        await page.evaluate("tell({type: 'rewind', frames: 0}); rewind()")
+        await until(lambda: talk.count("rewind") == told + 2)
+        await page.evaluate("tell({type: 'rewind', frames: 1}); begin(state.robots.find(r => r.name == 'arm'), 0)")
+        await page.wait_for_function("!state.pending.length")
+        assert await page.evaluate("state.action.length") == 7, "the command of the frame that was gone back to was another robot's"
+        assert not page.faults
+
+    browsing(test)
+
+
 async def overheard(page) -> list[str]:
     """Of the page's present connection from now on: types of what it says, "<" for each answer. A new connection."""
     talk: list[str] = []
@@ -277,6 +293,11 @@ def test_it_fits_a_phone():
         pad = await page.locator(".pads").bounding_box()
         assert pad["y"] + pad["height"] <= 740, "the picture and the pad are on one screen"
         await page.tap(".pad button[data-key=ArrowUp]")
+        await page.set_viewport_size({"width": 740, "height": 360})  # on its side
+        assert await page.evaluate("document.documentElement.scrollWidth") <= 740
+        for part in (".views", ".pads"):
+            box = await page.locator(part).bounding_box()
+            assert box["y"] + box["height"] <= 360, f"{part} is on the screen"
         assert not page.faults
 
     browsing(test)

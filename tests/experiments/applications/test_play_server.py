@@ -33,15 +33,6 @@ from tests.experiments.applications.serving import SECONDS, Player, ask, hear, s
 from tests.hma_jax.simulator.small import simulator
 
 
-@pytest.fixture(autouse=True)
-def shared_programs(monkeypatch):
-    """Simulators of the same tiny model share what they compile."""
-    from hma_jax.simulator import simulator as module
-    from tests.hma_jax.simulator.conftest import programs
-
-    monkeypatch.setattr(module, "Programs", programs)
-
-
 def test_the_page_and_what_it_must_know_are_served():
     async def test(client):
         page = await (await client.get("/")).text()
@@ -487,6 +478,8 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
             frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert len(frames) == 4 and frames[0].shape == (32, 32, 3)
 
+        frame = await ask(player.socket, type="start", robot="pusher", start=0)
+        assert (frame["recorded"], frame["recording"]) == (4, False), "it can still be had when another episode begins"
         packed = await (await client.get(f"/recording/{player.token}/rlds")).read()
         zipfile.ZipFile(io.BytesIO(packed)).extractall(tmp_path)
         ((images, actions),) = _episodes(tmp_path / "arm_played" / "1.0.0")
