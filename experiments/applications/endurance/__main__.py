@@ -88,6 +88,11 @@ def main() -> None:
     parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
     asked = parser.parse_args()
     require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
+    require(
+        0 < asked.every < 120 * asked.minutes,
+        f"--every {asked.every:g}: a row of the table needs at least half as many seconds, and --minutes {asked.minutes:g} "
+        f"are {60 * asked.minutes:g}; give fewer",
+    )
     detector, rows = Detector.load(asked.detector), []
     claim_name(asked.out, asked.name, asked.run, load_simulator(asked.run), asked.detector)
     for kind in asked.drives:

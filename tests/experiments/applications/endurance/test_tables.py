@@ -1,13 +1,17 @@
 """What is found, what is close and what follows, on films that are made up."""
 
 import dataclasses
+import sys
 
 import numpy as np
+import pytest
 
+from experiments.applications.endurance.__main__ import main
 from experiments.applications.endurance.films import Film, colours_of, load_films, save_films
 from experiments.applications.endurance.hidden import LEAST, find_events
 from experiments.applications.endurance.tables import measure, over_robots, read_rows, rows_of
 from experiments.applications.tables import write_rows
+from hma_jax.config import ConfigError
 
 N = 200
 
@@ -67,6 +71,12 @@ def test_rows_are_of_whole_parts_and_are_read_again(tmp_path):
     write_rows(tmp_path / "rows.csv", rows)
     mean, half, n = over_robots([r for r in read_rows(tmp_path / "rows.csv") if r["part"] == 1], "psnr")
     assert (mean, n) == (22.0, 2) and half > 4  # of two robots little is known
+
+
+def test_a_drive_too_short_for_a_row_is_refused_before_it_is_made(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["endurance", "nowhere", "--minutes", "0.4"])
+    with pytest.raises(ConfigError, match="--every 60: .* --minutes 0.4 are 24; give fewer"):
+        main()
 
 
 def test_histograms_are_of_colours():
