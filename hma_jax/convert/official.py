@@ -39,6 +39,9 @@ from hma_jax.training.runs import Run
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 TORCH_WEIGHTS = ("pytorch_model.bin", "model.bin")
 FLOATS = ("float32", "float16", "bfloat16")
+ACTIONS_IN = ("stem/into/kernel", "action_head/robots/into/kernel")
+"""Parameters [E, U, ...] that multiply actions, given or noised."""
+
 CLIP = 10.0
 """What the release keeps predicted clean values in while sampling; its configuration has no field for it."""
 
@@ -172,6 +175,8 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
             path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays
         }
         remarks.append("the release has action heads, this model has none: they are written as zeros")
+    if not _untouched(run):
+        arrays |= _without_constants(arrays, run.table)
     arrays = folded(arrays, leaves, run.model, form)
     remarks += _remarks(run.model, form)
     tensors = to_official(nested(arrays), official_parts(form, run.table, leaves))
@@ -185,12 +190,25 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
 def _form(run: Run) -> ModelConfig:
     """The model that is written: as it came where it came from the release and was not trained since, else
     as the release holds it. Raises ConfigError if the release could not compute it."""
-    source = run.provenance.get("official")
-    untouched = source and run.step == 0 and source["table"] == stable_hash(run.table)
-    if untouched and read_model(source["config"], CONFIG) == run.model:
+    if _untouched(run):
         return run.model
     require_official(run.model, run.table)
     return released_form(run.model)
+
+
+def _untouched(run: Run) -> bool:
+    """Whether it came from the release and was not trained since."""
+    source = run.provenance.get("official")
+    if not source or run.step or source["table"] != stable_hash(run.table):
+        return False
+    return read_model(source["config"], CONFIG) == run.model
+
+
+def _without_constants(arrays: dict[str, np.ndarray], table: EmbodimentTable) -> dict[str, np.ndarray]:
+    """What action values come in by, with zeros for those that do not vary. These are 0 to this model; the release
+    divides their rounding noise by about 0 (`EmbodimentTable.normalise`)."""
+    alive_EU = table.alive()
+    return {path: np.where(alive_EU[..., None], arrays[path], 0) for path in ACTIONS_IN if path in arrays}
 
 
 def _same(theirs: ModelConfig, form: ModelConfig) -> bool:

@@ -15,6 +15,7 @@ import pytest
 from hma_jax.config import ConfigError, ExecutionConfig, MupConfig
 from hma_jax.convert import loads_in_release, read_official, write_official
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
+from hma_jax.convert.official import official_tensors
 from hma_jax.model.hma import declare_model
 from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import CONTINUOUS, make_checkpoint
@@ -39,6 +40,7 @@ def everything(config, params, execution: ExecutionConfig) -> dict[str, np.ndarr
     params = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), execution.dtype), params)
     rng, robots = np.random.default_rng(0), batch["embodiment"]
     own = np.arange(TABLE.action_width) < TABLE.chunks[np.asarray(robots), None]  # beyond it is padding
+    alive = TABLE.alive()[np.asarray(robots)][:, None]  # other values are 0, also when noised
 
     def apply(params):
         model = declared.merge(params)
@@ -48,7 +50,7 @@ def everything(config, params, execution: ExecutionConfig) -> dict[str, np.ndarr
             time = jnp.asarray(rng.integers(0, 1000, batch["tokens"].shape[:3]))
             made["denoiser"] = model.denoiser(batch["tokens"], time, out.said)
         if config.action_heads:
-            noised = (batch["actions"], time[..., 0]) if config.diffusion else ()
+            noised = (jnp.where(alive, batch["actions"], 0), time[..., 0]) if config.diffusion else ()
             actions = model.action_head(*noised, out.actions, robots)
             actions = actions.reshape(*actions.shape[:2], -1, TABLE.action_width)
             made["actions"] = jnp.where(own[:, None, None], actions, 0)
@@ -137,6 +139,18 @@ def test_what_came_with_mup_that_the_release_refuses_loses_it_once_it_is_trained
     before, after = (json.loads((tmp_path / x / "config.json").read_text()) for x in "ab")
     assert after == before | {"use_mup": False, "factored_vocab_size": 64}
     assert not loads_in_release(before) and loads_in_release(after)
+
+
+@pytest.mark.parametrize("changes", [{}, {"diffusion": RELEASED}], ids=["discrete", "continuous"])
+def test_action_values_that_do_not_vary_are_nothing_to_the_release_either(changes):
+    """It divides their rounding noise by 1e-10."""
+    config = model_config(frames=3, **changes)
+    _, params = lively_params(config)
+    tensors, _ = official_tensors(Run(config, train_config(), TABLE, params, 7, {}))
+    takes = ["action_mlp.{}.model.0.weight", *(["action_diff_losses.{}.net.input_proj.weight"] if changes else [])]
+    for name in takes:
+        assert (tensors[name.format("base")] == 0).all(axis=0).tolist() == 3 * [False, True, False]
+        assert (tensors[name.format("arm")] != 0).all()
 
 
 def test_another_range_of_clean_values_is_said(tmp_path):
