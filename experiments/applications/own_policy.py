@@ -47,7 +47,7 @@ from experiments.applications.tables import write_table
 from experiments.boundary import guarded
 from experiments.progress import step
 from experiments.wrote import wrote
-from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig
+from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, OptimizerConfig, TrainConfig, require
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.files import write_file
@@ -178,9 +178,15 @@ def markdown(rows: list[tuple[str, float, float, float]]) -> str:
 
 def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bool, float]]]:
     """What `read_trials` reads. Every policy's outcomes are kept in `out` and made once. Raises ConfigError where they
-    were made with other settings."""
+    were made with other settings, and for a model that sees more frames than there are to train it on."""
     simulator = load_simulator(run)
     robot, size, task = simulator.robot(settings.robot), simulator.tokenizer.image_size, settings.make_task()
+    window = simulator.model.config.frames
+    require(
+        window <= settings.frames,
+        f"{run} sees {window} frames, an episode here has {settings.frames}: there is nothing to train it on; name a run with "
+        "a shorter window",
+    )
     claim(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():

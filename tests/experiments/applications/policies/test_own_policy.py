@@ -82,6 +82,8 @@ def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_pa
         monkeypatch.setattr(own_policy, "load_simulator", lambda _, made=made: made)
         trials.append(compare(tmp_path / "run", tmp_path / "out", FEW))
     assert trials[0] == trials[1] and len(trials[0][RANDOM]) == FEW.starts
+    with pytest.raises(ConfigError, match="sees 4 frames, an episode here has 3"):
+        compare(tmp_path / "run", tmp_path / "shorter", replace(FEW, frames=3, hold=1))
 
 
 @pytest.mark.parametrize("name", ["own_policy", "own_policy_grown"])
