@@ -88,6 +88,7 @@ def main() -> None:
     parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
     asked = parser.parse_args()
     require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
+    require(asked.starts >= 1, f"--starts must be at least 1, got {asked.starts}")
     require(
         0 < asked.every < 120 * asked.minutes,
         f"--every {asked.every:g}: a row of the table needs at least half as many seconds, and --minutes {asked.minutes:g} "

@@ -211,6 +211,12 @@ def test_an_episode_ends_when_nothing_can_change_its_outcome():
     assert not decided([False] * 10 + [True] * 5, task) and decided([False] * 10 + [True, False], task)
 
 
+def test_a_plan_is_not_carried_out_for_longer_than_it_is():
+    assert plan_actions.Settings(execute=6).search.frames == 6
+    with pytest.raises(ConfigError, match="--execute must lie in 1..6, the frames of a plan, got 7"):
+        plan_actions.Settings(execute=7)
+
+
 def from_settings(kind: type, path: Path, model: Path = FIRST):
     values = json.loads(path.read_text())
     assert values.pop("run") == model.name

@@ -77,6 +77,9 @@ def test_a_drive_too_short_for_a_row_is_refused_before_it_is_made(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["endurance", "nowhere", "--minutes", "0.4"])
     with pytest.raises(ConfigError, match="--every 60: .* --minutes 0.4 are 24; give fewer"):
         main()
+    monkeypatch.setattr(sys, "argv", ["endurance", "nowhere", "--starts", "0"])
+    with pytest.raises(ConfigError, match="--starts must be at least 1, got 0"):
+        main()
 
 
 def test_histograms_are_of_colours():
