@@ -24,7 +24,7 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     The fast DCT is what TensorFlow's decoder uses by default, so pixels equal those that
     RLDS pipelines built on TensorFlow see. With `at_least`, a JPEG image may come smaller, as its
     coefficients allow, but no side shorter than that: what is resized anyway costs half as much.
-    Raises ValueError if the bytes are no image, or one of more than MOST_PIXELS.
+    Raises ValueError if the bytes are no image, one of more than MOST_PIXELS, or one of depths.
     """
     if data.startswith(JPEG_MAGIC):
         _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
@@ -34,6 +34,8 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             _check_pixels(data, *image.size)
+            if image.mode.startswith("I"):  # made RGB, nearly all of them would be white
+                raise ValueError(f"{len(data)} bytes of grey values of 16 bits, as of depths, no picture")
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:  # the last of broken PNG chunks
         raise ValueError(f"{len(data)} bytes that are neither JPEG nor PNG") from error

@@ -40,6 +40,11 @@ def test_png_is_lossless_and_grey_becomes_rgb():
     assert np.array_equal(grey, np.repeat(image[..., :1], 3, axis=2))
 
 
+def test_depths_of_16_bits_are_no_picture():
+    with pytest.raises(ValueError, match="grey values of 16 bits, as of depths, no picture"):
+        decode_image(png(np.arange(0, 6400, 100, np.uint16).reshape(8, 8)))
+
+
 @pytest.mark.parametrize("data", [b"", b"text", b"\xff\xd8\xff\x00 broken", b"\x89PNG broken"])
 def test_bytes_that_are_no_image_are_refused(data):
     with pytest.raises(ValueError):
