@@ -91,12 +91,11 @@ def _episodes_3(root: Path, info: dict[str, Any], videos: list[str]) -> list[Epi
     columns += [column for group in places.values() for column in group]
     entries = []
     for path in sorted(folder.glob("*/*.parquet")):
-        table = read_table(path)
+        table = read_table(path, [*columns, "tasks"])  # beside them stand statistics, which take far more
         missing = [c for c in columns if c not in table.column_names]
         if missing:
             raise DataError(f"{path}: no column {shown(missing[0])}. {ADVICE}")
-        wanted = [*columns, *(["tasks"] if "tasks" in table.column_names else [])]
-        for line, row in enumerate(_rows(table.select(wanted), path)):
+        for line, row in enumerate(_rows(table, path)):
             where = f"{path}: row {line}"
             number = {c: (_seconds if c.endswith("timestamp") else _count)(row, c, where) for c in columns}
             clips = {}
@@ -122,12 +121,12 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     path = root / "meta" / "tasks.parquet"
     if not path.exists():
         return {}
-    table = read_table(path)
-    # pandas stores the tasks as the index, which has had several names.
-    text = [c for c in ("task", "__index_level_0__", "index") if c in table.column_names]
+    texts = ("task", "__index_level_0__", "index")  # pandas stores the tasks as the index, which has had several names
+    table = read_table(path, ["task_index", *texts])
+    text = [c for c in texts if c in table.column_names]
     if not text or "task_index" not in table.column_names:
         raise DataError(
-            f"{path}: the columns are {brief(', '.join(table.column_names))}; task and task_index are needed."
+            f"{path}: of task and task_index, which are needed, it has {brief(', '.join(table.column_names)) or 'neither'}."
         )
     rows = enumerate(_rows(table.select(["task_index", text[0]]), path))
     return {_count(row, "task_index", f"{path}: row {line}"): str(row[text[0]]) for line, row in rows}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -110,14 +110,15 @@ class ParquetRows:
         return held
 
 
-def read_table(path: Path) -> Any:
-    """All of a file, as a pyarrow table. Raises what `ParquetRows` does."""
+def read_table(path: Path, columns: Collection[str]) -> Any:
+    """All rows of a file, as a pyarrow table of those of `columns` that it has. Raises what `ParquetRows` does."""
     from pyarrow import parquet
 
     def read() -> Any:
         with path.open("rb") as file:
-            check_pages(file)
-        table = parquet.read_table(path, partitioning=None)
+            groups = read_groups(file)
+            check_pages(file, [chunk for group in groups for name in columns for chunk in group.columns.get(name, ())])
+        table = parquet.read_table(path, columns=list(columns), partitioning=None)
         table.column_names  # noqa: B018  that they are text is found out here
         return table
 

@@ -11,7 +11,7 @@ from pyarrow import parquet
 
 from data_pipelines.errors import DataError
 from data_pipelines.sources import parquet_rows
-from data_pipelines.sources.parquet_rows import ParquetRows
+from data_pipelines.sources.parquet_rows import ParquetRows, read_table
 
 ROWS, GROUP = 100, 30
 EPISODES = [0] * 45 + [2] * 5 + [1] * 20 + [2] * 30
@@ -63,6 +63,14 @@ def test_other_groups_and_columns_are_not_read(path):
             rows.read(path, ["picture.top"], first, 2)
     with pytest.raises(DataError, match="kind 13"):
         rows.read(path, ["list"], 0, 1)
+
+
+def test_a_table_of_some_columns_reads_no_other(path):
+    """As beside an episode's place in LeRobot's tables stand statistics."""
+    spoil(path, "list")
+    assert read_table(path, ["number", "absent"]).to_pydict() == {"number": list(range(ROWS))}
+    with pytest.raises(DataError, match="kind 13"):
+        read_table(path, ["number", "list"])
 
 
 def test_what_was_read_last_is_kept_and_little_else(path, monkeypatch):
