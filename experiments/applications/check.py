@@ -11,8 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from data_pipelines.sampling.splits import count_held_out
+from data_pipelines.tokens.manifest import JobSettings
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches
+from experiments.running.trial import Materials, open_materials
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
 from hma_jax.config import ConfigError, require
@@ -20,32 +23,45 @@ from hma_jax.evaluation.effects import FEWEST, Effect, find_effects, make_loss
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_robots
 from hma_jax.simulator.robots import Robot
-from hma_jax.training.runs import Model, load_model
+from hma_jax.training.runs import Model
 
 BATCH = 16
+AT_LEAST = 8
+"""Episodes that `store.min_val` is to hold out, where there are enough."""
 
 Spoil = Callable[[np.ndarray], np.ndarray]
 """Changes recorded actions [n, T, stride, A]: for tests of the check itself."""
 
 
-def check_run(
-    run: Path, workspace: Workspace, robots: Sequence[str], windows: int, spoil: Spoil = lambda actions: actions
-) -> dict[str, list[Effect]]:
-    """Effects of each robot's dimensions, on so many held-out windows of the workspace.
-
-    Raises ConfigError where the run or the workspace is not there, or does not know a robot.
-    """
-    missing = [str(path) for path in (workspace.store, workspace.manifest) if not path.exists()]
+def open_study(workspace: Workspace) -> Materials:
+    """Tokenizer, tokens and windows of a study. Raises ConfigError where they are not there."""
+    needed = (workspace.store, workspace.tokenizer, workspace.manifest)
+    missing = [str(path) for path in needed if not path.exists()]
     require(not missing, f"{', '.join(missing)}: not made yet; give the --out of the study that has the robots' tokens")
-    model, store = load_model(run), TokenStore(workspace.store)
-    manifest = EvalManifest.load(workspace.manifest)
+    return open_materials(workspace)
+
+
+def check_run(
+    run: Path,
+    model: Model,
+    materials: Materials,
+    robots: Sequence[str],
+    windows: int,
+    out: Path,
+    spoil: Spoil = lambda actions: actions,
+) -> dict[str, list[Effect]]:
+    """Effects of each robot's dimensions, on so many held-out windows of the study in `out`, whose tokens are the model's.
+
+    Raises ConfigError where the study does not know a robot, or has too few episodes of it.
+    """
+    store, manifest = materials.store, materials.manifest
     known = {r.name: r for r in find_robots(run, model.table)}
     there = [name for name in known if name in manifest.names]
     names = list(robots) or there
     unknown = [name for name in names if name not in there]
     require(bool(names) and not unknown, f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}")
     for name in names:
-        require_episodes(store, manifest, name, windows, workspace.root)
+        require_episodes(store, manifest, name, windows, out)
     loss = jax.jit(make_loss(model.config, model.table, model.execution))
     return {name: _check(model, loss, store, manifest, known[name], windows, spoil) for name in names}
 
@@ -72,15 +88,29 @@ def require_episodes(store: TokenStore, manifest: EvalManifest, robot: str, wind
     elif there.spec.val_split:
         why = f"Its own split {there.spec.val_split} has {held_out}: leave val_split out of its entry"
     else:
+        episodes = held_out + len(there.train.steps)
         why = (
-            f"{held_out} of {held_out + len(there.train.steps)} are held out, by store.min_val={settings.min_val}, "
+            f"{held_out} of {episodes} are held out, by store.min_val={settings.min_val}, "
             f"store.val_fraction={settings.val_fraction:g} and at most "
-            f"store.max_val_fraction={settings.max_val_fraction:g}. "
-            "It is judged on episodes that it was not trained on: tokenise and train in another --out, with --set "
-            "store.min_val=8 from the first command on (4 of 16 episodes are held out then)"
+            f"store.max_val_fraction={settings.max_val_fraction:g}. {_hold_out_more(settings, episodes)}"
         )
     needs = f"what actions do is told from at least {FEWEST}"
     raise ConfigError(f"{robot} has {judged} episodes to be judged; {needs}. {why}")
+
+
+def _hold_out_more(settings: JobSettings, episodes: int) -> str:
+    """How to have FEWEST of so many held out."""
+    for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
+        count = count_held_out(episodes, settings.val_fraction, AT_LEAST, max(AT_LEAST, settings.max_val), share)
+        if count >= FEWEST:
+            return (
+                "It is judged on episodes that it was not trained on: tokenise and train in another --out, with --set "
+                f"store.min_val={AT_LEAST}{more} from the first command on ({count} of {episodes} are held out then)"
+            )
+    return (
+        f"No setting holds out {FEWEST} of {episodes}, half of them at most: record more, or name the dataset's own "
+        "validation split in its entry (split and val_split), if it has one"
+    )
 
 
 def _check(

@@ -32,16 +32,19 @@ def check(
         robots: Only these. Otherwise all that have windows there.
         windows: Of each robot.
     """
-    from experiments.applications.check import check_run, verdict, write_effects
+    from experiments.applications.check import check_run, open_study, verdict, write_effects
+    from experiments.cli.evaluate import check_fits
     from hma_jax.simulator.folder import find_robots
-    from hma_jax.training.runs import load_run
+    from hma_jax.training.runs import load_model
 
     require_local("--out", out)
     require(windows >= 2, f"--windows must be at least 2, got {windows}")
     workspace = Workspace(out) if out else Workspace.of_run(run)
     with step(f"check {run}"):
-        found = check_run(run, workspace, robots, windows)
-    names = {robot.name: robot.dimensions for robot in find_robots(run, load_run(run).table)}
+        model, materials = load_model(run), open_study(workspace)
+        check_fits(model.run, materials)
+        found = check_run(run, model, materials, robots, windows, workspace.root)
+    names = {robot.name: robot.dimensions for robot in find_robots(run, model.table)}
     for robot, effects in found.items():
         table = tidy_table(robot, "dimension", "worth", "verdict")
         for effect in effects:

@@ -390,8 +390,9 @@ def prepared_otherwise(study, root: Path, *settings: str, data: tuple[str, ...] 
 
 def test_evaluation_on_tokens_of_another_tokenizer(study, tmp_path, refused):
     other = prepared_otherwise(study, tmp_path, "tokenizer.channels=8")
-    message = refused(2, "evaluate", study[0] / "model", *SMOKE, "--out", other, *study[1])
-    assert "trained on tokens of tokenizer" in message and "the --out it was trained in" in message
+    for command, asked in (("evaluate", (*SMOKE, *study[1])), ("check", ())):
+        message = refused(2, command, study[0] / "model", "--out", other, *asked)
+        assert "trained on tokens of tokenizer" in message and "the --out it was trained in" in message
 
 
 def test_evaluation_on_windows_of_another_length(study, tmp_path, refused):

@@ -13,19 +13,23 @@ from tests.data_pipelines.windows.test_evalset import small_store
 
 
 @pytest.mark.parametrize(
-    ("min_val", "frozen", "windows", "said"),
+    ("episodes", "min_val", "frozen", "windows", "said"),
     [
-        (2, 9, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 2 of 16 are held out, by "
-                   "store.min_val=2, store.val_fraction=0.05 and at most store.max_val_fraction=0.5. It is judged on "),
-        (5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, and the "
+        (16, 2, 9, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 2 of 16 are held out, by "
+                   "store.min_val=2, store.val_fraction=0.05 and at most store.max_val_fraction=0.25. It is judged on "
+                   "episodes that it was not trained on: tokenise and train in another --out, with --set store.min_val=8 "
+                   "from the first command on (4 of 16 are held out then)"),
+        (9, 8, 9, 64, "--set store.min_val=8 --set store.max_val_fraction=0.5 from the first command on (4 of 9 are held "),
+        (7, 8, 9, 64, "No setting holds out 4 of 7, half of them at most: record more, or name the dataset's own "),
+        (20, 5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, and the "
                    "2 frozen windows are of 2 of them: eval.windows_per_dataset took no more, or the others are too "
                    "short. Freeze more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace windows`"),
-        (5, 9, 2, "--windows 2 takes 1 of the 5 episodes that the 9 windows there are of; give more"),
-        (5, 25, 64, ""),
+        (20, 5, 9, 2, "--windows 2 takes 1 of the 5 episodes that the 9 windows there are of; give more"),
+        (20, 5, 25, 64, ""),
     ],
 )  # fmt: skip
-def test_too_few_episodes_are_told_with_what_took_them(min_val, frozen, windows, said, tmp_path):
-    store = small_store(tmp_path, lengths=(20,) * 16, min_val=min_val, max_val_fraction=0.5)
+def test_too_few_episodes_are_told_with_what_took_them(episodes, min_val, frozen, windows, said, tmp_path):
+    store = small_store(tmp_path, lengths=(20,) * episodes, min_val=min_val)
     manifest = freeze_manifest(store, ("toy",), 4, frozen, 0)
     if not said:
         require_episodes(store, manifest, "toy", windows, Path("runs/a"))
