@@ -118,7 +118,8 @@ def read_table(path: Path, columns: Collection[str]) -> Any:
         with path.open("rb") as file:
             groups = read_groups(file)
             check_pages(file, [chunk for group in groups for name in columns for chunk in group.columns.get(name, ())])
-        table = parquet.read_table(path, columns=list(columns), partitioning=None)
+        with parquet.ParquetFile(path) as file:
+            table = file.read(columns=list(columns))
         table.column_names  # noqa: B018  that they are text is found out here
         return table
 
