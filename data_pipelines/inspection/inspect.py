@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 
 INSTRUCTION_KEYS = (INSTRUCTION_KEY, "steps/observation/natural_language_instruction")
 WIDEST = 256
-"""Values of an action field at most; wider ones are embeddings or images in disguise."""
+"""Values of an action field at most; wider ones are embeddings or images in disguise. But `action` itself is what was
+done, however wide: a model's frame has the actions of its whole stride."""
 
 BLANK_STD = 1.5
 """Grey levels: a frame that varies less over its pixels shows nothing (JPEG noise included)."""
@@ -143,7 +144,8 @@ def inspect_dataset(
     fields, splits = _describe(source)
     cameras = {f.key: _CameraLog() for f in fields if f.per_step and f.kind == "image"}
     numbers = [f.key for f in fields if f.per_step and f.kind == "number" and "action" in f.key]
-    numbers = [key for key in numbers if source.features[step_key(key)].size in range(1, WIDEST + 1)]
+    sizes = {key: source.features[step_key(key)].size for key in numbers}
+    numbers = [key for key in numbers if sizes[key] in range(1, WIDEST + 1) or key == "action" and sizes[key] > 0]
     rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
     steps, examples, prints, bytes_read = [], [], [], 0
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")

@@ -198,6 +198,12 @@ def test_dict_actions_are_suggested_field_by_field(tmp_path):
     assert (suggestion.action_keys, suggestion.action_dims) == (spec.action_keys, spec.action_dims)
 
 
+def test_actions_of_a_long_stride_are_no_embedding(tmp_path):
+    spec = make_spec("chunks", (390,))
+    suggestion = suggest_entry(inspect_dataset(write_rlds(tmp_path, spec, [5, 6])).facts, spec.hz)
+    assert (suggestion.action_keys, suggestion.action_dims) == (("action",), (390,))
+
+
 def test_real_dataset_gets_the_entry_it_has():
     facts = inspect_dataset(REAL_DATA).facts
     known = get_spec("bridge_dataset")
