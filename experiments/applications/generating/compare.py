@@ -62,7 +62,7 @@ def compare(
         still = np.broadcast_to(pair.recorded[given - 1], pair.recorded.shape)
         rows.append((pair.number, psnr_of(pair, given), psnr_of(pair._replace(generated=still), given)))
         clip = home / "clips" / f"{pair.number:05d}.mp4"
-        if i < clips and not clip.exists():
+        if i < clips:  # anew: one that is there may be of a dataset that was removed
             clip.parent.mkdir(exist_ok=True)
             write_file(clip, encode_video(np.concatenate([pair.recorded, pair.generated], axis=2), rate))
         if progress:

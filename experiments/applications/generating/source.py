@@ -60,6 +60,7 @@ class GeneratedSource:
         return {
             "generated": True,
             "robot": self._robot.name,
+            "range": [list(self._robot.low), list(self._robot.high)],  # actions beyond it are clipped
             "stride": self._robot.stride,
             "checkpoint": self._checkpoint,
             "step": self._simulator.model.step,

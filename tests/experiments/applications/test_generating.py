@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from experiments.applications.generating.trajectories import open_trajectories
 from experiments.cli.main import main
 from hma_jax.config import ConfigError
 from hma_jax.simulator import simulator as simulator_module
+from hma_jax.simulator.folder import save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.experiments.applications.runs import TABLE, make_run
@@ -66,7 +68,11 @@ def content(out):
 
 def test_recorded_actions_are_replayed_and_a_killed_command_goes_on(run, recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(source_module, "SHARD_BYTES", 1)  # a shard per batch
-    assert generate(run, recorded, tmp_path / "whole") == 0
+    clip = tmp_path / "whole" / "pusher_sand_generated" / "clips" / "00000.mp4"
+    clip.parent.mkdir(parents=True)
+    clip.write_bytes(b"of a dataset that was removed")
+    assert generate(run, recorded, tmp_path / "whole", "--clips", "1") == 0
+    assert len(clip.read_bytes()) > 500
     said = " ".join(capsys.readouterr().out.split())
     assert "5 episodes. PSNR against the recording" in said and "hma data inspect" in said
 
@@ -98,6 +104,16 @@ def test_recorded_actions_are_replayed_and_a_killed_command_goes_on(run, recorde
         np.testing.assert_array_equal(mine.actions, np.clip(truth.chunks.reshape(len(truth), -1), low, high))
         apart = np.abs(np.stack(mine.images).astype(int) - truth.images)
         assert apart[:3].mean() < 6 < apart[3:].mean()  # JPEG; then a model that knows nothing
+
+
+def test_what_was_made_under_other_ranges_of_actions_is_not_taken_for_the_same(run, recorded, tmp_path, capsys):
+    assert generate(run, recorded, tmp_path, "--episodes", "1") == 0
+    save_robots([replace(ROBOT, low=tuple(x / 2 for x in ROBOT.low))], run / "robots.json")
+    try:
+        assert generate(run, recorded, tmp_path, "--episodes", "1") == 2
+    finally:
+        (run / "robots.json").unlink()
+    assert "was not made of this source with these settings" in " ".join(capsys.readouterr().err.split())
 
 
 def episode_seed(i: int) -> int:
