@@ -73,6 +73,9 @@ def read_neutral(directory: Path) -> Run:
         description["version"] == VERSION,
         f"{path}: version {description['version']}, this program reads {VERSION}; convert it with its own",
     )
+    for name in ("tensors", "provenance"):
+        kind = type(description[name]).__name__
+        require(isinstance(description[name], dict), f"{path}: {name}: expected named fields, got {kind}")
     model = from_dict(ModelConfig, description["model"], f"{path}: model")
     table = from_dict(EmbodimentTable, description["table"], f"{path}: table")
     leaves = declare_model(model, table).leaves()

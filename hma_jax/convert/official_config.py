@@ -147,7 +147,7 @@ def read_model(config: Mapping[str, Any], where: str) -> ModelConfig:
     full = _complete(config, where)
     network = full["action_network"]
     require(
-        network in NETWORKS,
+        isinstance(network, str) and network in NETWORKS,
         f"{where}: action_network {network!r} is not supported; supported are {', '.join(NETWORKS)}",
     )
     fields = {ours: full[theirs] for theirs, ours in MODEL_FIELDS.items()}

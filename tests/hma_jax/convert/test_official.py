@@ -120,6 +120,7 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
     ("changes", "message"),
     [
         ({"action_network": "resampler_concat"}, "action_network 'resampler_concat' is not supported.*mlp"),
+        ({"action_network": ["mlp"]}, "action_network .'mlp'. is not supported"),
         ({"d_model": None}, "missing field.*d_model"),
         ({"num_heads": 3}, "multiple of model.heads"),
         ({"image_vocab_size": 65}, "65 is no product of 2 equal factors"),
