@@ -49,7 +49,7 @@ def test_list_is_filtered_by_words_and_mixture(capsys):
 
 def test_unknown_dataset_goes_from_inspection_to_training_data(robot, tmp_path, capsys):
     """Inspect, one entry, tokenise: nothing else is needed for a dataset nobody knew."""
-    entries, sheets = str(tmp_path / "my.toml"), str(tmp_path / "sheets")
+    entries, sheets = str(tmp_path / "entries" / "my.toml"), str(tmp_path / "sheets")
     assert main(["data", "inspect", str(robot), "--hz", "4", "--entry", entries, "--out", sheets]) == 0
     said = capsys.readouterr().out
     assert "not in the registry" in said and 'action_keys=("action[:3]",),' in said

@@ -123,6 +123,9 @@ def data_inspect(
     use_entries(registry)
     sheets = Path("runs") / "inspect"
     make_directory(out or sheets)
+    for option, file in (("--json", json), ("--entry", entry)):
+        if file is not None:
+            make_directory(file.parent, option)
     with step(f"read {directory}"):
         sample = inspect_dataset(directory, split, episodes=episodes)
     facts = sample.facts
