@@ -13,7 +13,10 @@ from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 MOST_UNPACKED = 32 * 2**20
-"""Bytes of a page, unpacked. Writers aim at 1 MB; a page of one large image may have more."""
+"""Bytes of any page, unpacked. Writers aim at 1 MB, but look after a thousand rows only."""
+
+MOST_TIMES = 8
+"""As many times the bytes that a page takes in the file, it may have too: a thousand images are hardly packed at all."""
 
 MOST_HEADER = 64 * 1024
 """Bytes; a header may hold the smallest and the largest value of its page."""
@@ -56,24 +59,27 @@ def read_groups(file: BinaryIO) -> list[RowGroup]:
 
 
 def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
-    """Raises ValueError for a page of `chunks`, by default of all, that is damaged, lies outside of its column, or says
-    that it holds more than MOST_UNPACKED bytes."""
+    """Raises ValueError for a page of `chunks`, by default of all, that is damaged, lies outside of its column or of the
+    file, or says that it holds more than MOST_UNPACKED bytes and MOST_TIMES its own."""
     if chunks is None:
         chunks = [chunk for group in read_groups(file) for column in group.columns.values() for chunk in column]
+    whole = file.seek(0, 2)
     for start, size in chunks:
         at, end = start, start + size
+        if end > whole:
+            raise ValueError(f"a column reaches to byte {end}, the file has {whole}")
         while at < end:
             file.seek(at)
             header = _Compact(file.read(min(MOST_HEADER, end - at)))
             sizes = header.read_struct()
             unpacked, packed = _number(sizes, UNPACKED), _number(sizes, PACKED)
-            if not 0 <= unpacked <= MOST_UNPACKED:
-                raise ValueError(
-                    f"the page at byte {at} says that it holds {unpacked} bytes, {MOST_UNPACKED} are the most"
-                )
-            at += header.at + packed
-            if packed < 0 or at > end:
+            most = max(MOST_UNPACKED, MOST_TIMES * packed)
+            after = at + header.at + packed
+            if packed < 0 or after > end:
                 raise ValueError(f"a page of {packed} bytes reaches out of its column, which ends at byte {end}")
+            if not 0 <= unpacked <= most:
+                raise ValueError(f"the page at byte {at} says that it holds {unpacked} bytes, {most} are the most")
+            at = after
 
 
 def _read_footer(file: BinaryIO) -> dict[int, Any]:

@@ -7,6 +7,7 @@ import pyarrow as arrow
 import pytest
 from pyarrow import parquet
 
+from data_pipelines.sources import parquet_pages
 from data_pipelines.sources.parquet_pages import MOST_UNPACKED, check_pages
 
 
@@ -59,6 +60,18 @@ def test_a_page_that_lies_about_its_size_is_refused(table):
     table.write_bytes(data)
     with pytest.raises(ValueError, match=f"{MOST_UNPACKED} are the most"):
         check(table)
+
+
+def test_a_page_of_many_images_is_as_large_as_they_are(tmp_path, monkeypatch):
+    """Writers end a page after a thousand rows, whatever is in them."""
+    monkeypatch.setattr(parquet_pages, "MOST_UNPACKED", 2**15)
+    random = np.random.default_rng(0)
+    parquet.write_table(arrow.table({"image": [random.bytes(2000) for _ in range(100)]}), tmp_path / "images.parquet")
+    check(tmp_path / "images.parquet")
+    zeros = arrow.table({"image": [bytes(2000)] * 100})
+    parquet.write_table(zeros, tmp_path / "zeros.parquet", compression="zstd", use_dictionary=False)
+    with pytest.raises(ValueError, match="are the most"):
+        check(tmp_path / "zeros.parquet")
 
 
 def test_a_page_that_reaches_out_of_its_column_is_refused(table):
