@@ -1,7 +1,7 @@
 """What an episode is called, whatever lies before it: its file's name, and its place in that file.
 
-Owns names as numbers. Splits, subsets and frozen windows hash them, so that an episode keeps its side
-when others are damaged, absent or left out.
+Owns names as numbers. Splits and subsets hash them, so that an episode keeps its side when others are damaged,
+absent or left out.
 """
 
 from __future__ import annotations
