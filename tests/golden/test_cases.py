@@ -20,20 +20,16 @@ VARIANTS = {
 }  # fmt: skip
 """Cases that say little beyond others (of 01b: 01d has loss and gradients of its logits; of 08d: 08c its sampler, 07 its
 joint actions; of 10b: 10a); `make test-slow` has them."""
-LARGE = {
-    "01d_discrete_loss_mup", "05_discrete_generation", "07_discrete_joint_actions", "08b_mar_loss", "08c_mar_generation",
-    "09b_tokenizer_five_levels", "10a_vae", "13_discrete_train_steps",
-}  # fmt: skip
-"""Cases that take three times as long when compiled as users compile; so compiled, `make test-slow` has them."""
 
 
+@pytest.mark.slow  # compiled as users compile, which takes three times as long
 @pytest.mark.exact
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in VARIANTS | LARGE)) for n in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_the_official_release_s_numbers(name: str):
     assert verify.main([str(HERE / name)]) == 0
 
 
-@pytest.mark.parametrize("name", sorted(LARGE))
+@pytest.mark.parametrize("name", sorted(set(CASES) - VARIANTS))
 def test_the_official_release_s_numbers_compiled_quickly(name: str):
     assert verify.main([str(HERE / name)]) == 0
 

@@ -101,13 +101,11 @@ def test_the_cached_rollout_equals_recomputing_the_window(
 
 
 def test_the_cached_rollout_is_exact_with_everything_that_the_release_lacks_at_once():
-    """Past the window, and drawn with the same random numbers; and each counts."""
+    """Past the window, and drawn with the same random numbers. That each counts is said below, by `make test-slow`."""
     config = shallow_config(conditioning="cross_attention", recall=True, chain_factors=True, frames=4)
     decode = DecodeConfig(2, temperature=1.0)
     got = compare_with_naive(config, decode, 2, frames=6)
     assert (got[:, 0] != got[:, 1]).any()
-    for change in ({"recall": False}, {"chain_factors": False}):
-        assert (got != rolled_out(replace(config, **change), decode, 2, frames=6)[0]).any(), change
 
 
 @pytest.mark.slow

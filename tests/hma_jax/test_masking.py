@@ -1,5 +1,6 @@
 import dataclasses
 import zlib
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -154,17 +155,15 @@ def test_tokens_that_change_may_count_more():
     changed = np.zeros(tokens.shape, bool)
     changed[:, 1:] = tokens[:, 1:] != tokens[:, :-1]
 
-    def found(weight, among=None):
-        masking = MaskingConfig(change_weight=weight)
-        counted = masked if among is None else masked._replace(targets_TS=masked.targets_TS & among)
+    @partial(jax.jit, static_argnums=0)
+    def sums_and_counts(weight: float, among):
+        model, masking = declared.merge(params), MaskingConfig(change_weight=weight)
+        counted = masked._replace(targets_TS=masked.targets_TS & among)
+        sums = masked_loss(model, counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8))
+        return sums.tokens, sums.correct, count_targets(counted, tokens, masking).tokens
 
-        @jax.jit
-        def sums_and_counts(counted):
-            model = declared.merge(params)
-            sums = masked_loss(model, counted, tokens, data["actions"], data["embodiment"], masking, jnp.zeros(8))
-            return sums.tokens, sums.correct, count_targets(counted, tokens, masking).tokens
-
-        return [float(x) for x in sums_and_counts(counted)]
+    def found(weight, among=np.ones_like(changed)):
+        return [float(x) for x in sums_and_counts(weight, among)]
 
     moving, standing = found(1.0, changed), found(1.0, ~changed)
     assert moving[2] > 20 and standing[2] > 20

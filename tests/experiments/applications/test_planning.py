@@ -97,10 +97,7 @@ def test_a_planner_in_the_true_simulator_goes_where_the_picture_says():
     assert np.linalg.norm(seen.positions()[0] - there) < 0.2 * away
 
 
-def test_the_learned_model_imagines_again_from_the_same_present(monkeypatch):
-    from tests.hma_jax.simulator.conftest import programs
-
-    monkeypatch.setattr("hma_jax.simulator.simulator.Programs", programs)
+def test_the_learned_model_imagines_again_from_the_same_present():
     robot, rng = ROBOTS[0], np.random.default_rng(0)
     model = LearnedModel(simulator(episodes=2, history=1), robot)
     images = list(rng.integers(0, 256, (5, 8, 8, 3), np.uint8))

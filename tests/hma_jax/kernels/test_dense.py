@@ -14,8 +14,6 @@ from hma_jax.kernels.dense import (
 )
 from tests.hma_jax.kernels.test_attention import check_equal, drawn
 
-pytestmark = pytest.mark.exact
-
 ROBOTS = jnp.array([2, 0, 2, 3, 2])
 
 
@@ -53,6 +51,7 @@ def test_each_example_is_multiplied_with_its_own_robot_s_matrix(product, sizes: 
 WIDTHS = [1, 7, 31, 33, 65, 176, 300]
 
 
+@pytest.mark.exact
 @pytest.mark.parametrize(
     "rows, out",
     [((4, 6), 32), *(pytest.param(*n, marks=pytest.mark.slow) for n in (((1, 1), 24), ((3, 12), 256)))],
