@@ -17,6 +17,10 @@ from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 
 
+HISTORY = 600
+"""Frames that an episode can be taken back by, as many as in a learned simulator: older states are not kept."""
+
+
 class World(Protocol):
     """One robot's world, whose episodes are begun by a seed and advance by native actions, float32 [A]."""
 
@@ -114,6 +118,7 @@ class TrueSimulator(ABC, Generic[W]):
         self.clipped = clipped
         for b, (world, chunk) in asked.items():
             self._before[b].append(world.get_state())
+            del self._before[b][:-HISTORY]
             for action in chunk:
                 world.step(action)
             self._draw(b, world)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from data_pipelines import true_simulator
 from data_pipelines.suite.environment import Environment
 from data_pipelines.suite.simulator import SuiteSimulator, suite_robot, suite_starts
 from data_pipelines.true_simulator import judge_by_state
@@ -25,7 +26,7 @@ def test_a_start_goes_on_as_the_recorded_episode_did(asked, stride):
     np.testing.assert_array_equal(begun.step([start.actions[stride : 2 * stride]])[0], start.images[2])
 
 
-def test_episodes_are_apart_clipped_and_taken_back():
+def test_episodes_are_apart_clipped_and_taken_back(monkeypatch):
     sim = SuiteSimulator([PUSHER, ARM], episodes=2)
     starts = [suite_starts("pusher_sand", 8, 1)[0], suite_starts("arm_chalk", 8, 1)[0]]
     first = sim.reset(starts)
@@ -39,6 +40,10 @@ def test_episodes_are_apart_clipped_and_taken_back():
     np.testing.assert_array_equal(images[0], true.render())
     assert sim.reach(0) == 1
     np.testing.assert_array_equal(sim.rewind(1, [0])[0], first[0])
+    monkeypatch.setattr(true_simulator, "HISTORY", 2)
+    seen = [sim.step([np.array([x, 0.0]), None])[0] for x in (0.9, 0.6, 0.3)]
+    assert sim.reach(0) == 2
+    np.testing.assert_array_equal(sim.rewind(2, [0])[0], seen[0])
 
 
 def test_up_moves_the_pusher_up_and_right_to_the_right():
