@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tokenize
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,14 +91,14 @@ def read_moments(part: Path, episodes: int) -> np.ndarray | None:
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, TypeError, tokenize.TokenError) as error:  # the last of a header
         raise DataError(
             f"{path}: statistics of actions cannot be read ({error}). Remove the file: they are then computed again."
         ) from error
-    if rows.ndim != 2 or len(rows) != episodes:
+    if rows.ndim != 2 or len(rows) != episodes or rows.dtype != np.float64:
         raise DataError(
-            f"{path}: statistics of {len(rows)} episodes beside a part of {episodes}. Remove the file: they are then "
-            "computed again."
+            f"{path}: {rows.dtype} {list(rows.shape)} are no statistics of {episodes} episodes. Remove the file: they are "
+            "then computed again."
         )
     return rows
 

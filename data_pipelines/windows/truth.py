@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,7 +43,7 @@ class OtherTruth:
             with np.load(path) as arrays:
                 frames = {name: arrays[name] for name in arrays.files}
                 return cls(**json.loads(frames.pop(META).tobytes()), frames=frames)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
             raise DataError(
                 f"{path}: the frames under other actions cannot be read ({error}). Remove the file and prepare the study "
                 "again, with `hma tokenize` or `hma study`."

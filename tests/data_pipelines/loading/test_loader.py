@@ -353,9 +353,15 @@ def test_statistics_beside_a_part_and_of_its_episodes_are_the_same_bits(store_ro
 def test_damaged_statistics_are_named(store_root, tmp_path):
     shutil.copytree(store_root, tmp_path / "store")
     path = next((tmp_path / "store").glob("arm/*.moments.npy"))
-    path.write_bytes(path.read_bytes()[:50])
-    with pytest.raises(DataError, match="moments.npy: statistics of actions cannot be read .* Remove the file"):
-        training_table(TokenStore(tmp_path / "store"), LoaderConfig(frames=6, max_trajectories=2))
+    whole = path.read_bytes()
+    for damaged, words in (
+        (whole[:50], "statistics of actions cannot be read"),
+        (whole.replace(b"'shape'", b"'shape(", 1), "statistics of actions cannot be read"),
+        (whole.replace(b"<f8", b"<i8", 1), r"int64 \[\d+, 7\] are no statistics of \d+ episodes"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=f"moments.npy: {words}.* Remove the file"):
+            training_table(TokenStore(tmp_path / "store"), LoaderConfig(frames=6, max_trajectories=2))
 
 
 def test_the_rate_is_a_setting(tmp_path):

@@ -125,7 +125,9 @@ def test_frames_of_other_windows_or_damaged_ones_are_refused(tmp_path):
         batches(store, 1, truth=truth_for(frozen))
     truth_for(frozen).save(tmp_path / "t.npz")
     whole = (tmp_path / "t.npz").read_bytes()
-    for content in (b"", whole[:-30]):
+    at = 30 + sum(np.frombuffer(whole[26:30], "<u2").tolist())  # where the first array begins, packed
+    changed = whole[:at] + b"\xff" + whole[at + 1 :]
+    for content in (b"", whole[:-30], changed):
         (tmp_path / "t.npz").write_bytes(content)
         with pytest.raises(DataError, match="t.npz: the frames under other actions cannot be read"):
             OtherTruth.load(tmp_path / "t.npz")
