@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
 from aiohttp import ClientWebSocketResponse, TCPConnector, WSMsgType
@@ -29,8 +29,9 @@ def serving(
     visitors: int = 2,
     truth: Truth = no_truth,
     together: int | None = None,
+    run: Callable[[Coroutine[Any, Any, None]], None] = asyncio.run,
 ) -> None:
-    """Runs `test` with a client of a server for so many visitors, `together` of whom act at once."""
+    """Runs `test` with a client of a server for so many visitors, `together` of whom act at once, by `run`."""
     sim = simulator(episodes=visitors)
     warm_up(sim)  # nobody waits for the compiler
     sim.starts = tuple(start(robot, 2, seed) for robot in (0, 1) for seed in range(2))
@@ -39,7 +40,7 @@ def serving(
         async with TestClient(TestServer(make_app(sim, truth, together)), connector=TCPConnector(limit=0)) as client:
             await asyncio.wait_for(test(client), 4 * SECONDS)
 
-    asyncio.run(main())
+    run(main())
 
 
 async def hear(socket: ClientWebSocketResponse) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import io
 import json
@@ -35,18 +36,35 @@ async def launched(play):
         pytest.skip(f"no Chromium: install it, or name it in PLAYWRIGHT_CHROMIUM ({str(error).splitlines()[0]})")
 
 
-def browsing(test, **options) -> None:
-    """Runs `test(browser, address, client)` against a server of this process."""
+@pytest.fixture(scope="module")
+def chromium():
+    """A loop and the browser in it, for all tests: beginning one takes longer than most of them."""
+    with asyncio.Runner() as runner:
+        play = runner.run(playwright.async_playwright().start())
+        try:
+            browser = runner.run(launched(play))
+            yield runner, browser
+            runner.run(browser.close())
+        finally:
+            runner.run(play.stop())
 
-    async def with_browser(client) -> None:
-        async with playwright.async_playwright() as play:
-            browser = await launched(play)
+
+@pytest.fixture
+def browsing(chromium):
+    """Runs `test(browser, address, client)` against a server of this process; who came in leaves with it."""
+    runner, browser = chromium
+
+    def run(test, **options) -> None:
+        async def with_browser(client) -> None:
             try:
                 await test(browser, str(client.make_url("/")), client)
             finally:
-                await browser.close()
+                for context in browser.contexts:
+                    await context.close()
 
-    serving(with_browser, **options)
+        serving(with_browser, run=runner.run, **options)
+
+    return run
 
 
 async def opened(browser, address: str, **how):
@@ -76,7 +94,7 @@ async def actions(client) -> list[list[float]]:
     return [e.chunks[-1].tolist() for e in simulator._episodes if e is not None and e.chunks]
 
 
-def test_keys_move_the_robot_and_letting_go_stops_it():
+def test_keys_move_the_robot_and_letting_go_stops_it(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.keyboard.down("ArrowRight")
@@ -100,7 +118,7 @@ def test_keys_move_the_robot_and_letting_go_stops_it():
     browsing(test)
 
 
-def test_a_slider_sets_its_dimension_and_rewinding_goes_back():
+def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.click("#robots button[data-name=arm]")
@@ -123,7 +141,7 @@ def test_a_slider_sets_its_dimension_and_rewinding_goes_back():
     browsing(test)
 
 
-def test_a_reload_and_a_lost_connection_find_the_episode_again():
+def test_a_reload_and_a_lost_connection_find_the_episode_again(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.wait_for_function("document.body.dataset.count > 5")
@@ -140,7 +158,7 @@ def test_a_reload_and_a_lost_connection_find_the_episode_again():
     browsing(test, visitors=1)
 
 
-def test_nothing_is_sent_before_the_greeting():
+def test_nothing_is_sent_before_the_greeting(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.evaluate("""window.sent = []; window.WebSocket = class {
@@ -160,7 +178,7 @@ def test_nothing_is_sent_before_the_greeting():
     browsing(test)
 
 
-def test_two_visitors_do_not_mix_and_a_third_is_told():
+def test_two_visitors_do_not_mix_and_a_third_is_told(browsing):
     async def test(browser, address, client):
         first = await opened(browser, address)
         second = await opened(browser, address)
@@ -180,7 +198,7 @@ def test_two_visitors_do_not_mix_and_a_third_is_told():
     browsing(test)
 
 
-def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_ones_later():
+def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_ones_later(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         simulator = client.server.app[CROWD].simulator
@@ -199,7 +217,7 @@ def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_one
     browsing(test)
 
 
-def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robot_chosen_after_it():
+def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robot_chosen_after_it(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         await page.wait_for_function("document.body.dataset.count > 5")
@@ -229,7 +247,7 @@ async def overheard(page) -> list[str]:
     return talk
 
 
-def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_robot():
+def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_robot(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)
         talk = await overheard(page)
@@ -251,7 +269,7 @@ def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_rob
     browsing(test)
 
 
-def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_rewind():
+def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_rewind(browsing):
     async def test(browser, address, client):
         simulator = client.server.app[CROWD].simulator
         simulator.describe([replace(simulator.robots["arm"], keeps=True)])
@@ -284,7 +302,7 @@ def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_re
     browsing(test, truth=FakeTruth)
 
 
-def test_it_fits_a_phone():
+def test_it_fits_a_phone(browsing):
     async def test(browser, address, client):
         phone = {"viewport": {"width": 360, "height": 740}, "has_touch": True, "is_mobile": True}
         page = await opened(browser, address, bypass_csp=False, **phone)  # as a visitor has it
