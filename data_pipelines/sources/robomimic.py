@@ -15,12 +15,13 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import DataError, UnreachableError
 from data_pipelines.names import shown
 from data_pipelines.sources.rlds.location import is_failure, retried
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
@@ -36,6 +37,10 @@ SUCCESS_REWARD = 1.0
 ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damaged (when tokenising, corrupt='skip')."
 
 
+DAMAGED = (KeyError, OSError, RuntimeError, TypeError, ValueError)
+"""What h5py raises of a damaged file."""
+
+
 class RobomimicSource:
     """Opens the file once to learn its layout, and again for each demonstration.
 
@@ -46,7 +51,7 @@ class RobomimicSource:
     def __init__(self, path: str | Path, settings: RobomimicSettings = RobomimicSettings()):
         settings.check()
         self.path, self.short_side = Path(path), settings.short_side
-        with self.open() as file:
+        with self.open() as file, damage(str(path), DataError):
             if "data" not in file:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
@@ -69,7 +74,7 @@ class RobomimicSource:
     def read(self, unit: int) -> Iterator[Episode]:
         name = self.units[unit]
         where = f"{self.path}: data/{name}"
-        with self.open() as file:
+        with self.open() as file, damage(where):
             demo = file["data"][name]
             actions = self.array(demo, "actions", where)
             steps = len(actions)
@@ -142,13 +147,28 @@ class RobomimicSource:
         return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras
 
 
+@contextmanager
+def damage(where: str, kind: type[DataError] = UnitError) -> Iterator[None]:
+    """`DAMAGED` as errors of `kind`, and as UnreachableError of a failing disk. For looking at a file: not around what
+    anybody else does while it is open."""
+    try:
+        yield
+    except (DataError, ConfigError):
+        raise
+    except DAMAGED as error:
+        if is_failure(error):
+            raise UnreachableError(f"{where} cannot be read ({error}). Run the same command again.") from error
+        advice = ADVICE if kind is UnitError else "Fetch the file again."
+        raise kind(f"{where} is damaged ({error}). {advice}") from error
+
+
 def read_rows(demo: Any, key: str, rows: slice, where: str) -> np.ndarray:
     """Some rows of a dataset of a demonstration. Raises UnitError, UnreachableError for a failing disk."""
 
     def read() -> np.ndarray:
         try:
             return np.asarray(demo[key][rows])
-        except (KeyError, OSError) as error:
+        except DAMAGED as error:
             if is_failure(error):
                 raise  # to be tried again
             raise UnitError(f"{where}/{key} cannot be read ({error}). {ADVICE}") from error

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from data_pipelines.errors import EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.rlds.schema import field_slice, step_key
-from data_pipelines.sources.robomimic import RobomimicSource, read_rows, source_key, succeeded
+from data_pipelines.sources.robomimic import RobomimicSource, damage, read_rows, source_key, succeeded
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
@@ -59,8 +59,7 @@ class RobomimicDataset(EpisodeSource):
         numbers = [int(name.removeprefix("demo_")) for name in self._demos]
         self.runs = tuple(EpisodeRun(self.location.name, number, 1) for number in numbers)
         with self._read.open() as file:
-            demos = [file["data"][name] for name in self._demos]
-            self._lengths = np.asarray([len(d["actions"]) if "actions" in d else -1 for d in demos], np.int32)
+            self._lengths = np.asarray([self._length(file, i) for i in range(len(self._demos))], np.int32)
         self._bytes = self.location.stat().st_size
 
     def __len__(self) -> int:
@@ -74,11 +73,12 @@ class RobomimicDataset(EpisodeSource):
         """Hash over the file's size, and the name and actions of every demonstration."""
         digest = hashlib.sha256(f"{self._bytes};".encode())
         with self._read.open() as file:
-            for name in self._demos:
+            for i, name in enumerate(self._demos):
                 digest.update(f"{name}:".encode())
-                if "actions" in file["data"][name]:
-                    rows = read_rows(file["data"][name], "actions", slice(None), f"{self.location}: data/{name}")
-                    digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
+                with suppress(EpisodeError), damage(self._where(i)):  # reading the episode says what is wrong
+                    if self._lengths[i] >= 0:
+                        rows = read_rows(file["data"][name], "actions", slice(None), self._where(i))
+                        digest.update(np.ascontiguousarray(rows, "<f8").tobytes())
         return digest.hexdigest()[:16]
 
     def sizes(self) -> np.ndarray:
@@ -93,23 +93,26 @@ class RobomimicDataset(EpisodeSource):
     def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
         self.check_keys(image_key, action_keys)
         camera, keys = step_key(image_key), [step_key(k) for k in action_keys]
+        where = self._where(i)
         with self._read.open() as file:
-            demo, where = file["data"][self._demos[i]], self._where(i)
-            frames = _Frames(demo, _path(camera, image=True), where)
-            if not len(frames):
-                self._refuse(i, "a demonstration without a step")
-            if "actions" in demo and len(frames) != len(demo["actions"]):
-                self._refuse(i, f"{len(frames)} frames of {camera!r} for {len(demo['actions'])} actions")
-            fields = {field_slice(key)[0] for key in keys}
-            record = {f: read_rows(demo, _path(f), slice(None), where) for f in fields}
+            with damage(where):
+                demo = file["data"][self._demos[i]]
+                frames = _Frames(demo, _path(camera, image=True), where)
+                if not len(frames):
+                    self._refuse(i, "a demonstration without a step")
+                if "actions" in demo and len(frames) != len(demo["actions"]):
+                    self._refuse(i, f"{len(frames)} frames of {camera!r} for {len(demo['actions'])} actions")
+                fields = {field_slice(key)[0] for key in keys}
+                record = {f: read_rows(demo, _path(f), slice(None), where) for f in fields}
+                success = self._success(demo, where)
             actions = join_actions(
                 record, keys, self.features, len(frames), lambda what: EpisodeError(f"{where}: {what}").at(self.location, -1)
             )
-            yield OpenEpisode(i, actions, self._success(demo, where), frames.__getitem__, lambda n, data: data)
+            yield OpenEpisode(i, actions, success, frames.__getitem__, lambda n, data: data)
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         where, found = self._where(i), {}
-        with self._read.open() as file:
+        with self._read.open() as file, damage(where):
             demo = file["data"][self._demos[i]]
             for key in keys:
                 if key in self.features and self.features[key].image:
@@ -121,6 +124,15 @@ class RobomimicDataset(EpisodeSource):
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
                     found[key] = np.array([success], np.int64)
         return found
+
+    def _length(self, file: Any, i: int) -> int:
+        """Steps by the actions, -1 where there are none or nobody can tell: then reading the episode says why."""
+        try:
+            with damage(self._where(i)):
+                demo = file["data"][self._demos[i]]
+                return len(demo["actions"]) if "actions" in demo else -1
+        except EpisodeError:
+            return -1
 
     def _where(self, i: int) -> str:
         return f"{self.location}: data/{self._demos[i]}"

@@ -6,6 +6,7 @@ import errno
 import itertools
 import json
 import pickle
+import re
 import shutil
 
 import numpy as np
@@ -132,6 +133,28 @@ def test_what_is_lost_of_a_robomimic_file_does_not_say_where_it_lies(tmp_path):
         made.append(tokenize_dataset(VIEW, path, FakeTokenizer(), tmp_path / place / "store", corrupt="skip"))
     assert made[0].skipped[0].reason.startswith("image.hdf5: data/demo_10/obs/agentview_image is not there")
     assert made[0].hash() == made[1].hash()
+
+
+def test_damage_inside_of_a_robomimic_file_is_named(tmp_path):
+    """Of each of its lists of names, whatever h5py then raises; the other demonstrations are still there."""
+    path = write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4, 6))
+    sound, told, kept = path.read_bytes(), 0, []
+    for place in re.finditer(b"HEAP|SNOD", sound):
+        path.write_bytes(sound[: place.start()] + b"gone" + sound[place.end() :])
+        try:
+            source, lost = open_source(path, corrupt="skip"), 0
+            assert source.fingerprint()
+        except DataError as error:
+            told += "image.hdf5 is damaged" in str(error)
+            continue
+        for i in range(4):
+            try:
+                source.episode(i, VIEW.image_key, VIEW.action_keys)
+            except EpisodeError as error:
+                assert "image.hdf5: data/demo_" in str(error)
+                lost += 1
+        kept.append(lost)
+    assert told >= 2 and kept.count(1) >= 4 and max(kept) == 1
 
 
 def test_actions_that_are_texts_are_damage(tmp_path):
