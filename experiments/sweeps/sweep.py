@@ -5,6 +5,7 @@ Each axis is a file beside this one, and a line of `registry`.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -195,6 +196,7 @@ def all_judged(sweeps: Sequence[Sweep]) -> set[str]:
 def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     """A line for every trial of `sweeps`, by id, that tells it from the others."""
     lines: dict[str, str] = {}
+    places: dict[str, str] = {}  # on an axis of numbers, off the reference
     several = len({trial.train.steps for trial in unique_trials(sweeps, provenance).values()}) > 1
 
     def add(trial: Trial, remark: str) -> None:
@@ -204,11 +206,17 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     for sweep in sweeps:
         for point in sweep.points:
             add(point.trial, sweep.remark(point))
+            if sweep.scaling and point.x != sweep.reference_x:
+                places.setdefault(trial_id(point.trial, provenance), f"{sweep.axis} {point.x:g}")
     for sweep in sweeps:
         for point in sweep.points:
             for source in point.trial.with_source()[:-1]:
                 add(source, "")
-    return lines
+    # An axis may vary what no trial's own title says.
+    alike = {line for line, count in Counter(lines.values()).items() if count > 1}
+    return {
+        id: f"{line} · {places[id]}" if line in alike and id in places else line for id, line in lines.items()
+    }
 
 
 def all_steps(sweeps: Sequence[Sweep]) -> str:

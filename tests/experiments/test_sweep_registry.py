@@ -11,8 +11,9 @@ from experiments.presets import CPU_FULL
 from experiments.report.draw import draw
 from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.sweeps.registry import AXES, find_axis, join_axes, keep_axes, plan_sweeps
+from experiments.sweeps.sweep import titles
 from hma_jax.config import ConfigError
-from tests.experiments.fakes import STUDY, finished_study, record_of
+from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
 
 FOLDER = Path(experiments.sweeps.__file__).parent
 PAGE = Path(__file__).parents[2] / "docs/own_axis.md"
@@ -70,6 +71,9 @@ def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
     assert (root / "figures/temperature.png").exists()
     rows = (root / "results.csv").read_text()
     assert all(f"temperature,{x}," in rows.replace(".0,", ",") for x in (1, 3, 10))
+    lines = titles(plan_sweeps(STUDY, (*axes, "trajectories"), root), PROVENANCE).values()
+    assert len(set(lines)) == len(lines) and sum("temperature of the mixture 10" in line for line in lines) == 2
+    assert "seed 0 · temperature of the mixture 10" in page and "temperature of the mixture 3" not in page
 
 
 def test_files_are_kept_by_the_names_of_their_axes(tmp_path):
