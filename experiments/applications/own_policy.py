@@ -78,6 +78,10 @@ class Settings:
     learning_rate: float = 1e-3
     seed: int = 0
 
+    def __post_init__(self):
+        require(self.steps >= 1, f"--steps must be at least 1, got {self.steps}")
+        require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
+
     def make_task(self) -> Task:
         return find_task(self.robot, self.task, self.frames, self.hold)
 

@@ -244,6 +244,8 @@ def main() -> None:
     parser.add_argument("--unmask-steps", type=int, default=Settings.unmask_steps, help="looks at a frame")
     asked = vars(parser.parse_args())
     run, out, wanted = asked.pop("run"), asked.pop("out"), asked.pop("ways")
+    fewest = SearchConfig.elites  # whom CEM draws around
+    require(asked["candidates"] >= fewest, f"--candidates must be at least {fewest}, got {asked['candidates']}")
     search = SearchConfig(candidates=asked.pop("candidates"), iterations=asked.pop("iterations"))
     settings = Settings(search=search, **asked)
     decode = replace(find_decode(run), unmask_steps=settings.unmask_steps)

@@ -34,6 +34,7 @@ class Training:
         """Raises ConfigError."""
         require(self.given >= 1, f"given = {self.given}: a generated trajectory begins with at least 1 recorded frame")
         require(bool(self.seeds), "no seed: at least 1 is needed")
+        require(self.steps >= 1, f"--steps must be at least 1, got {self.steps}")
 
 
 @dataclass(frozen=True)

@@ -174,6 +174,8 @@ def test_episodes_that_leave_nothing_to_generate_or_to_judge_are_refused():
         Settings(starts=0)
     with pytest.raises(ConfigError, match="no seed"):
         Settings(seeds=())
+    with pytest.raises(ConfigError, match="--steps must be at least 1, got 0"):
+        Settings(steps=0)
     assert Settings(given=13).given == 13
 
 
@@ -211,10 +213,13 @@ def test_an_episode_ends_when_nothing_can_change_its_outcome():
     assert not decided([False] * 10 + [True] * 5, task) and decided([False] * 10 + [True, False], task)
 
 
-def test_a_plan_is_not_carried_out_for_longer_than_it_is():
+def test_a_plan_is_not_carried_out_for_longer_than_it_is_nor_searched_among_too_few(monkeypatch):
     assert plan_actions.Settings(execute=6).search.frames == 6
     with pytest.raises(ConfigError, match="--execute must lie in 1..6, the frames of a plan, got 7"):
         plan_actions.Settings(execute=7)
+    monkeypatch.setattr(sys, "argv", ["plan_actions", "nowhere", "--candidates", "2"])
+    with pytest.raises(ConfigError, match="--candidates must be at least 4, got 2"):
+        plan_actions.main()
 
 
 def from_settings(kind: type, path: Path, model: Path = FIRST):

@@ -62,6 +62,13 @@ def test_every_policy_is_judged_at_every_start_in_every_world(judged):
     np.testing.assert_array_equal(control.actions[[1, 0]], found.rollouts("random", TRUE).actions[:2])
 
 
+@pytest.mark.parametrize(("name", "least"), [("demonstrations", 1), ("head_episodes", 3)])
+def test_recordings_that_cannot_be_made_are_refused_before_policies_are_trained(name, least):
+    assert replace(ASKED, **{name: least})
+    with pytest.raises(ConfigError, match=f"--{name.replace('_', '-')} must be at least {least}"):
+        replace(ASKED, **{name: least - 1})
+
+
 def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged):
     root, found = judged
     lost = root / "out" / "rollouts" / "cloned-3.learned.npz"

@@ -31,6 +31,12 @@ from tests.hma_jax.simulator.small import ROBOTS, parts
 FEW = Settings(demonstrations=4, starts=3, steps=2, batch=2, frames=6)
 
 
+@pytest.mark.parametrize("name", ["steps", "starts"])
+def test_what_nothing_can_come_of_is_refused_before_anything_is_claimed(name):
+    with pytest.raises(ConfigError, match=f"--{name} must be at least 1, got 0"):
+        replace(FEW, **{name: 0})
+
+
 def test_windows_are_parts_of_episodes_with_the_actions_given_at_their_frames():
     model, robot = parts()[0], ROBOTS[1]  # two native steps per frame
     rng = np.random.default_rng(0)
