@@ -90,7 +90,8 @@ def fit(
 
 def ladder(steps: int, rungs: int, first: int = 20) -> tuple[int, ...]:
     """`rungs` steps of training from `first` to `steps`, each the same factor after the one before."""
-    require(rungs >= 2 and steps > first, f"a ladder from {first} to {steps} steps needs at least 2 rungs")
+    require(rungs >= 2, f"a ladder from {first} to {steps} steps needs at least 2 rungs, got {rungs}")
+    require(steps > first, f"the first checkpoint is that of {first} steps: training must be longer, not {steps} steps")
     return tuple(sorted({round(first * (steps / first) ** (i / (rungs - 1))) for i in range(rungs)}))
 
 

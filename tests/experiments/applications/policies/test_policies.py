@@ -148,6 +148,8 @@ def test_denoising_with_the_true_noise_gives_the_chunk(monkeypatch, demos):
 
 def test_a_ladder_has_its_first_and_last_rung():
     assert ladder(1000, 4, 1) == (1, 10, 100, 1000)
+    with pytest.raises(ConfigError, match="that of 60 steps: training must be longer, not 50 steps"):
+        ladder(50, 4, 60)
 
 
 @pytest.mark.parametrize("name", ["reach", "hover"])
