@@ -174,13 +174,14 @@ def _require_trained_here(setting: Setting, run: Path) -> None:
     """Raises ConfigError for a run that was converted: it was trained on no data that training could go on with."""
     from hma_jax.training.reading import CheckpointError, list_steps, read_description
 
-    checkpoints, described = run.absolute() / "checkpoints", {}
+    checkpoints, described, latest = run.absolute() / "checkpoints", {}, 0
     for latest in list_steps(checkpoints)[-1:]:
         with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
             described = read_description(checkpoints / str(latest))
-    # What has no table is no model, of which the restoring speaks too.
+    # What has no table is no model, of which the restoring speaks too. Training saves nothing before its first step:
+    # weights of step 0 are another run's, under its description perhaps (`hma convert from-safetensors`).
     require(
-        "table" not in described or "loader" in described["provenance"],
+        "table" not in described or (latest > 0 and "loader" in described["provenance"]),
         f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
         f"{setting.command('train', '--from', run)} --run NEW",
     )

@@ -215,12 +215,16 @@ def test_a_converted_run_is_fine_tuned_as_the_model_that_it_is(released, train, 
         np.testing.assert_array_equal(old, new)  # no step here learns anything
 
 
-def test_a_converted_run_is_not_resumed(released, where, monkeypatch, capsys):
+def test_a_converted_run_is_not_resumed(released, where, tmp_path, monkeypatch, capsys):
+    """Nor is one of ours that was read back from safetensors: it would be trained anew, as if from fresh weights."""
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
-    assert main(["train", *where, "--run", str(released)]) == 2
-    said = capsys.readouterr().err
-    assert f"{released} was converted, not trained here, so it cannot be resumed; fine-tune it with: " in said
-    assert f"hma train --from {released} --preset smoke " in said and said.endswith(" --run NEW\n")
+    ours = replace(load_run(released), provenance={"loader": {}, "tokenizer": "its own"})
+    write_run(ours, tmp_path / "read back")
+    for run, quoted in ((released, released), (tmp_path / "read back", f"'{tmp_path / 'read back'}'")):
+        assert main(["train", *where, "--run", str(run)]) == 2
+        said = capsys.readouterr().err
+        assert f"{run} was converted, not trained here, so it cannot be resumed; fine-tune it with: " in said
+        assert f"hma train --from {quoted} --preset smoke " in said and said.endswith(" --run NEW\n")
 
 
 def test_a_new_run_does_not_lie_where_the_model_lies_that_it_begins_with(tmp_path, where, monkeypatch, capsys):
