@@ -86,6 +86,13 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     if untrained:
         console.print(f"note: not evaluated, for it was not trained on: {', '.join(untrained)}", soft_wrap=True)
     names = tuple(name for name in trained.table.names if name in frozen - set(untrained))
+    besides = [name for name in names if setting.data and name not in setting.study.dataset_names()]
+    if besides:
+        console.print(
+            f"note: all windows that are frozen in {short(setting.workspace.root)} are judged, also those of "
+            f"{few(besides)}, which --data does not name",
+            soft_wrap=True,
+        )
     made_from = describe_evaluation(trained, names, materials, setting.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)

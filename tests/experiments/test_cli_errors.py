@@ -420,9 +420,12 @@ def test_evaluation_of_a_converted_model_on_what_does_not_fit_it(changes, robot,
 
 
 def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tmp_path, capsys):
-    other = prepared_otherwise(study, tmp_path, data=study[1][:2])
-    assert main(["evaluate", str(study[0] / "model"), *SMOKE, "--out", str(other), *study[1][:2]]) == 0
-    assert f"not evaluated, for want of windows here: {BASE.name}" in capsys.readouterr().out
+    option, arm, base = study[1]
+    other = prepared_otherwise(study, tmp_path, data=(option, arm))
+    assert main(["evaluate", str(study[0] / "model"), *SMOKE, "--out", str(other), option, base]) == 0
+    said = capsys.readouterr().out
+    assert f"not evaluated, for want of windows here: {BASE.name}" in said
+    assert f"also those of {ARM.name}, which --data does not name" in said
 
 
 def test_evaluation_with_a_prompt_that_fills_the_window(study, refused):
