@@ -188,8 +188,8 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
     window = simulator.model.config.frames
     require(
         window <= settings.frames,
-        f"{run} sees {window} frames, an episode here has {settings.frames}: there is nothing to train it on; name a run with "
-        "a shorter window",
+        f"{run} sees {window} frames, an episode here has {settings.frames}: there is nothing to train it on; name a "
+        "run with a shorter window",
     )
     claim(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"

@@ -96,8 +96,8 @@ class Settings:
     seed: int = 0  # of the training of the cloned policies
 
     def __post_init__(self):
-        longest = self.search.frames
-        require(1 <= self.execute <= longest, f"--execute must lie in 1..{longest}, the frames of a plan, got {self.execute}")
+        most = self.search.frames
+        require(1 <= self.execute <= most, f"--execute must lie in 1..{most}, the frames of a plan, got {self.execute}")
         require(self.starts >= 1, f"--starts must be at least 1, got {self.starts}")
         require(self.skip >= 0, f"--skip must not be negative, got {self.skip}")
 

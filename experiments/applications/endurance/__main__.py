@@ -91,8 +91,8 @@ def main() -> None:
     require(asked.starts >= 1, f"--starts must be at least 1, got {asked.starts}")
     require(
         0 < asked.every < 120 * asked.minutes,
-        f"--every {asked.every:g}: a row of the table needs at least half as many seconds, and --minutes {asked.minutes:g} "
-        f"are {60 * asked.minutes:g}; give fewer",
+        f"--every {asked.every:g}: a row of the table needs at least half as many seconds, and --minutes "
+        f"{asked.minutes:g} are {60 * asked.minutes:g}; give fewer",
     )
     detector, rows = Detector.load(asked.detector), []
     claim_name(asked.out, asked.name, asked.run, load_simulator(asked.run), asked.detector)

@@ -57,7 +57,8 @@ class JudgeConfig:
 
     def __post_init__(self):
         require(self.demonstrations >= 1, f"--demonstrations must be at least 1, got {self.demonstrations}")
-        require(self.head_episodes >= 3, f"--head-episodes must be at least 3, a third of them play, got {self.head_episodes}")
+        fewest = 3  # a third of them are play
+        require(self.head_episodes >= fewest, f"--head-episodes must be at least {fewest}, got {self.head_episodes}")
         require(self.starts % self.batch == 0, f"{self.starts} starts cannot be run {self.batch} at a time")
         require(self.batch >= 2, "with one episode at a time the control has no other episode to take actions from")
 

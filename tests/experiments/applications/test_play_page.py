@@ -227,7 +227,7 @@ def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robo
         await until(lambda: talk.count("rewind") == told + 2)
         await page.evaluate("tell({type: 'rewind', frames: 1}); begin(state.robots.find(r => r.name == 'arm'), 0)")
         await page.wait_for_function("!state.pending.length")
-        assert await page.evaluate("state.action.length") == 7, "the command of the frame that was gone back to was another robot's"
+        assert await page.evaluate("state.action.length") == 7, "the frame that was gone back to was another robot's"
         assert not page.faults
 
     browsing(test)
