@@ -6,6 +6,7 @@ since the video's first frame.
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -99,26 +100,30 @@ class Video:
         base = float(self._stream.time_base)
         for target in (self._start + int(max(time - 0.5 / self.rate, 0) / base), None):
             # Where the index of a file misleads, decode it from its beginning.
-            self._container.seek(
-                self._start if target is None else target, stream=self._stream, backward=True
-            )
-            frames = self._decode(base)
+            frames = self._decode(base, self._start if target is None else target)
             first = next(frames, None)
             if first is not None and (first[0] <= time or target is None):
                 yield first
                 yield from frames
                 return
 
-    def _decode(self, base: float) -> Iterator[tuple[float, Any]]:
+    def _decode(self, base: float, target: int) -> Iterator[tuple[float, Any]]:
         import av
 
         try:
+            self._container.seek(target, stream=self._stream, backward=True)
             for frame in self._container.decode(self._stream):
                 yield (frame.pts - self._start) * base, frame
         except (av.FFmpegError, TypeError) as error:  # TypeError: a frame without a time
-            if is_failure(error):
-                raise UnreachableError(f"{self._path}: cannot be read ({error}). Run the same command again.") from error
+            if _is_failure(error):
+                again = "Run the same command again."
+                raise UnreachableError(f"{self._path}: cannot be read ({error}). {again}") from error
             raise UnitError(f"{self._path}: it cannot be decoded ({error}). {ADVICE}") from error
+
+
+def _is_failure(error: Exception) -> bool:
+    """As `is_failure`; where a file may not be read the system says EACCES, and FFmpeg says EPERM of its bytes."""
+    return is_failure(error) and getattr(error, "errno", None) != errno.EPERM
 
 
 @contextmanager
@@ -128,15 +133,17 @@ def open_video(path: Path) -> Iterator[Video]:
 
     def opened() -> Any:
         try:
-            return av.open(str(path))
+            return av.open(str(path), metadata_errors="ignore")
         except (OSError, av.FFmpegError) as error:
-            if is_failure(error):
+            if _is_failure(error):
                 raise  # to be tried again
             raise UnitError(f"{path}: no readable video ({error}). {ADVICE}") from error
 
     with retried(path, opened) as container:
         if not container.streams.video:
             raise UnitError(f"{path}: it has no video stream. {ADVICE}")
+        if container.streams.video[0].codec_context is None:
+            raise UnitError(f"{path}: its video is encoded in no known way. {ADVICE}")
         video = Video(path, container)
         if not video.rate:
             raise UnitError(f"{path}: it does not say how many frames it has per second. {ADVICE}")

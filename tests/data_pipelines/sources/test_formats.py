@@ -304,6 +304,22 @@ def test_a_damaged_video_loses_its_episode_alone(tmp_path):
         tokenize_dataset(TOP, root, FakeTokenizer(), tmp_path / "c", frame_step=1)
 
 
+@pytest.mark.parametrize(
+    "box, message", [(b"stts", "cannot be decoded"), (b"stsd", "encoded in no known way"), (b"Lavf", None)]
+)
+def test_a_video_with_a_damaged_index_is_damage_whatever_ffmpeg_calls_it(tmp_path, box, message):
+    """It says that an operation is not permitted. A note that is no text does no harm."""
+    root = write_lerobot(tmp_path / "toy-arm", "v2.1")
+    clip = sorted(root.rglob("*.mp4"))[0]
+    clip.write_bytes(b"\xffxyz".join(clip.read_bytes().rsplit(box, 1)))
+    source = open_source(root)
+    if message is None:
+        assert number(source.episode(0, TOP.image_key, ()).images[5]) == 5
+    else:
+        with pytest.raises(EpisodeError, match=f"{clip.name}: .*{message}"):
+            source.episode(0, TOP.image_key, ())
+
+
 def test_a_disk_that_fails_is_no_damage_of_a_video(tmp_path, monkeypatch):
     source = open_source(write_lerobot(tmp_path / "toy-arm", "v2.1"), corrupt="skip")
     monkeypatch.setattr(location.time, "sleep", lambda seconds: None)
