@@ -16,7 +16,7 @@ from typing import Any
 
 from data_pipelines.errors import DataError
 from data_pipelines.json_file import read_lines, read_object
-from data_pipelines.names import brief, inside, shown
+from data_pipelines.names import inside, shown
 from data_pipelines.sources.parquet_rows import ADVICE, read_table
 
 VERSIONS = ("v2.0", "v2.1", "v3.0")
@@ -125,9 +125,8 @@ def _tasks(root: Path, version: str) -> dict[int, str]:
     table = read_table(path, ["task_index", *texts])
     text = [c for c in texts if c in table.column_names]
     if not text or "task_index" not in table.column_names:
-        raise DataError(
-            f"{path}: of task and task_index, which are needed, it has {brief(', '.join(table.column_names)) or 'neither'}."
-        )
+        there = ", ".join(table.column_names) or "neither"
+        raise DataError(f"{path}: of task and task_index, which are needed, it has {there}.")
     rows = enumerate(_rows(table.select(["task_index", text[0]]), path))
     return {_count(row, "task_index", f"{path}: row {line}"): str(row[text[0]]) for line, row in rows}
 

@@ -16,7 +16,7 @@ MOST_UNPACKED = 32 * 2**20
 """Bytes of any page, unpacked. Writers aim at 1 MB, but look after a thousand rows only."""
 
 MOST_TIMES = 8
-"""As many times the bytes that a page takes in the file, it may have too: a thousand images are hardly packed at all."""
+"""As many times the bytes that a page takes in the file, it may have too: a thousand images are hardly packed."""
 
 MOST_HEADER = 64 * 1024
 """Bytes; a header may hold the smallest and the largest value of its page."""
@@ -59,8 +59,8 @@ def read_groups(file: BinaryIO) -> list[RowGroup]:
 
 
 def check_pages(file: BinaryIO, chunks: Iterable[Chunk] | None = None) -> None:
-    """Raises ValueError for a page of `chunks`, by default of all, that is damaged, lies outside of its column or of the
-    file, or says that it holds more than MOST_UNPACKED bytes and MOST_TIMES its own."""
+    """Raises ValueError for a page of `chunks`, by default of all, that is damaged, lies outside of its column or of
+    the file, or says that it holds more than MOST_UNPACKED bytes and MOST_TIMES its own."""
     if chunks is None:
         chunks = [chunk for group in read_groups(file) for column in group.columns.values() for chunk in column]
     whole = file.seek(0, 2)

@@ -106,8 +106,9 @@ class RobomimicDataset(EpisodeSource):
                 record = {f: read_rows(demo, _path(f), slice(None), where) for f in fields}
                 success = self._success(demo, where)
             actions = join_actions(
-                record, keys, self.features, len(frames), lambda what: EpisodeError(f"{where}: {what}").at(self.location, -1)
-            )
+                record, keys, self.features, len(frames),
+                lambda what: EpisodeError(f"{where}: {what}").at(self.location, -1),
+            )  # fmt: skip
             yield OpenEpisode(i, actions, success, frames.__getitem__, lambda n, data: data)
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:

@@ -182,8 +182,8 @@ class Manifest:
         scale: ActionScale = "deviation",
         spread: Spread | None = None,
     ) -> Embodiment:
-        """The model's view of this dataset's actions at `rate`. `moments` and `spread` are of the actions that count, if
-        those are not all of the train split's.
+        """The model's view of this dataset's actions at `rate`. `moments` and `spread` are of the actions that count,
+        if those are not all of the train split's.
 
         By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
         extremes. Raises DataError for a manifest of a version that kept no quantiles.

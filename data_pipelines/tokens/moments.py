@@ -97,8 +97,8 @@ def read_moments(part: Path, episodes: int) -> np.ndarray | None:
         ) from error
     if rows.ndim != 2 or len(rows) != episodes or rows.dtype != np.float64:
         raise DataError(
-            f"{path}: {rows.dtype} {list(rows.shape)} are no statistics of {episodes} episodes. Remove the file: they are "
-            "then computed again."
+            f"{path}: {rows.dtype} {list(rows.shape)} are no statistics of {episodes} episodes. Remove the file: "
+            "they are then computed again."
         )
     return rows
 

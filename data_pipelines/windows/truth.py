@@ -20,6 +20,9 @@ from hma_jax.runtime.files import write_file
 
 META = "made_for"
 
+DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What numpy raises of an archive that is missing or damaged."""
+
 
 @dataclass(frozen=True)
 class OtherTruth:
@@ -43,8 +46,8 @@ class OtherTruth:
             with np.load(path) as arrays:
                 frames = {name: arrays[name] for name in arrays.files}
                 return cls(**json.loads(frames.pop(META).tobytes()), frames=frames)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        except DAMAGED as error:
             raise DataError(
-                f"{path}: the frames under other actions cannot be read ({error}). Remove the file and prepare the study "
-                "again, with `hma tokenize` or `hma study`."
+                f"{path}: the frames under other actions cannot be read ({error}). Remove the file and prepare the "
+                "study again, with `hma tokenize` or `hma study`."
             ) from error
