@@ -53,6 +53,7 @@ def run_study(
     from experiments.running.provenance import trial_closure
 
     study, workspace = setting.study, setting.workspace
+    launcher.require_installed()
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials

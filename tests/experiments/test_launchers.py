@@ -327,3 +327,10 @@ def test_without_the_engine_the_message_says_what_to_install(tmp_path, monkeypat
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(ConfigError, match=rf"pip install 'hma-jax\[{name}\]'"):
             Launching(name).launcher(tmp_path)
+
+
+def test_without_the_engine_nothing_is_prepared(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "submitit", None)
+    assert main(["sweep", "width", "--preset", "smoke", "--out", str(tmp_path / "out"), "--launcher", "slurm"]) == 2
+    assert "--launcher slurm needs submitit: pip install 'hma-jax[slurm]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -31,6 +31,8 @@ class Launcher(ABC):
     """A place where trials run. `Settings` is a dataclass: what `--launcher-set` may say of it."""
 
     Settings: ClassVar[type]
+    needs: ClassVar[str] = ""
+    """The package that it works through; the extra of the launcher's name brings it."""
     pause: ClassVar[float] = 0.1
     """Seconds between two checks of what has ended."""
 

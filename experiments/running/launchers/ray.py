@@ -43,6 +43,7 @@ class RayLauncher(Launcher):
     """`workers`: how many trials run at a time; None: as many as the cluster holds. Raises ConfigError without it."""
 
     Settings = RaySettings
+    needs = "ray"
     pause = 0.5
 
     def __init__(
@@ -106,10 +107,8 @@ def _options(settings: RaySettings) -> dict[str, Any]:
 
 def _join(address: str) -> Any:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    try:
-        import ray
-    except ImportError:
-        raise ConfigError("--launcher ray needs Ray: pip install 'hma-jax[ray]'") from None
+    import ray
+
     before = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level="warning")

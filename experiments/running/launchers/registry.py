@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import json
 import typing
 from collections.abc import Sequence
@@ -47,8 +48,15 @@ class Launching:
         kind, settings = self._parsed()
         return kind.share(self.workers, settings)
 
+    def require_installed(self) -> None:
+        """Raises ConfigError without the package that the launcher works through."""
+        needs = launcher_class(self.name).needs
+        there = not needs or importlib.util.find_spec(needs) is not None
+        require(there, f"--launcher {self.name} needs {needs}: pip install 'hma-jax[{self.name}]'")
+
     def launcher(self, root: Path) -> Launcher:
         """For the study in `root`. Raises ConfigError where it cannot work."""
+        self.require_installed()
         kind, settings = self._parsed()
         return kind(root, self.workers, settings)
 

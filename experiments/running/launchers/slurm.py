@@ -73,10 +73,11 @@ class SlurmAttempt(Attempt):
 class SlurmLauncher(Launcher):
     """`workers`: how many jobs of the array run at a time; None: as many as Slurm gives.
 
-    Raises ConfigError where submitit or Slurm is missing.
+    Raises ConfigError where Slurm is missing.
     """
 
     Settings = SlurmSettings
+    needs = "submitit"
     pause = 2.0
 
     def __init__(
@@ -168,10 +169,8 @@ def ask_states() -> dict[str, str] | None:
 
 
 def _make_executor(folder: Path, workers: int | None, settings: SlurmSettings) -> Any:
-    try:
-        from submitit import SlurmExecutor
-    except ImportError:
-        raise ConfigError("--launcher slurm needs submitit: pip install 'hma-jax[slurm]'") from None
+    from submitit import SlurmExecutor
+
     try:
         executor = SlurmExecutor(folder, max_num_timeout=TIMEOUTS)
     except RuntimeError:
