@@ -131,6 +131,8 @@ def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path):
         np.testing.assert_array_equal(stored[0].chunks, truth.chunks)
         seen = truth.images if split == "val" else tokenizer.decode(tokenizer.encode(truth.images))
         np.testing.assert_array_equal(stored[0].images, seen)
+    with pytest.raises(ConfigError, match=f"pusher: no such directory, and {tmp_path} has tokens of pusher_sand$"):
+        open_trajectories("pusher", "val", None, robots, tokenizer, tmp_path)
 
 
 def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
