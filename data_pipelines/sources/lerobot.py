@@ -132,7 +132,7 @@ class LeRobotSource:
 
     def times(self, table: Any, where: str) -> np.ndarray:
         """Seconds since the episode's first frame. Raises UnitError for a row out of step."""
-        times = np.asarray(table[TIME], np.float64)
+        times = self.numbers(table, TIME, where)[:, 0]
         expected = np.arange(len(times)) / self.hz
         wrong = np.flatnonzero(~(np.abs(times - expected) < 0.5 / self.hz))
         if len(wrong):
@@ -191,11 +191,11 @@ class LeRobotSource:
         if TASK not in table.column_names or not self.meta.tasks:
             return [entry.tasks[0] if entry.tasks else ""] * table.num_rows
         indices = table[TASK].to_pylist()
-        unknown = [(row, i) for row, i in enumerate(indices) if i not in self.meta.tasks]
+        unknown = [(row, i) for row, i in enumerate(indices) if type(i) is not int or i not in self.meta.tasks]
         if unknown:
             row, index = unknown[0]
             raise UnitError(
-                f"{where}: task_index {index} at row {row} is not among the tasks of meta. {ADVICE}"
+                f"{where}: task_index {shown(index)} at row {row} is not among the tasks of meta. {ADVICE}"
             )
         return [self.meta.tasks[i] for i in indices]
 

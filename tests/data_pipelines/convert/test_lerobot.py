@@ -65,6 +65,18 @@ def unknown_task(e, rows):
     rows["task_index"] = pa.array([7] * len(rows["task_index"]))
 
 
+def listed_task(e, rows):
+    import pyarrow as pa
+
+    rows["task_index"] = pa.array([[0]] * len(rows["task_index"]))
+
+
+def worded_time(e, rows):
+    import pyarrow as pa
+
+    rows["timestamp"] = pa.array(["noon"] * len(rows["timestamp"]))
+
+
 def not_numbers(e, rows):
     import pyarrow as pa
 
@@ -82,6 +94,8 @@ def no_bytes(e, rows):
     [
         (late, "video", r"episode 1: timestamp 0.8000 s at row 5, where 10 frames per second make 0.5000 s"),
         (unknown_task, "video", "episode 0: task_index 7 at row 0 is not among the tasks"),
+        (listed_task, "image", "episode 0: task_index a list of 1 at row 0 is not among the tasks"),
+        (worded_time, "image", "episode 0: 'timestamp' is not one array of numbers per row .*noon"),
         (
             not_numbers,
             "video",
