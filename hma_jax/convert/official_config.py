@@ -229,7 +229,7 @@ def write_config(model: ModelConfig, table: EmbodimentTable, masking: MaskingCon
         "init_actions": True,
         "action_domains": list(table.names),
         "d_actions": table.chunks.tolist(),
-        "action_stats": [[list(e.mean), list(e.std)] for e in table.entries],
+        "action_stats": [[list(e.centre), list(e.unit)] for e in table.entries],
     }
     if model.diffusion:
         config |= {theirs: getattr(model.diffusion, ours) for theirs, ours in DIFFUSION_FIELDS.items()}

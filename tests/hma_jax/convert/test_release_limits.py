@@ -15,7 +15,8 @@ import pytest
 from hma_jax.config import ConfigError, ExecutionConfig, MupConfig
 from hma_jax.convert import loads_in_release, read_official, write_official
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
-from hma_jax.convert.official import official_tensors
+from hma_jax.convert.official import official_config, official_tensors
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.training.runs import Run
 from tests.hma_jax.convert.fakes import CONTINUOUS, make_checkpoint
@@ -151,6 +152,15 @@ def test_action_values_that_do_not_vary_are_nothing_to_the_release_either(change
     for name in takes:
         assert (tensors[name.format("base")] == 0).all(axis=0).tolist() == 3 * [False, True, False]
         assert (tensors[name.format("arm")] != 0).all()
+
+
+def test_the_release_is_given_the_scale_that_the_model_has_in_both_files():
+    config, robot = model_config(frames=3), Embodiment("push", 2, 1, (0.0, 1.0), (1.0, 2.0), low=(-3.0, 0.0), high=(1.0, 8.0))
+    table = EmbodimentTable((robot,))
+    run = Run(config, train_config(), table, declare_model(config, table).init(0), 7, {})
+    tensors, said = official_tensors(run)[0], official_config(run)["action_stats"]
+    assert said == [[[-1.0, 4.0], [2.0, 4.0]]]
+    assert said == [[tensors[f"action_preprocessor.push.{name}"].tolist() for name in ("mean", "std")]]
 
 
 def test_another_range_of_clean_values_is_said(tmp_path):
