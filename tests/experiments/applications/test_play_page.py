@@ -311,11 +311,12 @@ def test_it_fits_a_phone(browsing):
         pad = await page.locator(".pads").bounding_box()
         assert pad["y"] + pad["height"] <= 740, "the picture and the pad are on one screen"
         await page.tap(".pad button[data-key=ArrowUp]")
-        await page.set_viewport_size({"width": 740, "height": 360})  # on its side
-        assert await page.evaluate("document.documentElement.scrollWidth") <= 740
-        for part in (".views", ".pads"):
-            box = await page.locator(part).bounding_box()
-            assert box["y"] + box["height"] <= 360, f"{part} is on the screen"
+        for width, height in ((500, 320), (740, 360)):  # on its side
+            await page.set_viewport_size({"width": width, "height": height})
+            assert await page.evaluate("document.documentElement.scrollWidth") <= width
+            for part in (".views", ".pads"):
+                box = await page.locator(part).bounding_box()
+                assert box["y"] + box["height"] <= height, f"{part} is on the screen"
         assert not page.faults
 
     browsing(test)
