@@ -18,12 +18,10 @@ from experiments.applications.generating import source as source_module
 from experiments.applications.generating.trajectories import open_trajectories
 from experiments.cli.main import main
 from hma_jax.config import ConfigError
-from hma_jax.simulator import simulator as simulator_module
 from hma_jax.simulator.folder import save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.io import load_tokenizer
 from tests.experiments.applications.runs import TABLE, make_run
-from tests.hma_jax.simulator.conftest import programs
 
 ROBOT = Robot.of(TABLE.entries[0])
 
@@ -39,21 +37,6 @@ def recorded(tmp_path_factory):
     root = tmp_path_factory.mktemp("suite")
     (directory,) = generate_suite(root, scale=0.01, validation=5, names=["pusher_sand"])
     return directory
-
-
-@pytest.fixture(autouse=True)
-def compiled_once(monkeypatch):
-    """Simulators of the same run share their programs, and none is tuned for speed."""
-    kept = {}
-
-    def shared(model, tokenizer, episodes, decode):
-        key = tokenizer.identity, episodes, decode
-        return kept.setdefault(key, KEPT.setdefault(key, programs(model, tokenizer, episodes, decode)))
-
-    monkeypatch.setattr(simulator_module, "Programs", shared)
-
-
-KEPT: dict = {}
 
 
 def generate(run, recorded, out, *more: str) -> int:
