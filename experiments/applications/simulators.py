@@ -32,13 +32,14 @@ START_FRAMES = 3
 """Frames that an episode begins with: enough to see what moves."""
 
 
-def load_simulator(run: Path, **options: Any) -> Simulator:
+def load_simulator(run: Path | str, **options: Any) -> Simulator:
     """The learned simulator of a run, with robots and starts: those that lie beside it (`simulator.folder`), otherwise
     those of the study's directory that the run is in, which may be one of its trials. `options` are those of
     `Simulator.load`.
 
     Raises ConfigError where there is no run, or nothing to start from.
     """
+    run = Path(run)
     study = Workspace.of_run(run)
     if options.get("tokenizer") is None and not (run / TOKENIZER).exists() and study.tokenizer.exists():
         options["tokenizer"] = study.tokenizer
@@ -55,7 +56,9 @@ def load_simulator(run: Path, **options: Any) -> Simulator:
     return simulator
 
 
-def make_simulator(run: Path, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
+def make_simulator(
+    run: Path | str, world: World = "learned", *, episodes: int = 1, **options: Any
+) -> AnySimulator:
     """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
 
     Raises ConfigError; for "true" if a robot has no true simulator, or robots are of different ones.
