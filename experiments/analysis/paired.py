@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from experiments.words import few
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import WindowTable
 
@@ -34,9 +35,7 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
         return list(a.datasets)
     shared = [name for name in a.datasets if name in b.datasets]
     if not shared:
-        raise NotComparable(
-            f"no robot was judged in both: {', '.join(a.datasets[:4])}, ... and {', '.join(b.datasets[:4])}, ..."
-        )
+        raise NotComparable(f"no robot was judged in both: {few(a.datasets)} and {few(b.datasets)}")
     for robot in shared:
         try:
             mine = a.of(robot)

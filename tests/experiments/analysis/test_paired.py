@@ -67,7 +67,7 @@ def test_robots_that_one_model_alone_was_judged_on_are_left_out():
     table = judged(np.random.default_rng(0), robots=3)
     part = table.rows(np.flatnonzero(table.dataset != "r1"))
     assert list(paired(part, table)) == [OVERALL, "r0", "r2"]
-    with pytest.raises(NotComparable, match="no robot was judged in both: r1.* and r0, r2"):
+    with pytest.raises(NotComparable, match="no robot was judged in both: r1 and r0, r2$"):
         paired(table.of("r1"), part)
 
 
