@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import UNREADABLE, write_file
 
 META = "made_for"
-
-DAMAGED = (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
-"""What numpy raises of an archive that is missing or damaged."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +41,7 @@ class OtherTruth:
             with np.load(path) as arrays:
                 frames = {name: arrays[name] for name in arrays.files}
                 return cls(**json.loads(frames.pop(META).tobytes()), frames=frames)
-        except DAMAGED as error:
+        except UNREADABLE as error:
             raise DataError(
                 f"{path}: the frames under other actions cannot be read ({error}). Remove the file and prepare the "
                 "study again, with `hma tokenize` or `hma study`."

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import io
 import sys
-import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -36,7 +35,7 @@ from experiments.progress import step
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.simulator.robots import Robot
 
 OUT = Path("experiments/results/detector")
@@ -96,7 +95,7 @@ class Detector:
             with np.load(path, allow_pickle=False) as file:
                 weights = {name: jnp.asarray(file[name], jnp.float32) for name in file.files if name != "robots"}
                 return cls(weights, [str(name) for name in file["robots"]])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise ConfigError(
                 f"{path} is no detector ({error}); make one with python -m experiments.applications.detector RUN"
             ) from error

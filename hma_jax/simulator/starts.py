@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import UNREADABLE, write_file
 
 FILE = "starts.npz"
 
@@ -60,5 +59,5 @@ def load_starts(path: Path) -> tuple[Start, ...]:
             images, actions = arrays[f"{name}/images"], arrays[f"{name}/actions"]
             starts.append(Start(name.split("/")[1], images, actions, int(seed[0]) if len(seed) else None))
         return tuple(starts)
-    except (OSError, ValueError, KeyError, IndexError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise ConfigError(f"{path} cannot be read as starts of episodes ({error}); make it again") from error

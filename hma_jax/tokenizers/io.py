@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from flax import nnx
 from hma_jax.config import AnyTokenizerConfig, ConfigError, require
 from hma_jax.config.json import diff, from_dict, to_dict
 from hma_jax.model.params import Params, path_name
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
@@ -35,9 +34,6 @@ KINDS: dict[str, type[BaseTokenizer]] = {
     for cls in (LfqTokenizer, ContinuousTokenizer, Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)
 }
 AGAIN = "train, import or copy the tokenizer again"
-UNREADABLE = (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile)
-"""What numpy raises for a damaged archive: RuntimeError when a flipped bit claims encryption or an
-unknown compression, EOFError for an empty file."""
 
 
 def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:

@@ -15,7 +15,8 @@ import numpy as np
 from experiments.applications.detector import Detector
 from experiments.applications.endurance.drives import Drive
 from hma_jax.evaluation.metrics import psnr
-from hma_jax.runtime.files import write_file
+from hma_jax.config import ConfigError
+from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.simulator.simulator import Simulator
 
 BLOCK = 64
@@ -112,6 +113,10 @@ def save_films(films: Mapping[str, Film], path: Path) -> None:
 
 
 def load_films(path: Path) -> dict[str, Film]:
-    with np.load(path, allow_pickle=False) as file:
-        robots = list(dict.fromkeys(name.split("/")[0] for name in file.files))
-        return {robot: Film(**{f.name: file[f"{robot}/{f.name}"] for f in fields(Film)}) for robot in robots}
+    """Raises ConfigError for a damaged file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            robots = list(dict.fromkeys(name.split("/")[0] for name in file.files))
+            return {robot: Film(**{f.name: file[f"{robot}/{f.name}"] for f in fields(Film)}) for robot in robots}
+    except UNREADABLE as error:
+        raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command makes it again") from error

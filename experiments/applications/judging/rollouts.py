@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import time
-import zipfile
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, fields
@@ -18,7 +17,7 @@ from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, reached
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
@@ -117,5 +116,5 @@ def load_rollout(path: Path) -> Rollout:
     try:
         with np.load(path, allow_pickle=False) as file:
             return Rollout(**{f.name: file[f.name] for f in fields(Rollout)})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command makes it again") from error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from experiments.applications.policies.driving import Driven, drive, new_episodes
 from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import write_file
+from hma_jax.runtime.files import UNREADABLE, write_file
 
 SPLIT = "demonstrations"
 """Their seeds are those of no episode that a world model is trained or judged on."""
@@ -128,5 +127,5 @@ def load_demonstrations(path: Path) -> Demonstrations:
     try:
         with np.load(path, allow_pickle=False) as file:
             return Demonstrations(**{f.name: file[f.name] for f in fields(Demonstrations)})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except UNREADABLE as error:
         raise ConfigError(f"{path} cannot be read as demonstrations ({error}); record them again") from error
