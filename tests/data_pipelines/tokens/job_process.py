@@ -1,7 +1,8 @@
 """A tokenising job in a process of its own, which tests kill or run beside others.
 
 As a command it does the same with a real tokenizer, for the test of twenty kills:
-`python -m tests.data_pipelines.tokens.job_process RLDS STORE TOKENIZER`.
+`python -m tests.data_pipelines.tokens.job_process RLDS STORE TOKENIZER [unfinished]`. It prints a line when it is at
+work and one after each episode; "unfinished", it waits before the last one until it is killed.
 """
 
 from __future__ import annotations
@@ -50,13 +51,14 @@ def contents(root: Path) -> dict[str, bytes]:
 if __name__ == "__main__":
     from hma_jax.tokenizers.io import load_tokenizer
 
-    rlds, store, directory = map(Path, sys.argv[1:])
+    rlds, store, directory = map(Path, sys.argv[1:4])
+    unfinished = sys.argv[4:] == ["unfinished"]
     tokenizer = load_tokenizer(directory)
     tokenizer.encode(np.zeros((64, tokenizer.image_size, tokenizer.image_size, 3), np.uint8))  # compiled
-    said = []
 
     def progress(done: int, total: int) -> None:
-        if not said:
-            said.append(print("at work", flush=True))
+        print(f"{done} of {total}", flush=True)
+        if unfinished and done >= total - 1:
+            time.sleep(3600)
 
     run(rlds, store, tokenizer, part_size=60_000, batch=64, progress=progress)
