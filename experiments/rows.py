@@ -181,15 +181,16 @@ def read_csv(path: Path) -> list[Row]:
     kinds = {"x": _number, "seed": int, "n": int, "episodes": int, "parameters": int, "results": int}
     kinds |= {"mean": float, "sem": float, "train_flops": float}
     rows = []
-    with open(path, newline="") as file:
-        for number, record in enumerate(csv.DictReader(file), start=2):
-            try:
+    with open(path, newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        try:
+            for record in reader:
                 rows.append(Row(**{k: kinds.get(k, str)(v) for k, v in record.items()}))
-            except (ValueError, TypeError) as error:
-                raise ConfigError(
-                    f"{path}, line {number}: not a row of results ({error}); restore the file, or remove it and draw it "
-                    "again from the trials with `hma report`"
-                ) from error
+        except (ValueError, TypeError, AttributeError, csv.Error) as error:
+            raise ConfigError(
+                f"{path}, line {len(rows) + 2}: not a row of results ({error}); restore the file, or remove it and draw "
+                "it again from the trials with `hma report`"
+            ) from error
     return rows
 
 

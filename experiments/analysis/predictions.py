@@ -129,7 +129,7 @@ def _load(path: Path) -> Prediction:
         values: dict[str, Any] = json.loads(path.read_text())
         seal = values.pop("hash")
         prediction = from_dict(Prediction, values)
-    except (OSError, ValueError, KeyError, TypeError) as error:  # ConfigError is a ValueError
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:  # ConfigError is a ValueError
         raise ConfigError(f"{path}: no prediction can be read ({error}); restore it, or remove it") from error
     require(seal == stable_hash(values), f"{path} was changed after it was written; restore it, or remove it")
     return prediction

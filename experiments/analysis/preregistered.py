@@ -8,6 +8,7 @@ commit that brought the numbers, whose date and place in the history are the evi
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections import defaultdict
 from collections.abc import Sequence
@@ -63,7 +64,11 @@ def read_expected(path: Path) -> list[Expected]:
     if not path.exists():
         return []
     columns, numbers = [f.name for f in fields(Expected)], ("mean", "low", "high")
-    with open(path, newline="", encoding="utf-8") as file:
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # as spreadsheets save it, too
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not UTF-8 ({error}); save it as such") from error
+    with io.StringIO(text, newline="") as file:
         reader = csv.DictReader(file)
         known = (columns, columns[:-1])
         require(reader.fieldnames in known, f"{path}: its columns have to be {','.join(known[1])}, and may be seeds")

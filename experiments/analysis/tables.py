@@ -42,12 +42,12 @@ def read_trial(directory: Path) -> Judged:
     windows = WindowTable.load(directory / FILE)
     try:
         job = json.loads((directory / "job.json").read_text())
-        provenance = inputs_of(job["provenance"])
-    except (OSError, ValueError, KeyError) as error:
+        trial, provenance = read_job(job)[0], inputs_of(job["provenance"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
-            f"{directory}: the finished trial does not say what it is ({error}). Copy it again from where it ran"
+            f"{directory}: the finished trial does not say what it is ({error}); copy it again from where it ran"
         ) from error
-    return Judged(directory.name, read_job(job)[0], provenance, windows)
+    return Judged(directory.name, trial, provenance, windows)
 
 
 def read_trials(trials: Path, ids: Iterable[str] | None = None) -> dict[str, Judged]:

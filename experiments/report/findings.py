@@ -24,6 +24,7 @@ from experiments.report.fits import VERDICTS
 from experiments.report.pieces import pm, section, table
 from experiments.report.sweeps import CHANGED
 from experiments.sweeps.sweep import Sweep
+from hma_jax.config import ConfigError
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,17 @@ class Findings:
 
 
 def read_findings(path: Path, axes: Sequence[str]) -> Findings:
-    """Of a study with these axes, in their order on the page; empty without a file."""
+    """Of a study with these axes, in their order on the page; empty without a file. Raises ConfigError for one that is
+    no UTF-8."""
     if not path.exists():
         return Findings({})
     of_axes: dict[str, str] = {}
     rest = []
-    before, *parts = re.split(r"^## ", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not UTF-8 ({error}); save it as such") from error
+    before, *parts = re.split(r"^## ", text, flags=re.MULTILINE)
     if before := re.sub(r"\A\s*# .*", "", before).strip():
         rest.append(section("Findings", f"<div class=findings>{_as_html(before)}</div>"))
     for part in parts:

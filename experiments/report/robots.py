@@ -15,6 +15,7 @@ from experiments.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.running.provenance import Provenance
 from experiments.running.trial import trial_id
 from experiments.sweeps.sweep import POINT, Sweep
+from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
@@ -87,8 +88,18 @@ def _at_reference(rows: Sequence[Row], sweep: Sweep, metric: str, scope: str) ->
 
 
 def read_data(data_summary: Path) -> dict[str, dict[str, int]]:
-    """{robot: how much there is of it}; {} where nobody has counted."""
-    return json.loads(data_summary.read_text()) if data_summary.exists() else {}
+    """{robot: how much there is of it}; {} where nobody has counted. Raises ConfigError for a damaged file."""
+    try:
+        found = {name: {**facts} for name, facts in json.loads(data_summary.read_text()).items()}
+        require(all(isinstance(facts["episodes"], int) for facts in found.values()), "episodes that are no number")
+        return found
+    except FileNotFoundError:
+        return {}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(
+            f"{data_summary} does not say how much there is of each robot ({error}); remove it, the study's command "
+            "writes it again"
+        ) from error
 
 
 def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], data_summary: Path) -> str:

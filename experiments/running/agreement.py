@@ -38,7 +38,7 @@ def check_finished(trials: Path, ids: Iterable[str]) -> None:
             try:
                 job = json.loads((directory / "job.json").read_text())
                 found = trial_id(read_job(job)[0], inputs_of(job["provenance"]))
-            except (OSError, ValueError, KeyError) as error:
+            except (OSError, ValueError, KeyError, TypeError) as error:
                 raise ConfigError(
                     f"{directory}: the finished trial does not say what it is ({error}). Copy it "
                     "again from where it ran, or remove the directory to run it again"

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 RUNNING, FINISHED, DIVERGED, FAILED = "running", "finished", "diverged", "failed"
 LOST, PREEMPTED = "lost", "preempted"
@@ -47,12 +47,14 @@ class Ledger:
         lines = self.path.read_bytes().split(b"\n")
         records = []
         for number, line in enumerate(lines[:-1], start=1):  # what follows the last newline is torn
+            where = f"{self.path}, line {number}"
             try:
-                records.append(json.loads(line))
+                record = json.loads(line)
             except ValueError as error:
-                raise ConfigError(
-                    f"{self.path}, line {number}: not JSON ({error}); delete that line to go on"
-                ) from error
+                raise ConfigError(f"{where}: not JSON ({error}); delete that line to go on") from error
+            named = isinstance(record, dict) and all(isinstance(record.get(key), str) for key in ("trial", "event"))
+            require(named, f"{where}: it names no trial and what happened to it; delete that line to go on")
+            records.append(record)
         return records
 
     def states(self) -> dict[str, dict[str, Any]]:

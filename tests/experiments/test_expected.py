@@ -98,6 +98,15 @@ def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
         read_expected(path)
 
 
+def test_the_table_may_come_from_a_spreadsheet_in_utf_8_alone(tmp_path):
+    line = f"{COLUMNS}\nwidth,,8,,cross_entropy,5,4,6,abc1234\n"
+    (tmp_path / FILE).write_text(line, encoding="utf-8-sig")
+    assert read_expected(tmp_path / FILE) == [WIDTH]
+    (tmp_path / FILE).write_bytes(line.encode().replace(b"abc", b"\xe4bc"))
+    with pytest.raises(ConfigError, match=f"{FILE} is not UTF-8 .*; save it as such"):
+        read_expected(tmp_path / FILE)
+
+
 def test_columns_are_checked(tmp_path):
     (tmp_path / FILE).write_text("sweep,x,mean\nwidth,8,5\n")
     with pytest.raises(ConfigError, match="columns have to be"):

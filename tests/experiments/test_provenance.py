@@ -214,6 +214,7 @@ TAMPERING = {
     "another seed": (lambda d: edit(d / "job.json", '"seed": 0', '"seed": 5'), "job.json describes trial"),
     "other tokens": (lambda d: edit(d / "job.json", "5708e", "5708f"), "job.json describes trial"),
     "no job": (lambda d: (d / "job.json").unlink(), "does not say what it is"),
+    "a job of nothing": (lambda d: edit(d / "job.json", '"provenance": {', '"provenance": 3, "p": {'), "what it is"),
     "cut off": (lambda d: (d / "result.json").write_text((d / "result.json").read_text()[:300]), "not whole"),
     "of an earlier version": (lambda d: edit(d / "result.json", '"hash"', '"hush"'), "no 'hash' in result.json"),
 }

@@ -11,7 +11,9 @@ from experiments.analysis.scaling import trunk_parameters
 from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
+from experiments.report.findings import read_findings
 from experiments.report.plot_style import count
+from experiments.report.robots import read_data
 from experiments.report.sweeps import Along, describe
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.running.workspace import Workspace
@@ -53,6 +55,28 @@ def test_tables_read_back_what_was_written(drawn, tmp_path):
     a.robots.write_bytes(a.robots.read_bytes()[:-100])
     with pytest.raises(ConfigError, match="robots.parquet: not a table of rows.*`hma report`"):
         read_rows(a)
+    head, first, *others = a.results.read_bytes().splitlines(keepends=True)
+    unclosed, other_bytes = b'"' + first + 140_000 * b" ", first.replace(b"width", b"w\xefdth", 1)
+    for damaged in (b'"' + first, unclosed, other_bytes, first[:20]):
+        a.results.write_bytes(head + damaged + b"".join(others[:5]))
+        with pytest.raises(ConfigError, match="results.csv, line 2: not a row of results .*`hma report`"):
+            read_csv(a.results)
+
+
+@pytest.mark.parametrize("text", [b"", b"null", b'{"arm": 3}', b'{"arm": {"windows": 2}}', b"\xff"])
+def test_a_damaged_count_of_the_data_is_named(tmp_path, text):
+    (tmp_path / "data.json").write_bytes(text)
+    with pytest.raises(ConfigError, match="data.json does not say how much there is of each robot .*; remove it"):
+        read_data(tmp_path / "data.json")
+
+
+def test_findings_of_another_encoding_are_named_and_a_mark_of_utf_8_is_none_of_them(tmp_path):
+    path = tmp_path / "findings.md"
+    path.write_text("## `width`\n\nΔPSNR falls\n", encoding="utf-8-sig")
+    assert "ΔPSNR falls" in read_findings(path, ("width",)).of_axes["width"]
+    path.write_text("## `width`\n\ndéjà\n", encoding="latin-1")
+    with pytest.raises(ConfigError, match="findings.md is not UTF-8 .*; save it as such"):
+        read_findings(path, ("width",))
 
 
 def test_curve_joins_seeds_and_windows(drawn):

@@ -93,6 +93,10 @@ def test_a_prediction_that_was_edited_is_refused(root, capsys):
     path.write_text(json.dumps(values | {"high": values["high"] * 1.001}))
     assert command(root) == 2
     assert "was changed after it was written" in capsys.readouterr().err
+    for other in ("null", "[]", "{}"):
+        path.write_text(other)
+        assert command(root) == 2
+        assert f"{path}: no prediction can be read" in capsys.readouterr().err
 
 
 def test_what_was_made_from_other_results_is_marked(root):

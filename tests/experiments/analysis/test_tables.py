@@ -52,6 +52,14 @@ def test_one_digit_of_the_windows_of_a_trial_cannot_be_changed(tmp_path):
         read_trial(directory)
 
 
+@pytest.mark.parametrize("job", ["", "null", "[]", "{}", '{"trial": 3, "provenance": {}}'])
+def test_a_trial_that_does_not_say_what_it_is_is_named(tmp_path, job):
+    (directory, _), _ = two_seeds(tmp_path)
+    (directory / "job.json").write_text(job)
+    with pytest.raises(ConfigError, match=f"{directory}: the finished trial does not say what it is .*; copy it again"):
+        read_trial(directory)
+
+
 def test_a_row_per_trial_has_every_setting_and_result(tmp_path):
     (directory, _), (table, _) = two_seeds(tmp_path)
     trial = reference_trial(STUDY, 0)
