@@ -7,15 +7,21 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import json
+import math
 import sys
 import types
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from experiments.running.trial import Trial
 from experiments.study import Study
-from experiments.sweeps.sweep import Sweep, judge_less
+from experiments.sweeps.sweep import Point, Sweep, judge_less
+from experiments.words import few
 from hma_jax.config import ConfigError, require
+from hma_jax.config.json import from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file
 
 SCALING = ("datasets", "trajectories", "width")
@@ -81,6 +87,8 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
         where = f"{axis}: plan(study)"
         require(isinstance(sweep, Sweep), f"{where} must return a Sweep, got {type(sweep).__name__}")
         require(bool(sweep.points), f"{where} returned a sweep without points")
+        if is_file(axis):
+            _require_trials(study, sweep, where)
         _require_distinct(sweep, where)
         if is_file(axis):
             require(sweep.name not in AXES, f"{where}: the name {sweep.name!r} is taken; choose another")
@@ -91,6 +99,45 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
     names = [sweep.name for sweep in sweeps]
     require(len(set(names)) == len(names), f"two axes have the same name: {', '.join(sorted(names))}")
     return [judge_less(study, sweep) for sweep in sweeps]
+
+
+def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
+    """Raises ConfigError for a point of a user's file that is none, for one whose trial would fail once it is trained,
+    and for one whose number would be of other robots, or of another position, than it says."""
+    for number, p in enumerate(sweep.points, start=1):
+        of_trial = isinstance(p, Point) and isinstance(p.trial, Trial)
+        what = type(p.trial if isinstance(p, Point) else p).__name__
+        require(of_trial, f"{where}: point {number} has to be a Point with a Trial, and has a {what}")
+        numbered = isinstance(p.x, int | float) and math.isfinite(p.x)
+        require(numbered, f"{where}: position {p.x!r} of point {number} is no number; names are for make_ablation")
+        named = not sweep.labels or p.x in range(len(sweep.labels))
+        require(named, f"{where}: position {p.x:g} has no label; x counts into the {len(sweep.labels)} labels, from 0")
+        _require_trial(study, p.trial, p.scope or sweep.scope, f"{where}: the trial at {p.x:g}")
+    places: dict[tuple[str, str, str], float] = {}
+    for p in sweep.points if not sweep.labels else ():
+        trained = replace(p.trial, measure_untrained=False)  # of the reference alone
+        x = places.setdefault((p.series, p.role, stable_hash(to_dict(trained))), p.x)
+        require(
+            x == p.x,
+            f"{where} has the same trial at {x:g} and {p.x:g}: nothing of it changes there, or the study's reference "
+            "trial does not stand at reference_x",
+        )
+
+
+def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str) -> None:
+    try:  # as its process reads it
+        same = from_dict(Trial, json.loads(json.dumps(to_dict(trial)))) == trial
+    except (TypeError, ValueError) as error:  # ConfigError is a ValueError
+        raise ConfigError(f"{where} has a setting of a wrong kind ({error})") from error
+    require(same, f"{where} has a setting of a wrong kind: a list where a tuple belongs, or a number that is none")
+    known = {name for one in trial.with_source() for name in one.datasets}
+    for names, of, what in (
+        (known, study.all_names(), "is trained on {}, which the study does not have"),
+        (trial.evaluated, known, "judges {} and is not trained on it; leave it out of `evaluated`"),
+        (scope, trial.evaluated, "does not judge {}, over which the axis averages; leave it out of `scope`"),
+    ):
+        without = [name for name in names if name not in of]
+        require(not without, f"{where} {what.format(few(without))}")
 
 
 def _require_distinct(sweep: Sweep, where: str) -> None:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, training_of, trial_id
 from experiments.study import Study
-from hma_jax.config.json import stable_hash
+from hma_jax.config import require
+from hma_jax.config.json import diff, stable_hash
 
 POINT, CONTROL, STANDARD = "point", "control", "standard"
 """Roles of a trial: on the curve; beside it, trained on shuffled actions; on a curve without muP."""
@@ -137,9 +138,19 @@ def make_sweep(
     """The sweep whose trial at x is `change(reference, x)`, for every seed, plus the control: at the reference, and
     at the ends of a numbered axis if the study wants `end_controls`.
 
-    `seeds` are the study's unless given, `steps` those of every trial.
+    `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError where the study's reference
+    trial does not stand at `reference_x`: `change` has to leave it there as it is, but for whom it is judged on.
     """
     seeds = study.seeds if seeds is None else seeds
+    there = reference_trial(study, seeds[0], steps)
+    changed = change(there, reference_x)
+    require(isinstance(changed, Trial), f"axis {name}: change has to return a trial, and returned {changed!r}")
+    lines = diff(there, replace(changed, evaluated=there.evaluated))
+    require(
+        not lines,
+        f"axis {name}: the reference trial of this study does not stand at reference_x {reference_x}, where it would be "
+        f"changed ({'; '.join(lines)}); give the position that it has",
+    )
 
     def trial(x: int, seed: int) -> Trial:
         reference = reference_trial(study, seed, steps)

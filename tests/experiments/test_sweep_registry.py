@@ -43,6 +43,21 @@ def test_an_unknown_axis_is_named(axis, words, capsys):
     assert main(["sweep", axis, "--preset", "smoke", "--dry-run"]) == 2 and words in capsys.readouterr().err
 
 
+OWN = """from dataclasses import replace
+from experiments.sweeps.sweep import make_sweep
+
+def plan(study):
+    return make_sweep(
+        study, "own", "x", study.dataset_names(), (1, 3), lambda trial, x: {}, 3, question="?", gain="it"
+    )
+"""
+POINTS = """from experiments.sweeps.sweep import Point, Sweep, reference_trial
+
+def plan(study):
+    return Sweep("own", "x", study.dataset_names(), ({},))
+"""
+
+
 @pytest.fixture
 def documented(tmp_path) -> Path:
     """The example of the documentation as a file."""
@@ -107,6 +122,16 @@ def plan(study):
     [
         ("", "has no function plan"),
         ("def plan(study): return 3", "must return a Sweep, got int"),
+        (OWN.format("trial"), "has the same trial at 1 and 3: nothing of it changes there"),
+        (OWN.format("None"), "axis own: change has to return a trial, and returned None"),
+        (OWN.format("replace(trial, tau=2.0 + x)"), r"does not stand at reference_x 3, .* \(tau: 3.0 -> 5.0\)"),
+        (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "trial at 1 has a setting of a wrong kind .*tau"),
+        (OWN.format("replace(trial, datasets=list(trial.datasets)) if x == 1 else trial"), "a list where a tuple"),
+        (OWN.format("replace(trial, datasets=trial.datasets[:x])"), "trial at 1 judges rover, pusher and is not trained"),
+        (OWN.format("replace(trial, datasets=trial.datasets[:x], evaluated=trial.datasets[:x])"), "at 1 does not judge"),
+        (OWN.format("replace(trial, datasets=('toto',), evaluated=('toto',)) if x == 1 else trial"), "trained on toto, wh"),
+        (POINTS.format("reference_trial(study, 0)"), "point 1 has to be a Point with a Trial, and has a Trial"),
+        (POINTS.format("Point('wide', reference_trial(study, 0))"), "position 'wide' of point 1 is no number"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
         (TWICE, "returned 2 points at 8, point, seed 0; give each a position or a series of its own"),
     ],
