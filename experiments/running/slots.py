@@ -13,6 +13,7 @@ import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -69,10 +70,16 @@ def find_accelerators(environment: Mapping[str, str] = os.environ) -> Accelerato
         return None
     for kind, variable, find in (("gpu", "CUDA_VISIBLE_DEVICES", _gpus), ("tpu", "TPU_VISIBLE_CHIPS", _tpu_chips)):
         told = environment.get(variable)
-        names = find() if told is None else tuple(name.strip() for name in told.split(",") if name.strip())
+        names = find() if told is None else _named(told)
         if names:
             return Accelerators(kind, names)
     return None
+
+
+def _named(told: str) -> tuple[str, ...]:
+    """Of a list as CUDA reads it: what is no device, such as -1 or what Slurm says of a job without any, ends it."""
+    names = (name.strip() for name in told.split(",") if name.strip())
+    return tuple(takewhile(lambda name: name != "NoDevFiles" and not name.startswith("-"), names))
 
 
 @cache

@@ -53,6 +53,9 @@ def test_slots_share_the_cores():
         ({"CUDA_VISIBLE_DEVICES": "2,5"}, Accelerators("gpu", ("2", "5"))),
         ({"CUDA_VISIBLE_DEVICES": "MIG-a, MIG-b"}, Accelerators("gpu", ("MIG-a", "MIG-b"))),
         ({"CUDA_VISIBLE_DEVICES": ""}, None),
+        ({"CUDA_VISIBLE_DEVICES": "-1"}, None),
+        ({"CUDA_VISIBLE_DEVICES": "NoDevFiles"}, None),
+        ({"CUDA_VISIBLE_DEVICES": "0,-1,1"}, Accelerators("gpu", ("0",))),  # as CUDA reads it
         ({"CUDA_VISIBLE_DEVICES": "0,1", "JAX_PLATFORMS": "cpu"}, None),
         ({"CUDA_VISIBLE_DEVICES": "", "TPU_VISIBLE_CHIPS": "1"}, Accelerators("tpu", ("1",))),
         ({}, Accelerators("gpu", ("0", "1"))),

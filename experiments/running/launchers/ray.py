@@ -6,7 +6,9 @@ or machine dies is not tried again by Ray: the runner does that, with its bound.
 
 from __future__ import annotations
 
+import math
 import os
+import re
 import signal
 import threading
 import time
@@ -18,7 +20,7 @@ from typing import Any
 from experiments.running.attempts import Ended, is_alive
 from experiments.running.launchers.base import Command, Launcher, trial_command
 from experiments.running.launchers.far import STOP, Attempt
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,20 @@ class RaySettings:
     tpus: int = 0  # chips
     memory_gb: float | None = None
     resources: tuple[str, ...] = ()  # others that the cluster names, such as "big_memory=1"
+
+    def __post_init__(self):
+        for name in ("cpus", "gpus", "tpus"):
+            value = getattr(self, name)
+            whole = value <= 1 or float(value).is_integer()  # as Ray asks for it
+            require(value >= 0 and whole, f"--launcher-set {name}={value:g}: it must be 0 or more, above 1 a whole number")
+        memory = self.memory_gb
+        require(memory is None or 0 < memory < math.inf, f"--launcher-set memory_gb={memory:g}: it must be positive")
+        for resource in self.resources:
+            amount = re.fullmatch(r"[^=]+=(\d+(?:\.\d+)?)", resource)
+            require(
+                amount is not None and float(amount[1]) > 0,
+                f"--launcher-set resources={resource}: write it as resources=NAME=AMOUNT, such as resources=fast_disk=1",
+            )
 
 
 @dataclass(frozen=True)

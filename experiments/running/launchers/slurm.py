@@ -22,7 +22,7 @@ from typing import Any
 from experiments.running.attempts import Ended
 from experiments.running.launchers.base import Command, Launcher, trial_command
 from experiments.running.launchers.far import Attempt
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +55,17 @@ class SlurmSettings:
     minutes: int = 1440  # of one job; a trial that needs more goes on in the next
     grace: int = 120  # seconds to save before the end of a job's time
     sbatch: tuple[str, ...] = ()  # further options, such as "gres=gpu:h100:1"
+
+    def __post_init__(self):
+        for name, least in (("gpus", 0), ("cpus", 1), ("minutes", 1), ("grace", 0)):
+            value = getattr(self, name)
+            require(value is None or value >= least, f"--launcher-set {name}={value}: it must be at least {least}")
+        memory = self.memory_gb
+        require(memory is None or 0 < memory < math.inf, f"--launcher-set memory_gb={memory:g}: it must be positive")
+        require(
+            self.grace < 60 * self.minutes,
+            f"--launcher-set grace={self.grace}: a job of {self.minutes} minutes would be told to save before it begins",
+        )
 
 
 class SlurmAttempt(Attempt):
