@@ -60,8 +60,8 @@ class SlurmSettings:
         for name, least in (("gpus", 0), ("cpus", 1), ("minutes", 1), ("grace", 0)):
             value = getattr(self, name)
             require(value is None or value >= least, f"--launcher-set {name}={value}: it must be at least {least}")
-        memory = self.memory_gb
-        require(memory is None or 0 < memory < math.inf, f"--launcher-set memory_gb={memory:g}: it must be positive")
+        memory = 1.0 if self.memory_gb is None else self.memory_gb
+        require(0 < memory < math.inf, f"--launcher-set memory_gb={memory:g}: it must be positive")
         require(
             self.grace < 60 * self.minutes,
             f"--launcher-set grace={self.grace}: a job of {self.minutes} minutes would be told to save before it begins",
