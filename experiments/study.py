@@ -182,6 +182,7 @@ class Study:
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
             require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
         self._check_tokens()
+        require(not self.train.seed, f"train.seed: a trial has one of seeds; set seeds={self.train.seed}")
         for name in ("tau", "flops_per_second"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")
         require(self.trial_seconds >= 0, f"trial_seconds must not be negative, got {self.trial_seconds:g}")

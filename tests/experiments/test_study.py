@@ -190,6 +190,13 @@ def test_model_that_takes_other_tokens_is_told_what_to_set(preset, setting, mess
         override(get_preset(preset), [setting])
 
 
+def test_the_seed_of_a_study_s_trials_is_one_of_its_seeds():
+    """`train.seed` would be replaced by each of them without a word."""
+    with pytest.raises(ConfigError, match="train.seed: a trial has one of seeds; set seeds=3"):
+        override(SMOKE, ["train.seed=3"])
+    assert override(SMOKE, ["seeds=3"]).seeds == (3,)
+
+
 def test_the_advice_makes_a_study_continuous():
     study = override(SMOKE, ["tokenizer.quantise=false", 'model.diffusion={"channels": 8, "patch": 1}'])
     assert study.model.diffusion.token_channels == study.tokenizer.token_channels == 8
