@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
 from rich.table import Table
 
 from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
@@ -194,7 +195,7 @@ def plan_table(
         trial, cost = plan.trial, plan.cost
         seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
         table.add_row(
-            ("reference" if id in shared else axes.get(id, "source")) + seed,
+            escape(("reference" if id in shared else axes.get(id, "source")) + seed),
             f"{len(trial.datasets)}",
             "all" if trial.max_trajectories is None else _short_count(trial.max_trajectories),
             f"{trial.model.width}",

@@ -182,7 +182,7 @@ class SweepMonitor(Monitor):
 
     def launched(self, job: Job, resumed: bool) -> None:
         note = "resuming" if resumed else "starting"
-        self.tasks[job.id] = self.bars.add_task(f"  {job.title}", total=None, note=note)
+        self.tasks[job.id] = self.bars.add_task(f"  {escape(job.title)}", total=None, note=note)
 
     def progressed(self, job: Job, phase: str, done: int, total: int) -> None:
         self.bars.update(self.tasks[job.id], completed=done, total=total, note=phase)
@@ -197,7 +197,7 @@ class SweepMonitor(Monitor):
         message = f": {escape(state.message)}" if state.message else ""
         more = "; it goes on from its last checkpoint" if again else ""
         self.bars.console.print(
-            f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {job.title} "
+            f"[{colour}]{state.event}[/] {self.ended_count}/{self.total} {escape(job.title)} "
             f"[dim]({_clock(seconds)})[/]{message}{more}"
         )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from rich.markup import escape
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, tidy_table
@@ -55,7 +56,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     found = {(row.scope, row.metric): row for row in rows}
     ratio = "cross_entropy" in metrics
     columns = ["robot", *(f"{m} ({_unit(m)})" for m in metrics), *["perplexity"] * ratio]
-    table = tidy_table(f"{a.name} - {b.name}", *columns)
+    table = tidy_table(escape(f"{a.name} - {b.name}"), *columns)
     for scope in dict.fromkeys(row.scope for row in rows):
         cells = [_cell(found.get((scope, metric))) for metric in metrics]
         nats = found.get((scope, "cross_entropy"))

@@ -6,6 +6,7 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -57,7 +58,7 @@ def _show(root: Path) -> None:
     for name in ("curve", "over", "L, nats per token", "exponents", "remarks"):
         table.add_column(name, overflow="fold")
     for fitted in numbers.fits:
-        table.add_row(fitted.curve.name, ", ".join(fitted.curve.axes), *_words(fitted))
+        table.add_row(*map(escape, (fitted.curve.name, ", ".join(fitted.curve.axes), *_words(fitted))))
     if numbers.isoflop is not None:
         a = numbers.isoflop.exponent
         said = f"N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" if a else ""
@@ -112,7 +113,8 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     save_prediction(path, prediction)
     console.print(
         f"{curve.name} at {prediction.x[0]:,.0f} {curve.axes[0]}: {prediction.mean:.4f} nats per token, "
-        f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}", soft_wrap=True, highlight=False,
+        f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}",
+        soft_wrap=True, highlight=False, markup=False,
     )  # fmt: skip
     wrote(path, then=f"git add {shlex.quote(short(path))} && git commit, and only then run the trials")
 

@@ -7,7 +7,10 @@ import io
 import pytest
 from rich.console import Console
 
-from experiments.progress import tidy_table
+from experiments import progress
+from experiments.progress import SweepMonitor, tidy_table
+from experiments.running.attempts import State
+from experiments.running.runner import Job
 
 METRICS = ("perplexity", "accuracy", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval")
 
@@ -51,3 +54,14 @@ def test_a_column_of_prose_takes_what_the_others_leave(width):
     said = shown(table, width)
     assert all(len(line) <= width for line in said.splitlines())
     assert [word for word in said.split() if word.startswith("word")] == prose
+
+
+def test_brackets_in_the_title_of_a_trial_are_words(monkeypatch):
+    console = Console(file=io.StringIO(), width=110, highlight=False)
+    monkeypatch.setattr(progress, "console", console)
+    for title in ("pace [fps] 3", "pace [/s] 3"):
+        with SweepMonitor(1) as monitor:
+            job = Job("a", title, {})
+            monitor.launched(job, resumed=False)
+            monitor.ended(job, State("failed", "[/x] y"), 1.0, again=False)
+        assert f"{title} (1.0 s): [/x] y" in console.file.getvalue()

@@ -51,6 +51,13 @@ def plan(study):
         study, "own", "x", study.dataset_names(), (1, 3), lambda trial, x: {}, 3, question="?", gain="it"
     )
 """
+NAMED = """from dataclasses import replace
+from experiments.sweeps.sweep import make_ablation
+
+def plan(study):
+    variants = {"as it is": lambda trial: trial, "per [/s]": lambda trial: replace(trial, tau=1.0)}
+    return make_ablation(study, "own", "x", variants, "as it is", question="?", gain="it", title="t")
+"""
 POINTS = """from experiments.sweeps.sweep import Point, Sweep, reference_trial
 
 def plan(study):
@@ -71,6 +78,13 @@ def test_the_documented_axis_is_planned(documented, capsys):
     assert main(["sweep", str(documented), "--preset", "smoke", "--dry-run"]) == 0
     said = capsys.readouterr().out
     assert "4 trials" in said and "temperature" in said and "reference" in said
+
+
+def test_brackets_of_a_label_are_words_in_a_plan(tmp_path, capsys):
+    (tmp_path / "own.py").write_text(NAMED)
+    asked = ["--preset", "smoke", "--set", "ablation_seeds=0", "--dry-run"]
+    assert main(["sweep", str(tmp_path / "own.py"), *asked]) == 0
+    assert "per [/s]" in capsys.readouterr().out
 
 
 def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
