@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 
 from experiments.progress import console
 from experiments.words import few
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
 from hma_jax.runtime.files import write_file
 
@@ -64,9 +64,10 @@ class MadeFrom:
 
 
 def read_stamp(directory: Path, name: str = STAMP) -> MadeFrom | None:
-    """What the thing in `directory` was made from; None if it is not written down there."""
+    """What the thing in `directory` was made from; None if it is not written down there, or damaged."""
     try:
         there = from_dict(MadeFrom, json.loads((directory / name).read_text()))
+        require(all(isinstance(part, dict) for part in vars(there).values()), "not JSON values by name")
     except (OSError, ValueError):  # ConfigError is a ValueError
         return None
     moved = {name: there.recorded[name] for name in FORMERLY_RECORDED if name in there.recorded}

@@ -39,6 +39,7 @@ from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep, all_steps, reference_trial, titles
+from hma_jax.config import ConfigError
 from hma_jax.config.json import to_json
 from hma_jax.runtime.files import write_file
 
@@ -206,10 +207,16 @@ def _curves(
 
 def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
     path = workspace.tokenizer / "quality.json"
-    if not path.exists():
+    try:
+        quality = json.loads(path.read_text())
+        return CurvePoint(0, float(quality["mean"]), float(quality["sem"]), math.nan, {}, 0)
+    except FileNotFoundError:
         return None
-    quality = json.loads(path.read_text())
-    return CurvePoint(0, quality["mean"], quality["sem"], math.nan, {}, 0)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path}: no quality of a tokenizer can be read ({error}); restore the file, or remove it: the page then "
+            "does not show it"
+        ) from error
 
 
 def _fits(workspace: Workspace, numbers: Numbers) -> str:

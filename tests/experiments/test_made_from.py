@@ -11,7 +11,14 @@ from data_pipelines.suite import generate as suite_generator
 from data_pipelines.tokens import tokenize_job
 from experiments.cli.main import main
 from experiments.preparing import tokenizer as tokenizer_step
-from experiments.preparing.made_from import OLD_STAMP, STAMP, dataset_differences, differences, may_replace
+from experiments.preparing.made_from import (
+    OLD_STAMP,
+    STAMP,
+    dataset_differences,
+    differences,
+    may_replace,
+    read_stamp,
+)
 from experiments.running.closure import trace
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
@@ -193,6 +200,12 @@ def test_sources_of_the_tokenizer_are_its_own():
         "data_pipelines.sources.lerobot_dataset", "hma_jax.training.loop",
     } <= names.keys()
     assert not [name for name in names if name.startswith(("experiments", "hma_jax.model.trunk"))]
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"inputs": 3}', '{"inputs": {}, "recorded": "x"}'])
+def test_a_damaged_stamp_says_nothing(tmp_path, text):
+    (tmp_path / STAMP).write_text(text)
+    assert read_stamp(tmp_path) is None
 
 
 def test_a_stamp_of_an_earlier_version_is_read_in_place(hma, out):

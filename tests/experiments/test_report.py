@@ -70,6 +70,16 @@ def test_a_damaged_count_of_the_data_is_named(tmp_path, text):
         read_data(tmp_path / "data.json")
 
 
+@pytest.mark.parametrize("text", ["", "null", '{"mean": 20.0}', '{"mean": "x", "sem": 0.1}'])
+def test_a_damaged_quality_of_the_tokenizer_is_named(tmp_path, text):
+    workspace = Workspace(tmp_path)
+    assert page._tokenizer_quality(workspace) is None
+    workspace.tokenizer.mkdir()
+    (workspace.tokenizer / "quality.json").write_text(text)
+    with pytest.raises(ConfigError, match="quality.json: no quality of a tokenizer can be read .*; restore the file"):
+        page._tokenizer_quality(workspace)
+
+
 def test_findings_of_another_encoding_are_named_and_a_mark_of_utf_8_is_none_of_them(tmp_path):
     path = tmp_path / "findings.md"
     path.write_text("## `width`\n\nΔPSNR falls\n", encoding="utf-8-sig")
