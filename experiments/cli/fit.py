@@ -109,7 +109,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
         )
     results, windows = read_results(workspace, unique_trials(sweeps, record.provenance))
     prediction = predict(curve, held, windows, result_hashes(results))
-    path = out or workspace.predictions / f"{curve.name}-{text}.json"
+    path = out or workspace.predictions / f"{curve.name}-{text}.json".replace("/", "_")
     save_prediction(path, prediction)
     console.print(
         f"{curve.name} at {prediction.x[0]:,.0f} {curve.axes[0]}: {prediction.mean:.4f} nats per token, "

@@ -162,7 +162,7 @@ def _headline(
     gains = f"{', '.join(others)} and {final}" if others else final
     return (
         f"<header><h1>HMA study <em>{html.escape(study.name)}</em></h1>"
-        f"<p class=lead>What an action-conditioned video model over many robots gains from {gains}: "
+        f"<p class=lead>What an action-conditioned video model over many robots gains from {html.escape(gains)}: "
         f"{max(len(p.trial.datasets) for s in sweeps for p in s.points)} dataset(s), "
         f"{all_steps(sweeps)} steps of {study.train.batch} windows per trial.</p>"
         f"<p class=meta>{html.escape(when)}</p></header>"

@@ -90,13 +90,14 @@ def test_brackets_of_a_label_are_words_in_a_plan(tmp_path, capsys):
 def test_the_documented_axis_is_drawn_without_its_file(documented, tmp_path):
     root = tmp_path / "study"
     root.mkdir()
+    documented.write_text(documented.read_text().replace("another mixture", "another <mixture>"))
     (kept,) = keep_axes({"temperature": str(documented)}, root)
     documented.unlink()
     axes = ("width", kept)
     save_record(Workspace(root), record_of(axes=axes))
     draw(finished_study(root, axes=axes), load_record(Workspace(root)))
     page = (root / "report.html").read_text()
-    assert "how strongly the mixture favours" in page and "more width and another mixture" in page
+    assert "how strongly the mixture favours" in page and "more width and another &lt;mixture&gt;" in page
     assert (root / "figures/temperature.png").exists()
     rows = (root / "results.csv").read_text()
     assert all(f"temperature,{x}," in rows.replace(".0,", ",") for x in (1, 3, 10))

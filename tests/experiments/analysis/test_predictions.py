@@ -157,14 +157,14 @@ def test_an_axis_of_a_file_is_predicted(root):
 
 
 def test_of_several_curves_one_is_chosen(root, capsys):
-    with_own_axis(root, "replace(sweep, points=tuple(replace(p, series=s) for s in ('one', 'as well') for p in sweep.points))")
+    with_own_axis(root, "replace(sweep, points=tuple(replace(p, series=s) for s in ('a/b', 'as well') for p in sweep.points))")
     assert predict_own(root, "own") == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert f"which curve of own? Write one of own-one={HELD}, 'own-as well={HELD}'" in said
+    assert f"which curve of own? Write one of own-a/b={HELD}, 'own-as well={HELD}'" in said
     assert not (root / "predictions").exists()
-    assert predict_own(root, "own-as well") == 0
-    [(name, prediction)] = load_predictions(root / "predictions").items()
-    assert prediction.curve == "own-as well" and name == f"own-as well-{HELD}.json"
+    assert predict_own(root, "own-as well") == predict_own(root, "own-a/b") == 0
+    found = {name: prediction.curve for name, prediction in load_predictions(root / "predictions").items()}
+    assert found == {f"own-as well-{HELD}.json": "own-as well", f"own-a_b-{HELD}.json": "own-a/b"}
 
 
 def test_nothing_is_predicted_where_the_lowest_loss_is_within(root, capsys):
