@@ -66,6 +66,9 @@ def test_the_default_is_where_the_study_is():
     with pytest.raises(ConfigError, match="train.masking.setting is 'policy'"):
         masking = replace(passive, setting="policy")
         settings_axis.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
+    masking = replace(SMOKE.train.masking, setting="full")
+    with pytest.raises(ConfigError, match="nothing predicts its actions; add --set model.action_heads=true"):
+        settings_axis.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
 
 
 @pytest.mark.parametrize("study", PLAIN.values(), ids=PLAIN)
