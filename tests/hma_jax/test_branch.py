@@ -43,7 +43,6 @@ def test_rates_agree_for_as_long_as_is_said_and_no_longer(schedule, fewer, more)
         assert end == fewer - max(int(0.2 * fewer), 1) and rates[0][end + 1] != rates[1][end + 1]
 
 
-@pytest.mark.exact
 def test_a_branch_is_byte_equal_to_a_run_of_its_own(tmp_path: Path):
     """The checkpoint before the decay stays, though the newest ones alone would be kept."""
     alone = train(tmp_path / "alone", 12)
