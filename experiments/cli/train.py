@@ -147,7 +147,10 @@ def adapt_model(
         f"{short(source)} already knows {few(setting.study.dataset_names())}: there is nothing to add. To train it on: "
         f"{setting.command('train', '--from', source)} --run NEW",
     )
-    require(not setting.study.train.only, "train.only: leave it out; the new robots alone are trained, or, with --everything, all")
+    require(
+        not setting.study.train.only,
+        "train.only: leave it out; the new robots alone are trained, or, with --everything, all",
+    )
     run = run or setting.workspace.root / "model"
     require_another_place(source, run)
     _check(setting, run, trajectories, options)

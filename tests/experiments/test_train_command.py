@@ -262,7 +262,8 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
         "train", "--from", str(beside), "--data", *data
     )
     only = ("--set", f"train.only={BASE.name}")
-    assert "train.only: leave it out; the new robots alone are trained" in refused("adapt", str(beside), "--data", *data, *only)
+    said = refused("adapt", str(beside), "--data", *data, *only)
+    assert "train.only: leave it out; the new robots alone are trained" in said
     asked, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
     setting = setting_of(beside, trained, asked)
     assert setting.tokenizer == tokenizer and strangers(trained, setting) == [BASE.name]
