@@ -53,7 +53,8 @@ def freeze_windows(study: Study, workspace: Workspace, replace: Step | None = No
     summary = summarise(store, names, frames, study.rate)
     write_file(workspace.data_summary, json.dumps(summary, indent=1))
     for name, facts in summary.items():
-        _remark(name, facts, manifest.empty.get(name, ""), frames)
+        _remark(name, facts, manifest.empty.get(name, ""))
+    say_padded(summary, frames, workspace.data_summary.name)
     _say_held_out(summary, study.store)
     without = [name for name, facts in summary.items() if not facts["windows"]]
     if without:
@@ -172,16 +173,25 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
         )
 
 
-def _remark(name: str, facts: dict[str, int], no_evaluation: str, frames: int) -> None:
+def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> None:
+    """Says in how many datasets windows end with padding, and where that is most of them; `file` has the others."""
+    padded = {name: facts for name, facts in summary.items() if facts["padded"]}
+    if padded:
+        most = sorted(padded, key=lambda name: -padded[name]["padded"] / padded[name]["episodes"])
+        each = [f"{padded[name]['padded']} of {padded[name]['episodes']} of {name}" for name in most]
+        console.print(
+            f"note: training episodes too short for {frames} frames, whose windows end with padding: {few(each)}"
+            f"{f' ({file})' if len(each) > 3 else ''}",
+            markup=False,
+            soft_wrap=True,
+        )
+
+
+def _remark(name: str, facts: dict[str, int], no_evaluation: str) -> None:
     """Says what of a dataset is not used."""
     remarks = []
     if facts["too_short"]:
         remarks.append(f"{facts['too_short']} of {facts['episodes']} training episodes are too short for any window")
-    if facts["padded"]:
-        remarks.append(
-            f"{facts['padded']} of {facts['episodes']} training episodes are too short for {frames} frames: their "
-            "windows end with padding"
-        )
     if facts["skipped"]:
         remarks.append(f"{facts['skipped']} damaged episodes are left out")
     if no_evaluation:

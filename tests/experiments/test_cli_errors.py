@@ -254,6 +254,17 @@ def test_dataset_without_a_window_is_reported_and_left_out(study, capsys):
     assert facts[ARM.name]["too_short"] == 0 and facts[ARM.name]["windows"] > 0
 
 
+def test_windows_that_end_with_padding_are_one_line_however_many_datasets_have_them(capsys):
+    """Where it is most of the episodes first; those that are not named stand in a file."""
+    facts = {f"robot_{i}": {"padded": i, "episodes": 10} for i in range(6)}
+    windows.say_padded(facts, 12, "data.json")
+    (line,) = capsys.readouterr().out.splitlines()
+    named = "5 of 10 of robot_5, 4 of 10 of robot_4, 3 of 10 of robot_3 and 2 more (data.json)"
+    assert line.endswith(f"too short for 12 frames, whose windows end with padding: {named}")
+    windows.say_padded({"whole": {"padded": 0, "episodes": 10}}, 12, "data.json")
+    assert capsys.readouterr().out == ""
+
+
 def test_no_window_at_all(arm, tmp_path, refused):
     long = ("--set", "model.frames=8", "--set", "eval.prompt_frames=7")
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, *long)
