@@ -78,7 +78,8 @@ def adapt(
     """Add new robots to a trained model and train them on the study's datasets.
 
     The model gets a stem, conditioning and head for every dataset it does not know. What it says of
-    the robots it knows stays the same, bit for bit, unless everything is trained.
+    the robots it knows stays the same, bit for bit, unless everything is trained. Of a run that keeps an
+    average of its weights it is that average, as when it is evaluated.
 
     Args:
         source: Directory of the training run that knows the other robots.
@@ -140,7 +141,7 @@ def adapt_model(
     from experiments.running.trial import open_materials
     from hma_jax.training.runs import load_run
 
-    trained = load_run(source)
+    trained = load_run(source, "auto")
     setting = setting_of(source, trained, asked)
     require(
         bool(strangers(trained, setting)),

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from hma_jax.convert import read_official, write_run
 from hma_jax.tokenizers.autoencoder import declare_tokenizer
 from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
+from hma_jax.training import train as model_training
 from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
@@ -186,6 +188,26 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
     assert main(other) != 0
     said = capsys.readouterr().err
     assert "is another model than --set asks for (there -> asked for): model.width: 16 -> 24. Leave out" in said
+
+
+def test_robots_are_added_to_the_averaged_weights_of_a_run_that_keeps_them(tmp_path):
+    """They are what is evaluated, and what was said of the known robots is to stay."""
+
+    def step(state, batch):
+        moved = jax.tree.map(lambda x: x + 1, state.params)
+        return state._replace(step=state.step + 1, params=moved), {"loss": jnp.float32(5)}
+
+    known, new = write_rlds(tmp_path / "known", ARM, [18] * 12), write_rlds(tmp_path / "new", BASE, [40] * 12)
+    source, adapted = tmp_path / "a" / "model", tmp_path / "b" / "model"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(model_training, "make_train_step", lambda *_: step)
+        averaged = ("--set", "train.ema_decay=0.5")
+        assert main(["train", *SMOKE, "--out", str(tmp_path / "a"), "--data", str(known), *averaged]) == 0
+    assert main(["adapt", str(source), *SMOKE, "--out", str(tmp_path / "b"), "--data", str(new)]) == 0
+    assert load_run(adapted).table.names == (ARM.name, BASE.name)
+    tables = [load_run(*which).params["embed"]["tables"] for which in ((adapted,), (source, "ema"), (source, "last"))]
+    np.testing.assert_array_equal(tables[0], tables[1])
+    assert not np.array_equal(tables[1], tables[2])
 
 
 def make_released(root: Path, *robots: tuple[str, int, int]) -> Path:
