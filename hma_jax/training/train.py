@@ -76,9 +76,10 @@ def train_model(
         seed = jax.device_put(jax.random.key_data(jax.random.key(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
-            """A run may go on for more steps, or fewer, from where the rate did not depend on their number."""
+            """A run may go on for more steps, or fewer, from where the rate did not depend on their number; not if it has
+            more of them already."""
             same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
-            return ("train.steps",) if step <= same else ()
+            return ("train.steps",) if step <= min(same, config.steps) else ()
 
         return fit(
             step,

@@ -84,6 +84,12 @@ def test_a_finished_run_is_not_run_again(unbroken):
     assert equal_trees(again.state, first.state)
 
 
+def test_a_run_that_has_more_steps_than_are_asked_for_is_not_taken_for_one_of_fewer(unbroken):
+    run_dir, _ = unbroken
+    with pytest.raises(CheckpointError, match="train.steps: 6 -> 4"):
+        train(run_dir, config=train_config(steps=4))
+
+
 @pytest.mark.slow
 def test_a_constant_rate_run_may_be_lengthened_and_another_not(tmp_path: Path):
     train(tmp_path)
