@@ -36,7 +36,10 @@ class Terminated(KeyboardInterrupt):
 
 
 _raised: list[Exit] = []
-"""Requests whose exceptions were raised in a block that has not ended."""
+"""Requests whose exceptions were raised in a block that has not ended, or that were handed on there."""
+
+_blocks = 0
+"""Of `terminated_like_interrupted`, that have not ended."""
 
 
 @contextmanager
@@ -58,22 +61,33 @@ def terminated_like_interrupted() -> Iterator[None]:
         _raised.append(Exit(128 + number))
         raise KeyboardInterrupt if number == signal.SIGINT else Terminated
 
+    global _blocks
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may install handlers
         return
     before = {signal.SIGTERM: signal.signal(signal.SIGTERM, stop)}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # otherwise it is ignored, or handled already
         before[signal.SIGINT] = signal.signal(signal.SIGINT, stop)
+    _blocks += 1
     try:
         yield
     finally:
+        _blocks -= 1
         _raised.clear()
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
+def hand_on(request: Exit) -> None:
+    """A request to stop that came too late for what had taken the signals for itself: `lost_request` tells what comes
+    after it. Where no block of `terminated_like_interrupted` asks for that, it is forgotten."""
+    if _blocks:
+        _raised.append(request)
+
+
 def lost_request() -> Exit | None:
-    """A request to stop whose exception has come to nothing, as it does in a callback of a library; told once.
+    """A request to stop whose exception has come to nothing, as it does in a callback of a library, or that was handed
+    on; told once.
 
     For what takes long to ask now and then, before it ends a block of `terminated_like_interrupted` itself.
     """

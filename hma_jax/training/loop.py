@@ -29,7 +29,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hma_jax.runtime.exits import Exit, lost_request
+from hma_jax.runtime.exits import Exit, hand_on, lost_request
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer, meet
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
@@ -252,7 +252,8 @@ class _Stop(threading.Event):
 
 @contextmanager
 def _stop_requests() -> Iterator[_Stop]:
-    """An event set by SIGINT or SIGTERM; a second signal acts as usual."""
+    """An event set by SIGINT or SIGTERM; a second signal acts as usual. A request that the block has not heeded is for
+    what comes after it."""
     event = _Stop()
     if threading.current_thread() is not threading.main_thread():
         yield event  # only the main thread may install handlers
@@ -272,6 +273,8 @@ def _stop_requests() -> Iterator[_Stop]:
         event.set()
     try:
         yield event
+        if event.is_set():  # in the last step, after which there is nothing left to stop here
+            hand_on(event.exit)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.runtime.exits import Exit, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, Terminated, raise_lost_request, terminated_like_interrupted
 from hma_jax.training.claim import RunBusy, locked_run
 from hma_jax.training.divergence import DivergedError
 from hma_jax.training.loop import Interrupted, LoopOptions, Watch
@@ -263,3 +263,19 @@ def test_a_request_that_was_lost_before_training_stops_it_after_a_step(tmp_path:
         with pytest.raises(Interrupted) as stopped:
             fit_toy(tmp_path, steps=1000)
     assert stopped.value.exit == Exit.STOPPED and list_steps(tmp_path / "checkpoints") == [1]
+
+
+def test_a_request_in_the_last_step_stops_what_comes_after_training(tmp_path: Path):
+    """A trial's evaluation, say, which may take longer than its training."""
+
+    def stop(step: int, steps: int, metrics: dict) -> None:
+        if step == steps:
+            signal.raise_signal(signal.SIGTERM)
+
+    with terminated_like_interrupted():
+        fit_toy(tmp_path / "trial", progress=stop)
+        assert list_steps(tmp_path / "trial" / "checkpoints") == [6]
+        with pytest.raises(Terminated):
+            raise_lost_request()
+    fit_toy(tmp_path / "by itself", progress=stop)
+    fit_toy(tmp_path / "the next", steps=3)  # is not stopped by what nobody asked for
