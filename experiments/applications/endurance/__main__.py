@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -48,21 +49,28 @@ KINDS: tuple[Kind, ...] = ("behaviour", "extremes", "alternation")
 TABLE = "endurance.csv"
 SAID = (
     "psnr", "psnr_still", "tool_found", "tool_close", "object_found", "object_close", "follows", "moves",
-    "true_follows", "true_tool_close", "true_object_close", "histogram",
+    "steers", "true_follows", "true_steers", "true_tool_close", "true_object_close", "histogram",
 )  # fmt: skip
 """Measures that are printed."""
 
 
-def film_path(out: Path, name: str, variant: str, kind: Kind, minutes: float, which: int) -> Path:
-    return out / "films" / f"{name}-{variant}-{kind}-{minutes:g}-{which}.npz"
+def film_path(
+    out: Path, name: str, variant: str, kind: Kind, minutes: float, which: int, robots: Sequence[str]
+) -> Path:
+    """`robots`: those that were asked for, none if all of the run are filmed."""
+    return out / "films" / f"{'-'.join([name, variant, kind, f'{minutes:g}', str(which), *robots])}.npz"
 
 
 def run_variant(
-    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int, update
+    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int, asked: Sequence[str], update
 ) -> dict[str, Film]:
-    """All robots of a run that the suite knows, each from its start number `which` on, in one batch."""
+    """The robots `asked` for, or all of a run that the suite knows, each from its start number `which` on, in one
+    batch. Raises ConfigError for one that is not there."""
     simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
     robots = native_robots(simulator.robots)
+    for name in asked:
+        require(name in robots, f"--robots {name}: {run} has {', '.join(robots)}")
+    robots = {name: robots[name] for name in asked} or robots
     decode = replace(find_decode(run), **VARIANTS[variant])
     options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
     simulator = load_simulator(run, **options)
@@ -80,6 +88,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
     parser.add_argument("--minutes", type=float, default=10.0, help="of simulated time")
     parser.add_argument("--starts", type=int, default=1, help="of each robot")
+    parser.add_argument("--robots", nargs="+", default=[], metavar="ROBOT", help="only these of the run")
     parser.add_argument("--variants", nargs="+", default=["shipped"], choices=list(VARIANTS), metavar="NAME")
     parser.add_argument("--drives", nargs="+", default=["behaviour"], choices=KINDS)
     parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
@@ -100,17 +109,18 @@ def main() -> None:
         for variant in asked.variants:
             new: list[Row] = []
             for which in range(asked.starts):
-                path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which)
+                path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which, asked.robots)
                 if not path.exists():
                     with step(f"{variant}, {kind}, {asked.minutes:g} min, start {which}") as update:
-                        made = run_variant(asked.run, detector, variant, kind, asked.minutes, which, update)
+                        options = (variant, kind, asked.minutes, which, asked.robots)
+                        made = run_variant(asked.run, detector, *options, update)
                     save_films(made, path)
                 films = load_films(path)
                 hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
                 new += rows_of(f"{asked.name}/{variant}", kind, which, films, hz, tools, asked.every)
             show(new)
             rows += new
-            draw_sheet(films, asked.out / f"{asked.name}-{variant}-{kind}.png")
+            draw_sheet(films, asked.out / f"{'-'.join([asked.name, variant, kind, *asked.robots])}.png")
             console.print(f"columns: frames {', '.join(map(str, shown_frames(films)))}", soft_wrap=True)
     table, curves = asked.out / asked.table, (asked.out / asked.table).with_suffix(".png")
     write_rows(table, rows)

@@ -16,11 +16,15 @@ from experiments.applications.scenes import SEEN
 STILL = 1e-3
 """Pixels: what varies less does not move."""
 
+STEP = 1.0
+"""Pixels: where a tool goes by less from a frame to the next, its direction is not told."""
+
 Row = dict[str, object]
 
 MEASURES = (
     "psnr", "psnr_still", "tool_found", "tool_close", "tool_px", "object_found", "object_close", "object_px", "follows",
-    "moves", "true_tool_close", "true_object_close", "true_follows", "true_moves", "level", "variance", "histogram",
+    "moves", "steers", "true_tool_close", "true_object_close", "true_follows", "true_moves", "true_steers", "level",
+    "variance", "histogram",
 )  # fmt: skip
 
 
@@ -48,13 +52,25 @@ def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
 
 def motion(true: np.ndarray, seen: np.ndarray, there: np.ndarray, prefix: str) -> dict[str, float]:
     """How the motion of tools [n, M, 2] that is seen follows what the commands do in the true simulator, from frame to
-    frame where a tool is in view: `follows`, Pearson's correlation of displacements across and down, their mean, and
-    `moves`, of how far they go alone, which does not mind that a robot stands otherwise than in truth."""
+    frame where a tool is in view. Pearson's correlations: `follows`, of displacements across and down, their mean;
+    `moves`, of how far they go alone; `steers`, of displacements along and aside of the one before, their mean. The last
+    two do not mind that a robot is turned otherwise than in truth, as one whose commands are velocities in its own frame
+    will be after the first error; `steers` minds where it goes from there."""
     both = there[1:] & there[:-1]
-    asked, done = np.diff(true, axis=0)[both], np.diff(seen, axis=0)[both]
-    pairs = {"follows": [(asked[:, a], done[:, a]) for a in (0, 1)]}
-    pairs["moves"] = [(np.linalg.norm(asked, axis=-1), np.linalg.norm(done, axis=-1))]
+    asked, done = np.diff(true, axis=0), np.diff(seen, axis=0)
+    pairs = {"follows": [(asked[both][:, a], done[both][:, a]) for a in (0, 1)]}
+    pairs["moves"] = [(np.linalg.norm(asked[both], axis=-1), np.linalg.norm(done[both], axis=-1))]
+    told = both[1:] & both[:-1] & (np.linalg.norm(asked[:-1], axis=-1) >= STEP)
+    turned, seen_turned = _from_the_one_before(asked)[told], _from_the_one_before(done)[told]
+    pairs["steers"] = [(turned.real, seen_turned.real), (turned.imag, seen_turned.imag)]
     return {prefix + name: float(np.mean([_correlation(*pair) for pair in some])) for name, some in pairs.items()}
+
+
+def _from_the_one_before(displacements: np.ndarray) -> np.ndarray:
+    """Complex [n - 1, M]: displacements [n, M, 2] along and aside of the direction of the one before, 0 without any."""
+    z = displacements[..., 0] + 1j * displacements[..., 1]
+    length = np.abs(z[:-1])
+    return z[1:] * z[:-1].conj() / np.where(length > 0, length, 1.0)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

@@ -9,7 +9,7 @@ import pytest
 from experiments.applications.endurance.__main__ import main
 from experiments.applications.endurance.films import Film, colours_of, load_films, save_films
 from experiments.applications.endurance.hidden import LEAST, find_events
-from experiments.applications.endurance.tables import measure, over_robots, read_rows, rows_of
+from experiments.applications.endurance.tables import measure, motion, over_robots, read_rows, rows_of
 from experiments.applications.tables import write_rows
 from hma_jax.config import ConfigError
 
@@ -57,6 +57,24 @@ def test_motion_follows_or_does_not():
     follows, moves = seen(64 - true)
     assert follows < -0.999 and moves > 0.999
     assert seen(np.full_like(true, 30.0)) == (0.0, 0.0)
+
+
+def test_a_robot_that_is_turned_otherwise_still_steers():
+    """Its heading drifts by two turns, and it does what it is told; mirrored it turns the other way."""
+    rng = np.random.default_rng(0)
+    steps = rng.uniform(1, 6, N) * np.exp(1j * np.cumsum(rng.normal(0, 0.4, N)))
+
+    def seen(path: np.ndarray) -> dict[str, float]:
+        position = np.stack([path.real, path.imag], -1)[:, None].astype(np.float32)
+        return motion(np.stack([true.real, true.imag], -1)[:, None], position, np.ones((N, 1), bool), "")
+
+    true = np.cumsum(steps)
+    drifting = seen(np.cumsum(steps * np.exp(4j * np.pi * np.arange(N) / N)))
+    assert abs(drifting["follows"]) < 0.3 and drifting["moves"] > 0.999 and drifting["steers"] > 0.99
+    assert seen(true.conj())["steers"] == pytest.approx(0.0, abs=1e-5)  # 1 along, -1 aside
+    other = np.cumsum(rng.uniform(1, 6, N) * np.exp(1j * np.cumsum(rng.normal(0, 0.4, N))))
+    assert abs(seen(other)["steers"]) < 0.2
+    assert seen(np.zeros(N))["steers"] == 0.0
 
 
 def test_rows_are_of_whole_parts_and_are_read_again(tmp_path):
