@@ -121,4 +121,6 @@ def rate_interval(successes: np.ndarray) -> Interval:
     n, rate, z = len(successes), float(np.mean(successes)), 1.959964
     centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    return Interval(rate, math.sqrt(rate * (1 - rate) / n), centre - half, centre + half, n, n)
+    low = centre - half if rate > 0 else 0.0  # to the last bit, or a figure's error bar would have a negative length
+    high = centre + half if rate < 1 else 1.0
+    return Interval(rate, math.sqrt(rate * (1 - rate) / n), low, high, n, n)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.suite.environment import Environment
+from experiments.applications.plan_actions import draw, summarise
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Units
 from experiments.applications.planning.goals import to_picture
@@ -110,3 +111,10 @@ def test_the_learned_model_imagines_again_from_the_same_present():
     assert (model.imagine(other) != imagined).any()
     np.testing.assert_array_equal(model.imagine(first), imagined)
     assert (to_picture(imagined[0, -1])(imagined) < to_picture(255 - imagined[0, -1])(imagined)).all()
+
+
+def test_a_figure_shows_planners_that_always_or_never_succeed(tmp_path):
+    episode = {"distance": 0.1, "seconds": 1.0}
+    tried = {"MPPI in the model": [episode | {"success": True}] * 50, "random actions": [episode | {"success": False}] * 5}
+    draw(summarise(tried), tmp_path / "planning.png")
+    assert (tmp_path / "planning.png").exists()

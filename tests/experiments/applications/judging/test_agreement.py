@@ -35,6 +35,8 @@ def test_intervals_of_rates_hold_at_the_ends():
     none, some = rate_interval(np.zeros(50)), rate_interval(np.arange(50) < 25)
     assert none.low == pytest.approx(0, abs=1e-12) and none.high == pytest.approx(0.0713, abs=1e-3)
     assert (some.low, some.high) == (pytest.approx(0.3664, abs=1e-3), pytest.approx(0.6336, abs=1e-3))
+    for n in range(1, 300):  # of which rounding takes a third beyond the ends
+        assert rate_interval(np.zeros(n)).low == 0 and rate_interval(np.ones(n)).high == 1
 
 
 def test_a_share_of_episodes_takes_policies_and_starts_for_what_varies():
