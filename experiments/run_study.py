@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
+from experiments.cost import devices_of
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console
@@ -54,6 +55,7 @@ def run_study(
 
     study, workspace = setting.study, setting.workspace
     launcher.require_installed()
+    devices_of(study.execution.mesh, launcher.share())  # or every trial would fail, once all is prepared
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials

@@ -27,6 +27,8 @@ from hma_jax.config import (
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
+    check_micro_batches,
+    check_objective,
     require,
 )
 from hma_jax.config.json import from_dict, to_dict
@@ -182,6 +184,9 @@ class Study:
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
             require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
         self._check_tokens()
+        # As training asks for them, which comes after data and tokenizer were made.
+        check_objective(self.model, self.train.masking)
+        check_micro_batches(self.train.batch, self.execution.accumulate)
         require(not self.train.seed, f"train.seed: a trial has one of seeds; set seeds={self.train.seed}")
         for name in ("tau", "flops_per_second"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")

@@ -115,6 +115,7 @@ def train_model(
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
     the run `begin` on where one is given, which knows its robots."""
     _check(setting, run, trajectories, options)
+    _require_devices(setting)
     _prepare(setting, replace)
     start = {}
     if begin is not None:
@@ -155,6 +156,7 @@ def adapt_model(
     run = run or setting.workspace.root / "model"
     require_another_place(source, run)
     _check(setting, run, trajectories, options)
+    _require_devices(setting)
     _prepare(setting, replace)
     study, new = setting.study, strangers(trained, setting)
     only = () if everything else tuple(new)
@@ -190,6 +192,14 @@ def _require_trained_here(setting: Setting, run: Path) -> None:
         f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
         f"{setting.command('train', '--from', run)} --run NEW",
     )
+
+
+def _require_devices(setting: Setting) -> None:
+    """Raises ConfigError, before any work, for a mesh that does not fit the devices here, the batch or the model."""
+    from hma_jax.runtime.mesh import check_mesh, make_mesh
+
+    study, execution = setting.study, setting.study.execution
+    check_mesh(make_mesh(execution.mesh), study.model, study.train.batch, execution.accumulate)
 
 
 def _prepare(setting: Setting, replace: Step | None) -> None:

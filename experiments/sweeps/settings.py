@@ -41,11 +41,6 @@ def plan(study: Study) -> Sweep:
         f"train.masking.setting is {default!r}, which predicts no frames to judge; use one of "
         f"{', '.join(NAMES)}",
     )
-    require(
-        study.model.action_heads or not study.train.masking.predicts_actions,
-        f"train.masking.setting is {default!r}, and model.action_heads false: nothing predicts its actions; add --set "
-        "model.action_heads=true",
-    )
     released = replace(study.train, masking=replace(study.train.masking, teacher_forcing=False))
     return make_ablation(
         replace(study, train=released),

@@ -19,7 +19,15 @@ from hma_jax.config.pretrained_tokenizers import (
     TokenGrid,
 )
 from hma_jax.config.tokenizer import TokenizerConfig, TokenizerTrainConfig
-from hma_jax.config.training import MaskingConfig, OptimizerConfig, Setting, TrainConfig, Weights
+from hma_jax.config.training import (
+    MaskingConfig,
+    OptimizerConfig,
+    Setting,
+    TrainConfig,
+    Weights,
+    check_micro_batches,
+    check_objective,
+)
 
 __all__ = [
     "AnyTokenizerConfig",
@@ -47,5 +55,7 @@ __all__ = [
     "TokenizerTrainConfig",
     "TrainConfig",
     "Weights",
+    "check_micro_batches",
+    "check_objective",
     "require",
 ]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from hma_jax.config.base import check_choices, require
+from hma_jax.config.model import ModelConfig
 
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
@@ -149,3 +150,41 @@ class TrainConfig:
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"train.batch must be at least 1, got {self.batch}")
         require(0 <= self.ema_decay < 1, f"train.ema_decay must lie in [0, 1), got {self.ema_decay}")
+
+
+# --- What must fit each other ------------------------------------------------------------------
+
+
+def check_objective(model: ModelConfig, masking: MaskingConfig) -> None:
+    """Raises ConfigError for an objective that `model` cannot be trained for."""
+    setting = masking.setting
+    require(
+        model.action_heads or not masking.predicts_actions,
+        f"train.masking.setting {setting!r} predicts actions, but the model has nothing to predict "
+        "them with; set model.action_heads=true",
+    )
+    require(
+        model.concat or not masking.predicts_actions,
+        f"train.masking.setting {setting!r} predicts actions from action tokens, of which "
+        f"model.conditioning {model.conditioning!r} has none; choose one with concat",
+    )
+    require(
+        model.frames > 1 or not masking.predicts_frames,
+        f"train.masking.setting {setting!r} predicts frames from earlier ones, and model.frames 1 leaves none to "
+        "predict; set model.frames to at least 2",
+    )
+    require(
+        model.diffusion is None or not masking.own_past,
+        "train.masking.own_past draws ids; continuous tokens have none",
+    )
+    require(
+        model.diffusion is None or masking.change_weight == 1,
+        "train.masking.change_weight tells ids that changed; of continuous tokens all change",
+    )
+
+
+def check_micro_batches(batch: int, accumulate: int) -> None:
+    """Raises ConfigError for a batch that does not split into so many micro-batches."""
+    require(
+        batch % accumulate == 0, f"train.batch {batch} is not a multiple of execution.accumulate {accumulate}"
+    )

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from einops import rearrange
 
-from hma_jax.config import ModelConfig, TrainConfig, require
+from hma_jax.config import ModelConfig, TrainConfig, check_micro_batches, check_objective, require
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
@@ -44,32 +44,10 @@ def make_train_step(
     its hidden actions, whatever the number of micro-batches. Randomness is fold_in(seed, step),
     then the example's row.
     """
-    require(
-        config.batch % accumulate == 0,
-        f"train.batch {config.batch} is not a multiple of execution.accumulate {accumulate}",
-    )
+    check_micro_batches(config.batch, accumulate)
     schedule = make_schedule(config.optimizer, config.steps)
     masking = config.masking
-    require(
-        model.action_heads or not masking.predicts_actions,
-        f"train.masking.setting {masking.setting!r} predicts actions, but the model has nothing to predict "
-        "them with; set model.action_heads=true",
-    )
-    require(
-        model.concat or not masking.predicts_actions,
-        f"train.masking.setting {masking.setting!r} predicts actions from action tokens, of which "
-        f"model.conditioning {model.conditioning!r} has none; choose one with concat",
-    )
-    require(
-        model.frames > 1 or not masking.predicts_frames,
-        f"train.masking.setting {masking.setting!r} predicts frames from earlier ones, and model.frames 1 leaves none to "
-        "predict; set model.frames to at least 2",
-    )
-    require(not (masking.own_past and model.diffusion), "train.masking.own_past draws ids; continuous tokens have none")
-    require(
-        masking.change_weight == 1 or not model.diffusion,
-        "train.masking.change_weight tells ids that changed; of continuous tokens all change",
-    )
+    check_objective(model, masking)
     multipliers = jax.tree.map(
         lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
     )

@@ -64,11 +64,8 @@ def test_the_default_is_where_the_study_is():
     sweep = settings_axis.plan(study)
     assert sweep.label(sweep.reference_x) == "passive"
     with pytest.raises(ConfigError, match="train.masking.setting is 'policy'"):
-        masking = replace(passive, setting="policy")
-        settings_axis.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
-    masking = replace(SMOKE.train.masking, setting="full")
-    with pytest.raises(ConfigError, match="nothing predicts its actions; add --set model.action_heads=true"):
-        settings_axis.plan(replace(SMOKE, train=replace(SMOKE.train, masking=masking)))
+        train = replace(SMOKE.train, masking=replace(passive, setting="policy"))
+        settings_axis.plan(replace(SMOKE, train=train, model=replace(SMOKE.model, action_heads=True)))
 
 
 @pytest.mark.parametrize("study", PLAIN.values(), ids=PLAIN)

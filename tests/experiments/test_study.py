@@ -128,6 +128,9 @@ def test_lists_of_names_are_written_without_quotes_wherever_they_are():
         ("trial_seconds=-1", "trial_seconds must not be negative"),
         ("designs.rate_factors=2,1", "designs.rate_factors must increase and be positive"),
         ("widths=a,b", "not a number"),
+        # What training would refuse, once data and tokenizer are made.
+        ("train.masking.setting=full", "has nothing to predict them with; set model.action_heads=true"),
+        ("execution.accumulate=3", "train.batch 4 is not a multiple of execution.accumulate 3"),
     ],
 )
 def test_wrong_override_names_the_field(setting, message):

@@ -88,6 +88,21 @@ def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch,
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("command", ["train", "adapt", "sweep"])
+def test_a_mesh_that_does_not_fit_is_refused_before_anything_is_prepared(command, where, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
+    monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", ("0",)))
+    study = [*SMOKE, "--out", str(tmp_path / "out"), "--data", *where[where.index("--data") + 1 :], "--mesh", "3", "1", "1"]
+    more = {"train": [], "sweep": ["width"]}
+    if command == "adapt":
+        more[command] = [str(make_released(tmp_path / "a", as_registered(ARM)))]
+        config = get_preset("smoke").tokenizer
+        save_tokenizer(LfqTokenizer(config, declare_tokenizer(config).init(0)), tmp_path / "a" / "tokenizer")
+    assert main([command, *more[command], *study]) == 2
+    said = capsys.readouterr().err
+    assert "a mesh of data=3, fsdp=1, tensor=1 does not fit 1 device(s); set one axis to -1" in said
+
+
 def test_fewer_trajectories_when_asked_for(train):
     said, trial, _ = train("--trajectories", "3")
     assert trial.max_trajectories == 3
