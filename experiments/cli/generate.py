@@ -92,10 +92,14 @@ def generate(
         console.print(f"left out {left:,} x: {reason}", markup=False, soft_wrap=True)
     with step("compare with the recordings") as update:
         found = compare(done.directory, recorded, given, clips, source.hz, update)
+    made, still = found
+    counted, of_made, of_still = "1 episode", " (one alone has no interval)", ""
+    if done.episodes > 1:
+        counted = f"{done.episodes:,} episodes"
+        of_made = f" ({made.low:.2f} to {made.high:.2f}, 95 % over episodes)"
+        of_still = f" ({still.low:.2f} to {still.high:.2f})"
     console.print(
-        f"{done.episodes:,} episodes. PSNR against the recording {found.generated.mean:.2f} dB "
-        f"({found.generated.low:.2f} to {found.generated.high:.2f}, 95 % over episodes); a still picture "
-        f"{found.still.mean:.2f} ({found.still.low:.2f} to {found.still.high:.2f})",
+        f"{counted}. PSNR against the recording {made.mean:.2f} dB{of_made}; a still picture {still.mean:.2f}{of_still}",
         soft_wrap=True,
     )
     written = [done.directory, done.directory.parent / "psnr.csv"]

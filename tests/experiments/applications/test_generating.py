@@ -91,6 +91,8 @@ def test_recorded_actions_are_replayed_and_a_killed_command_goes_on(run, recorde
 
 def test_what_was_made_under_other_ranges_of_actions_is_not_taken_for_the_same(run, recorded, tmp_path, capsys):
     assert generate(run, recorded, tmp_path, "--episodes", "1") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 episode. PSNR" in said and "(one alone has no interval); a still" in said and "nan" not in said
     save_robots([replace(ROBOT, low=tuple(x / 2 for x in ROBOT.low))], run / "robots.json")
     try:
         assert generate(run, recorded, tmp_path, "--episodes", "1") == 2
