@@ -37,7 +37,7 @@ def read_object(path: Path | UPath, *, if_missing: str, advice: str) -> dict[str
 
 def read_json(path: Path | UPath, *, if_missing: str, advice: str) -> Any:
     """As `read_object`, of any kind of value."""
-    return _parse(_read(path, if_missing, advice), path, advice)
+    return _parse(_read(path, if_missing), path, advice)
 
 
 def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -59,7 +59,7 @@ def read_lines(path: Path, *, if_missing: str, advice: str) -> Iterator[tuple[in
         raise DataError(f"{path} cannot be read ({error}). {advice}") from error
 
 
-def _read(path: Path | UPath, if_missing: str, advice: str) -> bytes:
+def _read(path: Path | UPath, if_missing: str) -> bytes:
     try:
         return read_start(path, MOST_BYTES + 1)
     except FileNotFoundError:

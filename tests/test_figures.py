@@ -21,7 +21,7 @@ from tests.pages import table
 
 ROOT = Path(__file__).parents[1]
 README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
-STUDY, ABLATIONS, BENCH = (ROOT / "experiments" / "results" / name for name in ("cpu", "ablations", "bench/cpu"))
+STUDY, BENCH = (ROOT / "experiments" / "results" / name for name in ("cpu", "bench/cpu"))
 
 TRAINED = {
     "untrained (vocabulary 65,536)": ("width", 48, "untrained"),

@@ -42,9 +42,9 @@ def require_same_windows(a: WindowTable, b: WindowTable) -> list[str]:
             theirs = b.of(robot).matched_to(mine)
         except ConfigError as error:
             raise NotComparable(f"{robot}: {error}") from error
-        _require_equal(mine, theirs, mine.frames, theirs.frames, "real frames", 0)
+        _require_equal(mine, mine.frames, theirs.frames, "real frames", 0)
         if TRUTH in mine.metrics and TRUTH in theirs.metrics:
-            _require_equal(mine, theirs, mine.metrics[TRUTH], theirs.metrics[TRUTH], f"dB of {TRUTH}", SAME)
+            _require_equal(mine, mine.metrics[TRUTH], theirs.metrics[TRUTH], f"dB of {TRUTH}", SAME)
     return shared
 
 
@@ -56,12 +56,11 @@ def agree(a: WindowTable, b: WindowTable) -> bool:
     return not both or bool((np.abs(a.metrics[TRUTH] - b.metrics[TRUTH]) <= SAME).all())
 
 
-def _require_equal(
-    a: WindowTable, b: WindowTable, mine: np.ndarray, theirs: np.ndarray, what: str, tolerance: float
-) -> None:
+def _require_equal(table: WindowTable, mine: np.ndarray, theirs: np.ndarray, what: str, tolerance: float) -> None:
+    """Raises NotComparable, naming the first window of `table` whose numbers differ."""
     other = np.flatnonzero(~(np.abs(mine - theirs) <= tolerance))
     if len(other):
-        robot, episode, start = a.names[other[0]]
+        robot, episode, start = table.names[other[0]]
         raise NotComparable(
             f"window ({robot}, episode {episode}, frame {start}) is not the same one in both: {mine[other[0]]:g} and "
             f"{theirs[other[0]]:g} {what} (and {len(other) - 1} others of {robot}); compare trials of one frozen set of "

@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import numpy as np
 
 from hma_jax.config import TokenizerConfig, require
-from hma_jax.model.frames import factorise
 from hma_jax.model.params import Params
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer
-from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.quantizer import ids_to_codes, latents_to_ids
 
 
@@ -31,14 +28,3 @@ class LfqTokenizer(AutoencoderTokenizer):
 
     def _to_latents(self, tokens: jax.Array) -> jax.Array:
         return ids_to_codes(tokens, self.config.bits)
-
-
-def code_usage(tokenizer: Tokenizer, images: np.ndarray) -> tuple[float, ...]:
-    """Perplexity of each factor's code distribution over all positions of `images`; at most V."""
-    digits = np.asarray(factorise(tokenizer.encode(images), tokenizer.factors, tokenizer.factor_vocab))
-    usage = []
-    for factor in range(tokenizer.factors):
-        counts = np.bincount(digits[..., factor].ravel())
-        p = counts[counts > 0] / counts.sum()
-        usage.append(float(np.exp(-np.sum(p * np.log(p)))))
-    return tuple(usage)

@@ -18,7 +18,7 @@ from hma_jax.tokenizers import quantizer
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer, reconstruction_psnr
 from hma_jax.tokenizers.base import PIECE, in_pieces
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
-from hma_jax.tokenizers.lfq import LfqTokenizer, code_usage
+from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.quantizer import (
     commitment,
     ids_to_codes,
@@ -223,17 +223,6 @@ def test_ids_that_cannot_be_decoded_are_refused(discrete):
     for wrong in (-1, 64):
         with pytest.raises(ConfigError, match=r"must lie in \[0, 64\)"):
             discrete.decode(ids + wrong)
-
-
-def test_code_usage_counts_codes_of_each_factor():
-    class Constant:
-        factors, factor_vocab = 2, 8
-
-        def encode(self, images):
-            return images
-
-    low_digit_only = np.arange(8, dtype=np.int32)[None]
-    assert code_usage(Constant(), low_digit_only) == pytest.approx((8.0, 1.0))
 
 
 # --- Training --------------------------------------------------------------------------------

@@ -30,7 +30,7 @@ KINDS = {
 
 
 def save_policy(policy: ChunkPolicy, directory: Path, about: Mapping[str, Any] | None = None) -> None:
-    """Replaces `directory`, whole or not at all. `about` is kept beside it: robot, task, step, seed."""
+    """Replaces `directory`, whole or not at all. `about` stands in its description: robot, task, step, seed."""
     making = directory.with_name(f".{directory.name}.{secrets.token_hex(4)}.tmp")
     making.mkdir(parents=True)
     try:
@@ -61,11 +61,6 @@ def load_policy(directory: Path) -> ChunkPolicy:
     scale = from_dict(Scale, description["scale"], f"{directory}: scale")
     wanted = jax.eval_shape(lambda: init(config, len(scale.mean), 0))
     return cls(config, unnamed(weights, wanted, directory), scale)
-
-
-def about_policy(directory: Path) -> dict[str, Any]:
-    """What `save_policy` was told."""
-    return json.loads((directory / DESCRIPTION).read_text())["about"]
 
 
 def named(params: Any) -> dict[str, np.ndarray]:

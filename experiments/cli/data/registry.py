@@ -145,7 +145,7 @@ def data_inspect(
             f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
             f"{windows.total:,.0f} windows in the split"
         )
-    _print_entry(facts, known, suggestion)
+    _print_entry(known, suggestion)
     folder = out or sheets / facts.name
     folder.mkdir(exist_ok=True)
     blank = [c.key for c in facts.cameras if c.is_blank]
@@ -207,7 +207,7 @@ def print_facts(facts: Facts) -> None:
         console.print(table)
 
 
-def _print_entry(facts: Facts, known: DatasetSpec | None, suggestion: Suggestion | None) -> None:
+def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> None:
     if suggestion is None:
         console.print("[yellow]no entry[/]: the dataset has no camera of three colours")
         return
