@@ -201,6 +201,13 @@ def known_robots(robots: Mapping[str, Robot]) -> dict[str, Robot]:
     return known
 
 
+def chosen(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
+    """Those of `names`, or all. Raises ConfigError for one that is not there."""
+    unknown = sorted(set(names) - set(robots))
+    require(not unknown, f"--robots: {', '.join(unknown)} cannot be watched; there are {', '.join(robots)}")
+    return {name: robot for name, robot in robots.items() if not names or name in names}
+
+
 def make_detector(robots: Sequence[str], tokenizer, out: Path) -> Detector:
     """Trains one on frames as `tokenizer` takes and shows them; writes it and its own errors into `out`."""
     episodes = max(EPISODES // len(robots), FEWEST)

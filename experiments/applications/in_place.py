@@ -19,7 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.suite.simulator import SPECS
-from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector, enlarged, known_robots, make_detector, shown_by
+from experiments.applications.detector import (
+    CLOSE, SURE, WEIGHTS, Detector, chosen, enlarged, known_robots, make_detector, shown_by,
+)  # fmt: skip
 from experiments.applications.endurance.tables import Row, over_robots
 from experiments.applications.made_with import claim
 from experiments.applications.scenes import Points, point_names, points_of
@@ -90,13 +92,6 @@ def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
         if float(row["moved_px"]) > CLOSE  # not of what came into view
     ]
     return over_robots(near, "near") if near else (float("nan"), float("nan"), 0)
-
-
-def chosen(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
-    """Those of `names`, or all. Raises ConfigError for one that is not there."""
-    unknown = sorted(set(names) - set(robots))
-    require(not unknown, f"--robots: {', '.join(unknown)} cannot be watched; there are {', '.join(robots)}")
-    return {name: robot for name, robot in robots.items() if not names or name in names}
 
 
 def main() -> None:

@@ -446,6 +446,20 @@ def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
     assert f"Of tools it is {share(tools)}, of objects {share(objects)}. The tokens are not what limits it: {as_tokens}." in page
 
 
+def test_where_things_stand_in_models_of_eight_robots_is_as_the_page_on_designs_says():
+    page = " ".join((ROOT / "docs" / "designs.md").read_text().split())
+    for name, place in (("weighed", "two cores train"), ("grown", "what-made-the-difference")):
+        rows = in_place_rows(name)
+        kinds = (rows, *([r for r in rows if r["what"].startswith(kind)] for kind in ("tool", "colour")))
+        (whole, half, robots), (tools, *_), (objects, *_) = (in_place(kind, "model") for kind in kinds)
+        text = page.partition(f"results/in_place/{name}.csv")
+        assert robots == 8 and f"{100 * whole:.0f} ± {100 * half:.0f} %" in text[0][-150:], name
+        assert place in text[0][-150:]
+        assert text[2].startswith(f"); tools {100 * tools:.0f} %, objects {100 * objects:.0f} %)"), name
+        assert f"as their tokenizer shows them {100 * in_place(rows, 'tokens')[0]:.0f} %" in page
+        assert in_place(rows, "true")[0] == 1 and in_place(rows, "still")[0] < 0.01
+
+
 def expectations() -> dict[tuple[str, str, str], Expected]:
     """{(axis, curve, x): what was written down before}."""
     return {(e.sweep, e.series, e.x): e for e in read_expected(RESULTS / "cpu-full" / "predictions" / FILE)}

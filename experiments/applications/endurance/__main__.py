@@ -19,7 +19,7 @@ from typing import Any
 
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications.detector import OUT as DETECTOR
-from experiments.applications.detector import WEIGHTS, Detector
+from experiments.applications.detector import WEIGHTS, Detector, chosen
 from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
@@ -65,12 +65,9 @@ def run_variant(
     run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int, asked: Sequence[str], update
 ) -> dict[str, Film]:
     """The robots `asked` for, or all of a run that the suite knows, each from its start number `which` on, in one
-    batch. Raises ConfigError for one that is not there."""
+    batch."""
     simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
-    robots = native_robots(simulator.robots)
-    for name in asked:
-        require(name in robots, f"--robots {name}: {run} has {', '.join(robots)}")
-    robots = {name: robots[name] for name in asked} or robots
+    robots = chosen(native_robots(simulator.robots), asked)
     decode = replace(find_decode(run), **VARIANTS[variant])
     options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
     simulator = load_simulator(run, **options)

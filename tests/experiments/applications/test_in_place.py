@@ -10,8 +10,8 @@ from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications import detector as detector_module
 from experiments.applications import in_place as in_place_module
-from experiments.applications.detector import Detector, as_given, as_shown, enlarged, make_detector, shown_by
-from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, chosen, in_place, watch_ends
+from experiments.applications.detector import Detector, as_given, as_shown, chosen, enlarged, make_detector, shown_by
+from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, in_place, watch_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
