@@ -64,6 +64,10 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     several = max((row.seeds for row in rows), default=1)
     seeds = f" and over {several} seeds" if several > 1 else ""
     table.caption = f"Differences with standard errors over episodes{seeds}, window by window."
+    for side, other in ((a, b), (b, a)):
+        if len(side.seeds) > several:
+            kept, there = (", ".join(map(str, x)) for x in ([s for s in side.seeds if s in other.seeds], side.seeds))
+            table.caption += f" Of the seeds of {escape(side.name)} ({there}) only {kept} is compared."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         table.caption += f" No error of {few(alone)}: one held-out episode."
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:

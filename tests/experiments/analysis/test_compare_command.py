@@ -54,7 +54,20 @@ def test_two_studies_are_compared_by_their_reference_models_over_seeds(table, tm
     assert main(["compare", *(str(tmp_path / n) for n in ("one", "two")), "--to", str(tmp_path / "c.csv")]) == 0
     overall = rows_of(tmp_path / "c.csv")[OVERALL, "cross_entropy"]
     assert overall["seeds"] == "2" and float(overall["low"]) < -0.3 < float(overall["high"])
-    assert "over 2 seeds" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert "over 2 seeds" in said and "only" not in said
+
+
+def test_seeds_of_a_study_that_the_other_has_not_are_left_out_and_it_is_said(table, tmp_path, capsys):
+    workspace = Workspace(tmp_path / "study")
+    for seed, windows in under_seeds(table, np.random.default_rng(1), 2, 0.01).items():
+        write_trial(workspace.trials, reference_trial(STUDY, seed), windows)
+    save_record(workspace, record_of())
+    one = write_trial(tmp_path / "one", reference_trial(replace(STUDY, widths=(8,)), 1), better(table))
+    assert main(["compare", str(one), str(workspace.root), "--to", str(tmp_path / "c.csv")]) == 0
+    assert rows_of(tmp_path / "c.csv")[OVERALL, "cross_entropy"]["seeds"] == "1"
+    said = " ".join(capsys.readouterr().out.split())
+    assert "Of the seeds of study (0, 1) only 1 is compared." in said
 
 
 def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path, capsys):
