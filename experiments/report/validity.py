@@ -8,9 +8,10 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from experiments.analysis.controllability import ROUNDING
 from experiments.analysis.predictions import Outcome
 from experiments.optima import Optimum
 from experiments.report.pieces import section
@@ -191,6 +192,8 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
             controls[r.trial] = max(controls.get(r.trial, r), r, key=lambda row: row.n)
     if not controls:
         return Check(name, "open", "No control, trained on shuffled actions, is finished.")
+    # What rounding leaves needs no error to be told from an effect, and has hardly one.
+    controls = {id: replace(r, mean=0.0, sem=0.0) if abs(r.mean) < ROUNDING else r for id, r in controls.items()}
     unknown = [r.trial for r in controls.values() if math.isfinite(r.mean) and math.isnan(r.sem)]
     known = [r for id, r in controls.items() if id not in unknown]
     far = max((abs(_errors(r.mean, r.sem)) for r in known), default=0.0)
@@ -209,7 +212,7 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
 
 
 def _errors(mean: float, sem: float) -> float:
-    return 0.0 if mean == 0 else mean / sem if sem else math.inf
+    return 0.0 if mean == 0 else mean / sem if sem else math.copysign(math.inf, mean)
 
 
 def _copying(robots: Sequence[Robot], whose: str) -> Check:

@@ -184,6 +184,19 @@ def test_a_control_that_follows_actions_is_bad(copied):
     assert verdicts(workspace)["controls"][0] == "bad"
 
 
+@pytest.mark.parametrize("rounded", [-2.4e-7, 0.0])
+def test_what_rounding_leaves_of_a_control_is_none_of_its_effects(copied, rounded):
+    """It scatters so little that its standard errors would say that the model follows actions."""
+    workspace, record = copied
+    [control] = trials_of(record, role=CONTROL)
+    rejudge(workspace, control, lambda m: m | {"delta_psnr": np.full_like(m["delta_psnr"], rounded)})
+    workspace.results.unlink()
+    draw(workspace, record)
+    assert verdicts(workspace)["controls"] == (
+        "good", ".</b> One control: +0.0 standard errors from zero (allowed: 3 each, 2 for the mean).",
+    )  # fmt: skip
+
+
 def test_a_control_of_one_episode_per_robot_leaves_the_question_open(copied):
     workspace, record = copied
     [control] = trials_of(record, role=CONTROL)
