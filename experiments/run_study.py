@@ -54,7 +54,8 @@ def run_study(
     from experiments.running.provenance import trial_closure
 
     study, workspace = setting.study, setting.workspace
-    launcher.require_installed()
+    with launcher.launcher(workspace.root):
+        pass  # or nothing could run, once all is prepared
     devices_of(study.execution.mesh, launcher.share())  # or every trial would fail, once all is prepared
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")

@@ -159,6 +159,16 @@ def instant_trials(monkeypatch):
     monkeypatch.setattr(Launching, "launcher", lambda *_: nullcontext())
 
 
+def test_a_place_without_its_engine_is_refused_before_anything_is_prepared(monkeypatch, tmp_path, capsys):
+    def nowhere(*_):
+        raise ConfigError("no Slurm here")
+
+    monkeypatch.setattr(Launching, "launcher", nowhere)
+    monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: pytest.fail("hours were spent on preparing"))
+    assert main(["study", "--preset", "smoke", "--out", str(tmp_path / "out")]) == 2
+    assert "no Slurm here" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
 def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp_path, capsys):
     assert main(["study", "--preset", "smoke", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr()
