@@ -19,10 +19,20 @@ Source = tuple["DatasetSpec", "Location"]
 
 
 def name_datasets(data: Sequence[str]) -> tuple[str, ...]:
-    """The names of the datasets at these locations. Raises DataError for one that is none."""
+    """The names of the datasets at these locations. Raises DataError for one that is none, ConfigError for two of one
+    name."""
     from data_pipelines.sources.open import source_name
 
-    return tuple(map(source_name, data))
+    places: dict[str, str] = {}
+    for place in data:
+        name = source_name(place)
+        require(
+            name not in places,
+            f"--data: {places.get(name)} and {place} are both the dataset {name!r}, by the name that their files give; "
+            "a study reads one directory of each: leave one out",
+        )
+        places[name] = place
+    return tuple(places)
 
 
 def find_sources(study: Study, data: Sequence[str]) -> list[Source]:

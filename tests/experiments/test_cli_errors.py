@@ -231,9 +231,11 @@ def test_wrong_number_of_action_values(tmp_path, refused):
     assert ARM.name in message and "has 5 values" in message and "2 were expected" in message
 
 
-def test_one_dataset_given_twice(arm, tmp_path, refused):
-    message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, arm)
-    assert "datasets repeat" in message and ARM.name in message
+def test_two_directories_of_one_dataset(arm, tmp_path, refused):
+    """A copy, or another version, under a directory of whatever name."""
+    other = shutil.copytree(arm, tmp_path / "corrected")
+    message = refused(2, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", arm, other)
+    assert f"{arm} and {other} are both the dataset {ARM.name!r}" in message and "leave one out" in message
 
 
 # --- Windows ---------------------------------------------------------------------------------
