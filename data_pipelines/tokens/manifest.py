@@ -78,7 +78,8 @@ class JobSettings:
     max_val: int = 200
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
-    max_val_fraction: float = 0.5  # of a dataset, whatever min_val says
+    # Of a dataset, whatever min_val says. Stores of earlier versions do not say it, and had this (`LATER`).
+    max_val_fraction: float = 0.5
 
     def __post_init__(self):
         check_bounds(self.val_fraction, self.min_val, self.max_val, self.max_val_fraction)

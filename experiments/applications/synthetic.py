@@ -89,9 +89,10 @@ from hma_jax.simulator.simulator import Simulator
 OUT = Path("runs/synthetic")
 
 JUDGED_ON = "held_out"
+"""The name of the recordings that nobody is trained on, beside those of `KINDS`."""
+
 SECOND = "without_actions.json"
 """What names the second control's model, in OUT."""
-"""The name of the recordings that nobody is trained on, beside those of `KINDS`."""
 
 BATCH = 8
 

@@ -49,10 +49,11 @@ class MaskingConfig:
     teacher_forcing: bool = False
     # With teacher forcing, of discrete tokens: past frames that the model drew itself, up to this share of them
     # (`objective.own_past`). DIFFERS: the release corrupts the past with random tokens alone (`max_corrupt_rate`, which
-    # does so here too), and in how many rounds, each after what the one before drew. A step passes over every frame
-    # once more for each.
+    # does so here too).
     own_past: float = 0.0
-    own_past_rounds: int = 1  # in which own_past is drawn, each after what the one before drew
+    # Rounds in which own_past is drawn, each after what the one before drew; a step passes over every frame once more
+    # for each.
+    own_past_rounds: int = 1
     # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
     # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
     change_weight: float = 1.0

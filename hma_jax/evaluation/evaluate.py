@@ -63,10 +63,10 @@ def evaluate(
     """Applies the protocol to `batches`, equal in shape.
 
     A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
-    and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is what the model was trained for.
-    `progress` is told the windows done so far. With several processes (`runtime.processes`) all call this with the
-    same batches, and each gets the whole result. Raises ConfigError if there is no window, or for a
-    model whose predictions are not finite.
+    and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is
+    what the model was trained for. `progress` is told the windows done so far. With several processes
+    (`runtime.processes`) all call this with the same batches, and each gets the whole result. Raises ConfigError if
+    there is no window, or for a model whose predictions are not finite.
     """
     mesh = make_mesh(execution.mesh)
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)

@@ -1,8 +1,8 @@
 """How frames enter the trunk and leave it, for both variants.
 
-Discrete: ids with one table per vocabulary factor in, what is said of each factor (`readout`) out. Continuous: latent patches
-in, out the vectors that condition the diffusion head (`heads.Denoiser`). Masked tokens enter
-as one learned vector in both.
+Discrete: ids with one table per vocabulary factor in, what is said of each factor (`readout`) out. Continuous: latent
+patches in, out the vectors that condition the diffusion head (`heads.Denoiser`). Masked tokens enter as one learned
+vector in both.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from hma_jax.kernels.dense import look_up
 from hma_jax.kernels.pointwise import replaced, scaled
 from hma_jax.model.initial import input_fan_out, trunk_init
 from hma_jax.model.layers import FINE_EPS, LayerNorm, Linear
-from hma_jax.model.readout import ChainedReadout, Readout
 from hma_jax.model.params import normal, ones, param, used, xavier_uniform, zeros
+from hma_jax.model.readout import ChainedReadout, Readout
 
 
 def factorise(tokens: jax.Array, factors: int, vocab: int) -> jax.Array:

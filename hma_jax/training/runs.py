@@ -84,7 +84,7 @@ def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[
     return today
 
 
-def load_run(run_dir: Path, weights: Weights = "last") -> Run:
+def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     """The parameters and description of a run's latest checkpoint; its moments are not read.
 
     The parameters lie on this process's default device. Raises CheckpointError if there is no
@@ -128,7 +128,7 @@ def load_run(run_dir: Path, weights: Weights = "last") -> Run:
 
 
 def load_model(
-    run_dir: Path, execution: ExecutionConfig = ExecutionConfig(), weights: Weights = "auto"
+    run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig(), weights: Weights = "auto"
 ) -> Model:
     """The model of a run's latest checkpoint, to be computed as `execution` says; its parameters are cast once,
     here.

@@ -30,7 +30,8 @@ class Validation:
     """What a run is validated on.
 
     `batches()` yields this process's rows of a few global batches, as for training, perhaps with `valid`
-    bool [B] (False: a row that only fills up) and `real` bool [B, T] (False: such a frame). It is read once; the windows stay in memory of the host.
+    bool [B] (False: a row that only fills up) and `real` bool [B, T] (False: such a frame). It is read once; the
+    windows stay in memory of the host.
     """
 
     every: int  # steps

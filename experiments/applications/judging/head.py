@@ -89,8 +89,8 @@ class SuccessHead:
         small = [np.broadcast_to(shrink_bytes(x, size), whole) for x in (first, images)]
         flat = np.stack(small, -4).reshape(-1, 2, size, size, 3)
         found = []
-        for first in range(0, len(flat), PIECE):
-            part = flat[first : first + PIECE]
+        for at in range(0, len(flat), PIECE):
+            part = flat[at : at + PIECE]
             padded = np.zeros((PIECE, *part.shape[1:]), np.uint8)
             padded[: len(part)] = part
             found.append(np.asarray(self._apply(self.params, padded))[: len(part)])
