@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.analysis.changes import find_changes
 from experiments.analysis.scaling import trunk_parameters
 from experiments.presets import CPU_FULL
 from experiments.report import page, plots
@@ -19,9 +20,11 @@ from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_r
 from experiments.running.workspace import Workspace
 from experiments.sweeps.datasets import plan as plan_datasets
 from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import unique_trials
 from experiments.sweeps.width import plan as plan_width
 from hma_jax.config import ConfigError
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
+from tests.experiments.judged import WIDE, windows_of
 
 
 @pytest.fixture(scope="module")
@@ -202,6 +205,17 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
     rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
     lines = re.findall(r"<tr><td class=text>(\d+)</td><td>([\d,]+)</td>(.*?)</tr>", describe(sweep, rows, [], Along()))
     assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [("8", "6,400", 1), ("16", "25,600", 1)]
+
+
+def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():
+    (sweep,) = plan_sweeps(WIDE, ("width",))
+    alone = {}
+    for id, trial in unique_trials([sweep], PROVENANCE).items():
+        windows = windows_of(trial)
+        alone[id] = replace(windows, episode=np.zeros_like(windows.episode), start=np.arange(len(windows)))
+    said = describe(sweep, [], [], Along(changes=find_changes([sweep], PROVENANCE, alone)))
+    assert "nats per token \u22120." in said and "One held-out episode per robot tells no interval." in said
+    assert "nan" not in said
 
 
 def test_page_without_any_finished_trial(tmp_path):
