@@ -114,7 +114,7 @@ class OptimizerConfig:
     beta1: float = 0.9  # AdamW's decay of the first moment
     beta2: float = 0.95  # and of the second
     epsilon: float = 1e-8  # AdamW's, in the denominator
-    weight_decay: float = 0.05  # of matrices
+    weight_decay: float = 0.05  # of everything but biases, as released: of gains, positions and token tables too
     clip_norm: float = 1.0  # largest norm of a gradient
     # How matrices between two widths of the trunk are moved: as everything else is, or along their momentum made
     # orthogonal (Muon; Jordan et al. 2024). DIFFERS: the release has AdamW alone. What it gains: docs/models.md.
