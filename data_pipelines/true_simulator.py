@@ -1,4 +1,5 @@
-"""True robots stepped side by side under the interface of the learned simulator: `hma_jax.simulator` says what calls mean.
+"""True robots stepped side by side under the interface of the learned simulator, which says what calls mean
+(`hma_jax.simulator`).
 
 Owns what all true simulators share; each kind says which robots it has and opens their worlds.
 """
@@ -13,9 +14,9 @@ import numpy as np
 
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
+from hma_jax.simulator.interface import chosen_episodes
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
-
 
 HISTORY = 600
 """Frames that an episode can be taken back by, as many as in a learned simulator: older states are not kept."""
@@ -86,12 +87,13 @@ class TrueSimulator(ABC, Generic[W]):
     ) -> np.ndarray:
         """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no effect."""
         del seeds
-        which = range(len(self)) if episodes is None else episodes
+        which = chosen_episodes(episodes, len(self))
         each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
         require(len(each) == len(which), f"{len(which)} episodes need as many starts, got {len(each)}")
-        for b, start in zip(which, each, strict=True):
+        for start in each:
             require(start.robot in self.robots, f"no robot {start.robot!r} here; there are {', '.join(self.robots)}")
             require(start.seed is not None, f"the start of {start.robot} does not say with which seed the truth begins")
+        for b, start in zip(which, each, strict=True):
             now = self._worlds[b]
             again = now is not None and now[1].name == start.robot
             if now is not None and not again:
@@ -125,9 +127,13 @@ class TrueSimulator(ABC, Generic[W]):
         return self.images
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
-        for b in range(len(self)) if episodes is None else episodes:
-            world, before = self._begun(b)[0], self._before[b]
-            require(0 <= frames <= len(before), f"episode {b} can be taken back by {len(before)} frames, not by {frames}")
+        which = chosen_episodes(episodes, len(self))
+        worlds = {b: self._begun(b)[0] for b in which}
+        for b in which:
+            reach = self.reach(b)
+            require(0 <= frames <= reach, f"episode {b} can be taken back by {reach} frames, not by {frames}")
+        for b, world in worlds.items():
+            before = self._before[b]
             if frames:
                 world.set_state(before[-frames])
                 del before[-frames:]

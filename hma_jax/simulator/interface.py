@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -31,6 +32,17 @@ class AnySimulator(Protocol):
     def step(self, actions: Sequence[np.ndarray | None]) -> np.ndarray: ...
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray: ...
+
+
+def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
+    """Which of `count` episodes a call is of; None: all. Raises ConfigError for numbers that repeat or that there are
+    not."""
+    which = list(range(count)) if episodes is None else [int(b) for b in episodes]
+    require(
+        all(0 <= b < count for b in which) and len(set(which)) == len(which),
+        f"episodes must be different numbers below {count}, got {which}",
+    )
+    return which
 
 
 Judge = Callable[[AnySimulator], tuple[np.ndarray, np.ndarray]]

@@ -19,6 +19,7 @@ from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, 
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
+from hma_jax.simulator.interface import chosen_episodes
 from hma_jax.simulator.programs import Beginning, Programs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -140,7 +141,7 @@ class Simulator:
 
         Of a start's frames the last T - 1 are seen. An int for `seeds` gives the b-th of these episodes seed + b.
         """
-        which = self._which(episodes)
+        which = chosen_episodes(episodes, len(self))
         each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
         numbers = [seeds + i for i in range(len(which))] if isinstance(seeds, (int, np.integer)) else list(seeds)
         asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"
@@ -167,14 +168,6 @@ class Simulator:
 
     def _blank(self, shape: tuple[int, ...], dtype: Any) -> Beginning:
         return Beginning.blank(len(self), self.room, self.model.table.action_width, shape, dtype)
-
-    def _which(self, episodes: Sequence[int] | None) -> list[int]:
-        which = list(range(len(self))) if episodes is None else [int(b) for b in episodes]
-        require(
-            all(0 <= b < len(self) for b in which) and len(set(which)) == len(which),
-            f"episodes must be different numbers below {len(self)}, got {which}",
-        )
-        return which
 
     def _begun(self, b: int) -> Episode:
         episode = self._episodes[b]
@@ -297,7 +290,7 @@ class Simulator:
         with "streaming" the window is computed anew, which is nearer to exact than what had been there.
         """
         require(frames >= 0, f"an episode is taken back by 0 frames or more, got {frames}")
-        which = self._which(episodes)
+        which = chosen_episodes(episodes, len(self))
         at = self._blank(self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
         new: dict[int, Episode] = {}
         for b in which:

@@ -46,6 +46,23 @@ def test_episodes_are_apart_clipped_and_taken_back(monkeypatch):
     np.testing.assert_array_equal(sim.rewind(2, [0])[0], seen[0])
 
 
+def test_what_is_refused_changes_no_episode():
+    sim, start = SuiteSimulator([PUSHER], episodes=2), suite_starts("pusher_sand", 8, 1)[0]
+    unknown = type(start)(start.robot, start.images, start.actions)  # no seed
+    sim.reset(start)
+    now = sim.step([np.array([0.9, 0.0]), None])
+    for episodes in ([2], [-1], [0, 0]):
+        for refused in (lambda which=episodes: sim.reset(start, episodes=which), lambda which=episodes: sim.rewind(0, which)):
+            with pytest.raises(ConfigError, match="episodes must be different numbers below 2"):
+                refused()
+    with pytest.raises(ConfigError, match="with which seed"):
+        sim.reset([start, unknown])
+    with pytest.raises(ConfigError, match="episode 1 can be taken back by 0 frames"):
+        sim.rewind(1)
+    np.testing.assert_array_equal(sim.images, now)
+    assert sim.reach(0) == 1
+
+
 def test_up_moves_the_pusher_up_and_right_to_the_right():
     for key, (column, row) in ((0, (1, 0)), (1, (0, -1))):
         true = Environment("pusher_sand")
