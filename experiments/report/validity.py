@@ -20,7 +20,7 @@ from experiments.rows import LOSS, OVERALL, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
-from hma_jax.evaluation.summary import Summary, means
+from hma_jax.evaluation.summary import Summary, means_and_errors
 from hma_jax.evaluation.windows import WindowTable
 
 Verdict = Literal["good", "bad", "open"]
@@ -39,7 +39,7 @@ HELD_OUT = "cross_entropy"
 """Nats per held-out token; models of latents have none."""
 
 EXACT = 1e-6
-"""Relative difference that recomputing a mean may make: windows are kept in float32."""
+"""Relative difference that recomputing a mean or its error may make: windows are kept in float32."""
 
 
 @dataclass(frozen=True)
@@ -129,13 +129,17 @@ def _same(a: float, b: float) -> bool:
 
 
 def _follows(result: Mapping[str, Any], windows: WindowTable, group: int) -> bool:
-    """Whether the means of a result are those of the windows."""
-    said, found = Summary.from_dict(result["evaluation"]).datasets, means(windows, group)
+    """Whether the means of a result, and their errors, are those of the windows."""
+    said, found = Summary.from_dict(result["evaluation"]).datasets, means_and_errors(windows, group)
     return said.keys() == found.keys() and all(
-        metric in found[robot] and math.isclose(stat.mean, found[robot][metric], rel_tol=EXACT, abs_tol=EXACT)
+        metric in found[robot] and all(map(_close, (stat.mean, stat.sem), found[robot][metric]))
         for robot, stats in said.items()
         for metric, stat in stats.items()
     )
+
+
+def _close(a: float, b: float) -> bool:
+    return math.isclose(a, b, rel_tol=EXACT, abs_tol=EXACT) or not (math.isfinite(a) or math.isfinite(b))
 
 
 def _trials(states: Mapping[str, State]) -> Check:

@@ -149,13 +149,14 @@ def test_a_line_taken_out_of_the_table_is_noticed(copied):
     assert verdicts(workspace)["numbers"][0] == "bad"
 
 
-def test_results_that_do_not_follow_from_their_windows_are_noticed(copied):
+@pytest.mark.parametrize("number", ["mean", "sem"])
+def test_results_that_do_not_follow_from_their_windows_are_noticed(copied, number):
     """Though sealed again, as somebody who edits numbers would not do by accident."""
     workspace, record = copied
     directory = workspace.trials / trials_of(record, width=8, seed=0)[0]
     result = json.loads((directory / RESULT).read_text())
     result.pop("hash")
-    result["evaluation"][SMALL.datasets[1]]["psnr"]["mean"] += 1e-4
+    result["evaluation"][SMALL.datasets[1]]["psnr"][number] += 1e-4
     write_result(directory, result)
     workspace.results.unlink()
     draw(workspace, record)
