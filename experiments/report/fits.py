@@ -44,9 +44,9 @@ def fit_rows(fits: Sequence[Fitted], isoflop: IsoFlop | None) -> list[FitRow]:
         best = [b for b in isoflop.budgets if b.best]
         doubts = tuple(f"{b.flops:.4g} FLOPs: {b.doubt}" for b in best if b.doubt)
         rows += _rows(("isoflop", "training FLOPs", len(best)), coefficients, isoflop.refused, doubts)
-        for b in best:
+        for b in isoflop.budgets:
             said = (f"isoflop {b.flops:.4g}", "trunk parameters", len(b.sizes))
-            rows += _rows(said, (b.best,), b.refused, (b.doubt,) if b.doubt else ())
+            rows += _rows(said, (b.best,) if b.best else (), b.refused, (b.doubt,) if b.doubt else ())
     return rows
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.isoflop import fit_isoflop
+from experiments.report.fits import fit_rows
 from tests.experiments.analysis.curves import measured, power
 
 SIZES, BUDGETS = np.geomspace(1e4, 1e7, 7), np.geomspace(6e10, 6e12, 5)
@@ -41,6 +42,7 @@ def test_a_best_size_at_the_end_is_refused():
     fit = fit_isoflop(small, np.geomspace(6e10, 6e12, 4), draws=20)
     assert "0 of 4 budgets have a minimum" in fit.refused and fit.exponent is None
     assert all("the largest size is best" in b.refused and b.best is None for b in fit.budgets)
+    assert [row.refused for row in fit_rows([], fit)] == [fit.refused, *(b.refused for b in fit.budgets)]
 
 
 def test_a_loss_that_only_flattens_has_no_best_size():
