@@ -14,11 +14,12 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import UseAppendAction, arg
 
+from experiments.override import override
 from experiments.presets import get_preset
 from experiments.program import PROGRAM
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
-from experiments.study import Study, on_tokenizer, on_user_data, override
+from experiments.study import Study, on_tokenizer, on_user_data
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.claim import is_address
 

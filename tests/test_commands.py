@@ -19,8 +19,8 @@ import pytest
 from tyro.extras import SubcommandApp
 
 from experiments.cli import main as program
+from experiments.override import override
 from experiments.presets import get_preset
-from experiments.study import override
 
 ROOT = Path(__file__).parents[1]
 PAGES = [

@@ -77,10 +77,10 @@ def _words(fitted: Fitted) -> tuple[str, str, str]:
 
 def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]) -> None:
     from experiments.analysis.predictions import predict, save_prediction
+    from experiments.override import override
     from experiments.report.numbers import read_results, result_hashes
     from experiments.running.attempts import read_states
     from experiments.running.ledger import MISSING, Ledger
-    from experiments.study import override
     from experiments.sweeps.registry import plan_sweeps
     from experiments.sweeps.sweep import unique_trials
 

@@ -11,10 +11,10 @@ from data_pipelines.suite.embodiments import EMBODIMENTS, TRAINED
 from data_pipelines.suite.generate import episode_count
 from experiments.analysis.scaling import surface_of
 from experiments.cost import plan_trials
+from experiments.override import override
 from experiments.preparing_cost import estimate_preparing
 from experiments.presets import CPU_FULL, PAPER
 from experiments.running.trial import training_of, trial_id
-from experiments.study import override
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.registry import AXES, find_axis, plan_sweeps

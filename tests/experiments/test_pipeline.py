@@ -9,12 +9,12 @@ from data_pipelines.errors import DataError
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.windows.evalset import eval_batches
+from experiments.override import override
 from experiments.preparing import counterfactual
 from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
 from experiments.running.trial import open_materials
 from experiments.running.workspace import Workspace
-from experiments.study import override
 
 
 def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeypatch):

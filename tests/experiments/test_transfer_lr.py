@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 
 from experiments.optima import as_good, chosen_by_others, find_optima
+from experiments.override import override
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
 from experiments.rows import LOSS, TRAINING, CurvePoint, curve, read_csv
-from experiments.study import TransferConfig, override
+from experiments.study import TransferConfig
 from experiments.sweeps import lr
 from experiments.sweeps.sweep import POINT, STANDARD, unique_trials
 from hma_jax.config import ConfigError
