@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from experiments.progress import console, tidy_table
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
+from hma_jax.config import require
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def compare(
     from experiments.analysis.tables import read_side
     from experiments.rows import write_csv
 
+    require(not to.is_dir(), f"--to {to} is a directory; name a file, such as --to {to / 'comparison.csv'}")
     make_directory(to.parent, "--to")
     first, second = read_side(a), read_side(b)
     rows = analysis.compare(first, second)

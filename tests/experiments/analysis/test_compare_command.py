@@ -81,6 +81,8 @@ def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path,
     ):
         assert main(["compare", str(a), str(b), "--to", str(tmp_path / "c.csv")]) == Exit.REFUSED == 2
         assert why in capsys.readouterr().err and not (tmp_path / "c.csv").exists()
+    assert main(["compare", str(a), str(a), "--to", str(tmp_path)]) == 2
+    assert f"is a directory; name a file, such as --to {tmp_path / 'comparison.csv'}" in capsys.readouterr().err
     workspace = Workspace(tmp_path / "empty")
     workspace.root.mkdir()
     save_record(workspace, record_of())
