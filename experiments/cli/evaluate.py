@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +15,7 @@ from experiments.setting import UNSET, Setting, StudyArguments, make_setting, re
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
-from hma_jax.config.json import from_dict
+from hma_jax.config.json import from_dict, to_strict_json
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -121,7 +120,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
         table.caption = f"No error of {few(alone)}: one held-out episode does not say how they differ."
     console.print(table)
     write_evaluation(place, evaluation)
-    write_file(place / "evaluation.json", json.dumps(summary.to_dict(), indent=1))
+    write_file(place / "evaluation.json", to_strict_json(summary.to_dict()))
     made_from.save(place, STAMP)
     wrote(place / "evaluation.json", place / FILE, place / "samples.npz")
 

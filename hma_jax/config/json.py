@@ -100,6 +100,11 @@ def to_json(config: Any) -> str:
     return json.dumps(to_dict(config), indent=2, sort_keys=True)
 
 
+def to_strict_json(values: Any) -> str:
+    """For any program: null for the numbers that are not finite, which JSON does not have."""
+    return json.dumps(json.loads(json.dumps(values), parse_constant=lambda _: None), indent=1)
+
+
 def from_json(cls: type, text: str) -> Any:
     return from_dict(cls, json.loads(text))
 

@@ -17,7 +17,7 @@ from experiments.running.trial import open_materials
 from experiments.running.workspace import Workspace
 from experiments.study import on_tokenizer
 from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
-from hma_jax.config.json import from_json, to_json
+from hma_jax.config.json import from_json, to_json, to_strict_json
 from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
 from hma_jax.tokenizers.io import load_tokenizer
@@ -68,7 +68,7 @@ def test_released_model_is_evaluated_on_ids_of_an_imported_tokenizer(arm, tmp_pa
     assert evaluation[ARM.name]["perplexity"]["mean"] == pytest.approx(64, rel=0.3)
     windows = WindowTable.load(tmp_path / "run" / FILE)
     summary = summarise(windows, get_preset("smoke").eval.perplexity_group)
-    assert json.dumps(summary.to_dict(), indent=1) == (tmp_path / "run" / "evaluation.json").read_text()
+    assert to_strict_json(summary.to_dict()) == (tmp_path / "run" / "evaluation.json").read_text()
     assert evaluation[ARM.name]["psnr"]["episodes"] == len(set(windows.episode.tolist()))
 
     assert hma("convert", "from-official", released(tmp_path / "b", 256), "--out", tmp_path / "run2") == 0

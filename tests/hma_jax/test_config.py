@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import math
 import typing
 from typing import Literal
 
@@ -23,6 +25,7 @@ from hma_jax.config import (
     TokenizerTrainConfig,
 )
 from hma_jax.config.base import check_choices
+from hma_jax.config.json import to_strict_json
 
 CONFIGS = [found for found in map(config.__dict__.get, config.__all__) if dataclasses.is_dataclass(found)]
 
@@ -89,3 +92,8 @@ def test_limits_that_can_work_are_accepted():
     OptimizerConfig(beta1=0.0, final_fraction=0.0, decay_fraction=1.0, weight_decay=0.0)
     MaskingConfig(mask_angle_min=1.0, min_ratio=0.5)  # half of every frame
     MeshConfig(min_shard_size=0)
+
+
+def test_files_for_other_programs_hold_no_number_that_json_does_not_have():
+    text = to_strict_json({"mean": 1.5, "sem": math.nan, "errors": [math.inf, -math.inf]})
+    assert json.loads(text, parse_constant=pytest.fail) == {"mean": 1.5, "sem": None, "errors": [None, None]}

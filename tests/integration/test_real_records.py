@@ -34,8 +34,10 @@ def test_real_and_unknown_robots_are_inspected_mixed_trained_and_evaluated(stran
     ]  # fmt: skip
     assert main(["train", *where]) == 0
     assert main(["evaluate", str(tmp_path / "out" / "model"), *where]) == 0
-    evaluation = json.loads((tmp_path / "out" / "model" / "evaluation.json").read_text())
+    text = (tmp_path / "out" / "model" / "evaluation.json").read_text()
+    evaluation = json.loads(text, parse_constant=pytest.fail)  # no NaN, which other programs do not read
     assert set(evaluation) == {"bridge_dataset", "stranger"}
+    assert evaluation["stranger"]["psnr"]["episodes"] == 1 and evaluation["stranger"]["psnr"]["sem"] is None
     for metrics in evaluation.values():
         assert 0 < metrics["perplexity"]["mean"] < 2 * 256 and np.isfinite(metrics["delta_psnr"]["mean"])
     manifest = json.loads((tmp_path / "out" / "tokens" / "stranger" / "manifest.json").read_text())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json as jsonlib
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,6 +17,7 @@ from experiments.progress import console, step, tidy_table
 from experiments.setting import use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
+from hma_jax.config.json import to_strict_json
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
@@ -156,8 +156,7 @@ def data_inspect(
     wrote(sheet)
     if json is not None:
         values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
-        strict = jsonlib.loads(jsonlib.dumps(values), parse_constant=lambda _: None)  # JSON has no NaN
-        write_file(json, jsonlib.dumps(strict, indent=1))
+        write_file(json, to_strict_json(values))
         wrote(json)
     if entry is not None:
         _write_entry(entry, suggestion)
