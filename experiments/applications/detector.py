@@ -29,6 +29,7 @@ from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
+from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
 from experiments.progress import step
@@ -37,6 +38,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
 from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.simulator.robots import Robot
+from hma_jax.tokenizers.shared import BaseTokenizer
 
 OUT = Path("experiments/results/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
@@ -173,12 +175,12 @@ def enlarged(images: np.ndarray) -> np.ndarray:
     return images.repeat(times, axis=1).repeat(times, axis=2)
 
 
-def as_given(tokenizer, scenes: Scenes) -> Scenes:
+def as_given(tokenizer: BaseTokenizer, scenes: Scenes) -> Scenes:
     """With frames as small as a tokenizer takes them."""
     return scenes._replace(images=enlarged(fit_images(scenes.images, tokenizer.image_size)))
 
 
-def shown_by(tokenizer, images: np.ndarray) -> np.ndarray:
+def shown_by(tokenizer: BaseTokenizer, images: np.ndarray) -> np.ndarray:
     """Frames uint8 [n, H, W, 3] as a tokenizer shows them."""
     images = fit_images(images, tokenizer.image_size)
     whole = jax.jit(lambda x: tokenizer.decode_uint8_fn(tokenizer.params, tokenizer.encode_fn(tokenizer.params, x)))
@@ -187,7 +189,7 @@ def shown_by(tokenizer, images: np.ndarray) -> np.ndarray:
     return enlarged(np.concatenate(parts)[: len(images)])
 
 
-def as_shown(tokenizer, scenes: Scenes, every: int = 1) -> Scenes:
+def as_shown(tokenizer: BaseTokenizer, scenes: Scenes, every: int = 1) -> Scenes:
     """The same with every n-th frame as the tokenizer shows it."""
     given = as_given(tokenizer, scenes)
     given.images[::every] = shown_by(tokenizer, scenes.images[::every])
@@ -208,7 +210,7 @@ def chosen(robots: dict[str, Robot], names: Sequence[str]) -> dict[str, Robot]:
     return {name: robot for name, robot in robots.items() if not names or name in names}
 
 
-def make_detector(robots: Sequence[str], tokenizer, out: Path) -> Detector:
+def make_detector(robots: Sequence[str], tokenizer: BaseTokenizer, out: Path) -> Detector:
     """Trains one on frames as `tokenizer` takes and shows them; writes it and its own errors into `out`."""
     episodes = max(EPISODES // len(robots), FEWEST)
     with step("true frames") as update:
@@ -232,8 +234,6 @@ def make_detector(robots: Sequence[str], tokenizer, out: Path) -> Detector:
 
 
 def main() -> None:
-    from experiments.applications.simulators import load_simulator
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.suite.simulator import SPECS
+from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.detector import (
     CLOSE, SURE, WEIGHTS, Detector, chosen, enlarged, known_robots, make_detector, shown_by,
 )  # fmt: skip
@@ -76,7 +77,7 @@ def watch_ends(simulator: Simulator, detector: Detector, robot: Robot) -> list[R
     return rows
 
 
-def _points(true, robot: Robot, episodes: int) -> Points:
+def _points(true: TrueSimulator, robot: Robot, episodes: int) -> Points:
     """Of the true state of some episodes."""
     states = [true.state(b) for b in range(episodes)]
     q, objects, seeds = (np.concatenate([getattr(s, name) for s in states]) for name in ("q", "objects", "seeds"))

@@ -49,7 +49,7 @@ from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.cloning import BcConfig, clone
 from experiments.applications.policies.closed_loop import gap, run_policy, start_seeds
 from experiments.applications.policies.demonstrations import record
-from experiments.applications.policies.learning import FitConfig
+from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.scripted import make_expert, noisy
 from experiments.applications.policies.tasks import Task, find_task, held, world_of
@@ -153,7 +153,7 @@ def distance_of(spec: EmbodimentSpec, seen: Environment) -> float:
     return float(gap(world_of(spec, [seen.get_state()]))[0])
 
 
-def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report) -> list[dict]:
+def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, way: str, report: Report) -> list[dict]:
     """The same starts under a policy that does not plan."""
     task = settings.make_task()
     policy: Policy = RandomPolicy(robot)

@@ -71,7 +71,7 @@ from experiments.applications.policies.demonstrations import (
     load_demonstrations,
     save_demonstrations,
 )
-from experiments.applications.policies.learning import FitConfig
+from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
@@ -120,7 +120,7 @@ def make_data(
     return {kind: load_demonstrations(path) for kind, path in sets.items()}
 
 
-def imagine(simulator: Simulator, robot: Robot, demos: Demonstrations, given: int, update) -> np.ndarray:
+def imagine(simulator: Simulator, robot: Robot, demos: Demonstrations, given: int, update: Report) -> np.ndarray:
     """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under its actions."""
     trajectories, images = as_trajectories(demos, robot), np.zeros_like(demos.images)
     for first in range(0, len(demos), len(simulator)):
@@ -151,7 +151,7 @@ def without_first(demos: Demonstrations, frames: int) -> Demonstrations:
 
 
 def run_trial(
-    lessons: Lessons, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update
+    lessons: Lessons, condition: Condition, data: Mapping[str, Demonstrations], seed: int, update: Report
 ) -> dict[str, list[float]]:
     """Trains one policy and judges it: what the lessons' judge says by start, {error} by held-out trajectory."""
     settings = lessons.settings

@@ -13,6 +13,7 @@ import numpy as np
 
 from data_pipelines.suite.simulator import SuiteSimulator
 from data_pipelines.true_simulator import TrueSimulator
+from experiments.applications.policies.learning import Report
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, reached
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
@@ -64,7 +65,7 @@ def run(
     task: Task,
     *,
     shuffled: bool = False,
-    report=lambda done, total, note: None,
+    report: Report = lambda done, total, note: None,
 ) -> Rollout:
     """Every start once, as many at a time as the simulator has episodes.
 
@@ -81,7 +82,9 @@ def run(
     return Rollout(*whole)
 
 
-def _run(simulator, policy: Policy, starts, seeds, task: Task, shuffled: bool) -> Rollout:
+def _run(
+    simulator: AnySimulator, policy: Policy, starts: Sequence[Start], seeds: Sequence[int], task: Task, shuffled: bool
+) -> Rollout:
     policy.reset(seeds=seeds)
     images = [simulator.reset(list(starts), seeds=list(seeds)).copy()]
     states = [_reached(simulator, task)]
