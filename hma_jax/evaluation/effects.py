@@ -23,6 +23,7 @@ import scipy.stats
 
 from hma_jax.config import ExecutionConfig, ModelConfig, require
 from hma_jax.evaluation.metrics import factored_cross_entropy, mean_over_frames
+from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.generation import next_frame_outputs
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
@@ -157,12 +158,9 @@ def _changes(
 
 
 def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
-    """Mean over windows; deviations are added up by episode before they are squared."""
-    x, of = np.asarray(differences, np.float64), np.unique(np.asarray(episode), return_inverse=True)[1]
-    sums = np.bincount(of, x - x.mean())
-    groups = len(sums)
-    spread = np.sqrt((sums**2).sum() * groups / (groups - 1)) / len(x)
-    return Difference(float(x.mean()), float(spread), groups)
+    """Mean over windows, its error clustered by episode."""
+    stat = mean_and_sem(differences, episode)
+    return Difference(stat.mean, stat.sem, stat.episodes)
 
 
 def make_loss(
