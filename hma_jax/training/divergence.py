@@ -44,7 +44,8 @@ def require_finite(step: int, values: Mapping[str, float], run_dir: Path | None,
         more = f" and {len(batch) - SAID} more, listed in {FILE} of the run" if len(batch) > SAID else ""
         few = f"its batch was {'; '.join(batch[:SAID])}{more}; if these are sound, "
     raise DivergedError(
-        f"{what}; {few}lower the learning rate or lengthen the warm-up (the last checkpoint is kept)"
+        f"{what}; {few}lower the learning rate or lengthen the warm-up, in a new output directory: that is another run "
+        "(the last checkpoint of this one is kept)"
     )
 
 

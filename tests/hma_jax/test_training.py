@@ -135,9 +135,11 @@ def test_divergence_stops_the_run_and_spares_the_last_checkpoint(tmp_path: Path)
                 batch["actions"][:] = np.nan
             yield batch
 
-    with pytest.raises(DivergedError, match="loss is nan at step 4"):
+    with pytest.raises(DivergedError, match="loss is nan at step 4; lower the learning rate .* in a new output directory"):
         train(tmp_path, make=poisoned)
     assert load_run(tmp_path).step == 2
+    with pytest.raises(CheckpointError, match="learning_rate: 0.001 -> 0.0001"):  # as the advice says
+        train(tmp_path, config=train_config(optimizer=OptimizerConfig(learning_rate=1e-4, warmup_steps=2)))
 
 
 def test_log_lines_beyond_the_checkpoint_are_dropped_and_a_torn_one_too(tmp_path: Path, unbroken):
