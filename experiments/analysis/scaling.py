@@ -192,4 +192,5 @@ def noise_near(measured: Measured, x: np.ndarray) -> tuple[float, float]:
         return float("nan"), float("nan")
     away = np.linalg.norm(np.log(measured.x) - np.log(x), axis=1)
     nearest = int(np.argmin(np.where(count > 1, away, np.inf)))
-    return float(measured.noise()[nearest]), float(count[nearest] - 1 + PRIOR)
+    # What is joined with a position's own variance are the same few seeds: they are no more than they are.
+    return float(measured.noise()[nearest]), float(min(count[nearest] - 1 + PRIOR, measured.freedom))

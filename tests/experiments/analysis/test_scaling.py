@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.analysis.intervals import critical
 from experiments.analysis.scaling import (
     FLOPS,
     TRUNK,
@@ -13,6 +14,7 @@ from experiments.analysis.scaling import (
     fit_budgets,
     fit_curve,
     fit_study,
+    noise_near,
     surface_of,
     trunk_parameters,
 )
@@ -24,6 +26,7 @@ from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import Point, Sweep, reference_trial
 from hma_jax.config import ModelConfig
 from hma_jax.evaluation.windows import WindowTable
+from tests.experiments.analysis.curves import measured, sizes
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE
 
@@ -132,3 +135,17 @@ def test_the_page_shows_fits_and_what_was_refused(branches, tmp_path):
     refused = fit_study(sweeps, PROVENANCE, few, draws=30)
     assert any(r.refused and not r.coefficient for r in fit_rows(refused, None))
     assert "No fit: " in describe_fits(refused, None, [], "")
+
+
+@pytest.mark.parametrize("seeds", [(2, 1, 1, 1), (2, 2, 2, 2)])
+def test_the_scatter_of_few_seeds_is_known_no_better_than_by_as_many(seeds):
+    """A prediction's interval is made of it: of new seeds, 90 % are within 90 % of Student's t."""
+    rng, inside = np.random.default_rng(0), []
+    x = sizes(4)
+    for _ in range(300):
+        points = measured(x, np.full(4, 3.0), 0.01, 2, rng)
+        points = points.only(np.array([seed < seeds[i // 2] for i, seed in enumerate(points.seed)]))
+        noise, freedom = noise_near(points, x[-1])
+        inside.append(abs(0.01 * rng.standard_normal()) < critical(freedom, 0.9) * noise)
+    assert freedom == sum(seeds) - 4
+    assert np.mean(inside) == pytest.approx(0.9, abs=0.05)
