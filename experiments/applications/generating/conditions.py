@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals, resample
 from experiments.analysis.intervals import Interval
+from experiments.applications.judging.agreement import rate_interval
 from experiments.applications.tables import write_table
 
 Trials = dict[tuple[int, int], dict[str, list[float]]]
@@ -63,7 +65,7 @@ def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") ->
 
 def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
     """Which share of the gap between few and all recorded trajectories condition `at` closes; the interval holds 95 %
-    of the draws over seeds and starts."""
+    of the draws over seeds and starts in which there is a gap."""
     found = resample(panel, draws)
 
     def share(points: np.ndarray) -> np.ndarray:
@@ -71,8 +73,11 @@ def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
         return (points[..., at] - points[..., FEW]) / np.where(np.abs(gap) < 1e-9, np.nan, gap)
 
     drawn = share(found.drawn)
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
-    return Interval(float(share(found.value)), float(np.nanstd(drawn)), float(low), float(high))
+    drawn = drawn[np.isfinite(drawn)]
+    if not len(drawn):  # there is no gap in any
+        return Interval(math.nan, math.nan, math.nan, math.nan)
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return Interval(float(share(found.value)), float(np.std(drawn)), float(low), float(high))
 
 
 class Summary(NamedTuple):
@@ -83,9 +88,17 @@ class Summary(NamedTuple):
 
 
 def summarise(trials: Trials, seeds: tuple[int, ...]) -> list[Summary]:
-    """Every condition; then which share of the gap 90 generated trajectories close, and 90 of each control."""
+    """Every condition; then which share of the gap 90 generated trajectories close, and 90 of each control.
+
+    Of policies that never or always succeed resampling knows no spread: the interval is then Wilson's over starts.
+    """
     panels = {what: make_panel(trials, seeds, what) for what in ("success", "error") if what in trials[FEW, seeds[0]]}
     found = {what: bootstrap_intervals(panel) for what, panel in panels.items()}
+    if "success" in found:
+        starts = len(panels["success"].episode)
+        found["success"] = [
+            rate_interval(np.full(starts, rate.mean)) if rate.mean in (0.0, 1.0) else rate for rate in found["success"]
+        ]
     tried = places(trials)
     summaries = [Summary(CONDITIONS[i].name, {what: each[i] for what, each in found.items()}) for i in tried]
     shares = ("10 + 90 generated", MOST), ("other actions", CONTROL), ("a model without actions", BLIND)
@@ -126,7 +139,8 @@ def markdown(found: Sequence[Summary]) -> str:
             if what == "success" and not one.name.startswith("share"):
                 low, high = max(low, 0.0), min(high, 1.0)
             n = digits[what]
-            cells += [f"{r.mean:.{n}f}", f"{low:.{n}f} to {high:.{n}f}"]
+            known = f"{low:.{n}f} to {high:.{n}f}" if math.isfinite(low) else "–"
+            cells += [f"{r.mean:.{n}f}" if math.isfinite(r.mean) else "–", known]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 

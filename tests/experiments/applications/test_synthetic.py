@@ -86,6 +86,16 @@ def test_the_share_of_the_gap_is_that_of_the_means():
     assert control.high < share.low
 
 
+def test_policies_that_never_succeed_are_no_certainty_and_leave_no_gap_to_close(recwarn):
+    trials = {(i, s): {"success": np.full(20, i == MOST), "distance": np.zeros(20)} for i in range(6) for s in (0, 1)}
+    found = conditions.summarise(trials, (0, 1))
+    few, most, share = (found[i].measured["success"] for i in (0, MOST, 6))
+    assert (few.low, most.high) == (0, 1) and few.high == pytest.approx(1 - most.low) == pytest.approx(0.161, abs=0.001)
+    assert np.isnan(share.mean) and not recwarn.list
+    assert "| 10 recorded | 0.00 | 0.00 to 0.16 |" in conditions.markdown(found)
+    assert "| share of the gap: 10 + 90 generated | – | – |" in conditions.markdown(found)
+
+
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory):
     """Some recorded episodes of pusher_sand, four of them held out."""
