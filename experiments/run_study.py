@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from experiments.cost import devices_of
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console
@@ -48,6 +47,7 @@ def run_study(
     directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
     changed, or if trials ran other sources than there are now and nobody accepts that.
     """
+    from experiments.cost import devices_of
     from experiments.preparing.pipeline import prepare
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows

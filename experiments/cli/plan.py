@@ -14,7 +14,6 @@ from experiments.progress import console, step, tidy_table
 from experiments.setting import Preset, StudyArguments, make_setting
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
-from hma_jax.runtime.audit import describe_sharding, size_of
 
 if TYPE_CHECKING:
     from experiments.bench.plan import Plan
@@ -72,12 +71,13 @@ def plan(
         brief: Leave out the layout of every parameter and the list of what is sent.
     """
     limit = read_memory(memory)
-    if any(name != "local" for name in topology):  # read when JAX starts
+    if any(name != "local" for name in topology):  # read when JAX is imported
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
         os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # programs for absent devices cannot be written
     from experiments.bench.collectives import count_kinds
     from experiments.bench.plan import find_devices, make_plan
+    from hma_jax.runtime.audit import size_of
 
     what, config, table, train, execution = _asked(asked, shape)
     rows: list[tuple[str, Plan]] = []
@@ -150,11 +150,15 @@ def _asked(
 
 
 def _print_layouts(name: str, made: Plan) -> None:
+    from hma_jax.runtime.audit import describe_sharding
+
     sizes = " x ".join(f"{axis} {size}" for axis, size in made.mesh.items())
     _print_lines(f"{name}: parameters on a mesh of {sizes}, and what one device stores", describe_sharding(made.decisions))
 
 
 def _print_sent(name: str, made: Plan) -> None:
+    from hma_jax.runtime.audit import size_of
+
     lines = [
         f"{sent.count:4} {c.kind:18} {size_of(sent.bytes):>10} {'each layer' if c.looped else 'once':10} "
         f"over {c.over or 'groups not told'}: {c.purpose}"

@@ -1,5 +1,8 @@
 """`hma plan`: the real training step, compiled and not run."""
 
+import os
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import get_args
 
@@ -108,6 +111,17 @@ def test_without_the_compiler_it_is_asked_for(monkeypatch):
     monkeypatch.setattr(planning.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"v5e:2x4: the TPU compiler is not installed: pip install -e '\.\[tpu\]'$"):
         find_devices("v5e:2x4")
+
+
+def test_absent_devices_are_planned_on_the_processor_whatever_is_here():
+    """JAX reads where it computes when it is imported: nothing of the program may have done so before."""
+    code = (
+        "import sys; from experiments.cli.main import main; main(['plan', '--topology', 'v5e:3x5']); import jax; "
+        "sys.exit((jax.config.jax_platforms, jax.config.jax_enable_compilation_cache) != ('cpu', False))"
+    )
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, timeout=120, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_gpus_are_not_taken_for_tpus_without_a_compiler(monkeypatch):
