@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from data_pipelines.inspection.action_stats import dimension_facts
 from data_pipelines.simulators.simulator import PHYSICS, PhysicsSimulator, can_simulate, physics_starts
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, suite_starts
@@ -120,6 +122,27 @@ def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:
         return suite_robot(entry.name, low, high, entry.mean, entry.stride, recorded=recorded)
     hz = manifest.spec.hz if manifest is not None else 0.0
     return Robot(entry.name, entry.stride, low, high, rest_of(low, high, entry.mean), hz=hz, recorded=recorded)
+
+
+def keep_places(simulator: Simulator, run: Path | str) -> None:
+    """Describes robots anew whose actions are places to go to, as the study's held-out episodes tell: keys then move the
+    place from where it was, and letting go leaves it there, where `rest` would be a jump.
+
+    What lies beside the run, and the suite, say it themselves. For whoever drives; no simulated frame depends on it.
+    """
+    study = Workspace.of_run(Path(run))
+    if (Path(run) / ROBOTS).exists() or not study.store.is_dir():
+        return
+    store = TokenStore(study.store)
+    told = [robot for robot in simulator.robots.values() if robot.name not in SPECS and robot.name in store.names]
+    simulator.describe([replace(robot, keeps=True) for robot in told if _goes_to_places(store, robot.name)])
+
+
+def _goes_to_places(store: TokenStore, name: str) -> bool:
+    """Whether most of its action values drift, as targets do, and do not jump about zero, as changes do."""
+    count = min(len(store.manifest(name).val.episodes), STARTS_PER_ROBOT)
+    hints = [f.hint for f in dimension_facts([np.asarray(store.episode(name, "val", i).actions) for i in range(count)])]
+    return 2 * hints.count("absolute") > len(hints)
 
 
 def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_PER_ROBOT) -> tuple[Start, ...]:

@@ -53,7 +53,7 @@ def play(
         if error.name != "aiohttp":
             raise
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
-    from experiments.applications.simulators import in_suite, load_simulator, true_simulator
+    from experiments.applications.simulators import in_suite, keep_places, load_simulator, true_simulator
     from hma_jax.simulator.folder import find_decode
     from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
@@ -69,6 +69,7 @@ def play(
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )
+    keep_places(simulator, run)
     console.print(f"{run}: {len(simulator.robots)} robots; compiling")
     warm_up(simulator, together=1)
     raise_lost_request()

@@ -3,7 +3,9 @@
 import json
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from experiments.applications import DRIVEN
 from experiments.applications import ship as ship_module
+from experiments.applications import simulators as simulators_module
 from experiments.applications.ship import ship
 from experiments.applications.simulators import load_simulator, make_simulator
 from experiments.bench.record import read_record
@@ -20,6 +23,7 @@ from hma_jax import Simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.folder import USUAL, find_decode
+from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.runs import TABLE, make_run
 
 
@@ -35,6 +39,31 @@ def test_robots_of_the_suite_are_described_and_begin_at_held_out_episodes(run):
     assert gripper.keeps and gripper.hz == 4.0
     assert {s.robot for s in simulator.starts} == {"pusher_sand", "gripper_wood"}
     assert all(s.seed is not None and s.images.shape == (3, 8, 8, 3) for s in simulator.starts)
+
+
+def test_of_one_s_own_data_targets_stay_where_they_were_moved_to_and_changes_end(tmp_path, monkeypatch):
+    """Told from the recordings: there is nobody else to say it."""
+    rng = np.random.default_rng(0)
+    changes = rng.normal(size=(80, 3))
+    recorded = {"arm": np.cumsum(changes, 0) / 10, "base": changes}
+    store = SimpleNamespace(
+        names=tuple(recorded),
+        manifest=lambda name: SimpleNamespace(val=SimpleNamespace(episodes=[0])),
+        episode=lambda name, split, i: SimpleNamespace(actions=recorded[name]),
+    )
+    monkeypatch.setattr(simulators_module, "TokenStore", lambda _: store)
+    robots = {name: Robot(name, 2, (-1.0,) * 3, (1.0,) * 3, (0.0,) * 3) for name in recorded}
+    described = []
+    simulator = SimpleNamespace(robots=robots, describe=described.extend)
+    workspace = Workspace(tmp_path)
+    workspace.store.mkdir()
+    simulators_module.keep_places(simulator, tmp_path / "model")
+    assert described == [replace(robots["arm"], keeps=True)]
+
+    (tmp_path / "model").mkdir()
+    (tmp_path / "model" / "robots.json").touch()  # what lies beside the run says it
+    simulators_module.keep_places(simulator, tmp_path / "model")
+    assert len(described) == 1
 
 
 def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
