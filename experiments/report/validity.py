@@ -76,7 +76,7 @@ def check_study(
 ) -> list[Check]:
     """`robots` are those of the trials called `whose`; `numbers` is what `check_numbers` found; `vocabulary` V of a
     discrete model."""
-    checks = [_trials(states), _seeds(sweeps, states, rows), numbers]
+    checks = [_trials(states), _seeds(sweeps, rows), numbers]
     checks += _untrained(rows, vocabulary)
     checks += [_controls(rows, metric) for metric in CONTROLLED if any(r.metric == metric for r in rows)]
     checks.append(_copying(robots, whose))
@@ -153,7 +153,7 @@ def _trials(states: Mapping[str, State]) -> Check:
     return Check("Every planned trial is here.", "bad" if without else "good", text)
 
 
-def _seeds(sweeps: Sequence[Sweep], states: Mapping[str, State], rows: Sequence[Row]) -> Check:
+def _seeds(sweeps: Sequence[Sweep], rows: Sequence[Row]) -> Check:
     """Distinct seeds with a result, at each point of each curve."""
     planned = {(s.name, p.x, p.series, p.role) for s in sweeps for p in s.points if p.role != CONTROL}
     seeds: dict[tuple[Any, ...], set[int]] = {point: set() for point in planned}
