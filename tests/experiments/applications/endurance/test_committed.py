@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 
+import numpy as np
+
 from experiments.applications.detector import OUT as DETECTOR
 from experiments.applications.detector import WEIGHTS, Detector
 from experiments.applications.endurance.tables import over_robots, read_rows
@@ -76,6 +78,28 @@ def test_ten_minutes_are_as_the_page_says():
         "{:.1f} ± {:.1f} dB and follows {:.2f} ± {:.2f} higher."
     )
     assert said.format(*beside) in page
+
+
+def test_robots_that_lose_their_heading_steer_to_the_end_as_the_page_says():
+    rows, page = read_rows(RESULTS / "steers.csv"), words_of(PAGE)
+    assert {(row["robot"], row["start"], row["part"]) for row in rows} == {
+        (robot, start, minute) for robot in ("rover_road", "omni_chalk") for start in (0, 1) for minute in range(1, 11)
+    }
+
+    def steers(robot: str, minute: int) -> float:
+        return np.mean([row["steers"] for row in rows if (row["robot"], row["part"]) == (robot, minute)])
+
+    ends = [steers(robot, minute) for robot in ("rover_road", "omni_chalk") for minute in (1, 10)]
+    assert min(ends[1] / ends[0], ends[3] / ends[2]) > 0.5
+    truly, worst = np.mean([row["true_steers"] for row in rows]), min(row["steers"] for row in rows)
+    said = "minute {:.2f} and {:.2f} for rover_road, {:.2f} and {:.2f} for omni_chalk, in no minute below {:.2f}; in the true"
+    assert said.format(*ends, worst) in page and f"simulator's own frames {truly:.2f}" in page
+    last = [f"{100 * row['object_found']:.0f}" for row in rows if (row["robot"], row["part"]) == ("rover_road", 10)]
+    assert "shows its own in {} % of the last; from the other starts in the third minute, and in {} %".format(*last) in page
+    lost = [[r["part"] for r in rows if r["robot"] == "omni_chalk" and r["start"] == s and r["object_found"] < 0.1] for s in (0, 1)]
+    assert [min(parts) for parts in lost] == [4, 3]
+    follows = [row["follows"] for row in rows]
+    assert f'"follows" wanders from {min(follows):.2f} to {max(follows):.2f}' in page
 
 
 def test_size_and_data_keep_objects():
