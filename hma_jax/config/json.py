@@ -123,11 +123,23 @@ def _of_dataclass(config: Any) -> dict[str, Any]:
 
 
 def diff(old: Any, new: Any, path: str = "") -> list[str]:
-    """Readable lines 'field: old -> new' for every difference between two configs."""
+    """Readable lines 'field: old -> new' for every difference between two configs. What is in a list and has a name, as
+    robots have, is told apart by it."""
     a, b = to_dict(old), to_dict(new)
+    if (mine := _by_name(a)) and (other := _by_name(b)):
+        lines = diff(mine, other, path) if mine.keys() == other.keys() else []
+        return lines or ([] if a == b else [f"{path}: {list(mine)} -> {list(other)}"])
     if isinstance(a, dict) and isinstance(b, dict):
         lines = []
         for key in sorted(set(a) | set(b)):
             lines += diff(a.get(key), b.get(key), f"{path}.{key}" if path else key)
         return lines
     return [] if a == b else [f"{path}: {a!r} -> {b!r}"]
+
+
+def _by_name(value: Any) -> dict[str, Any]:
+    """A list of objects that all have names of their own, by these; nothing for anything else."""
+    if not isinstance(value, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str) for one in value):
+        return {}
+    named = {one["name"]: one for one in value}
+    return named if len(named) == len(value) else {}

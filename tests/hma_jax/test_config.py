@@ -25,7 +25,7 @@ from hma_jax.config import (
     TokenizerTrainConfig,
 )
 from hma_jax.config.base import check_choices
-from hma_jax.config.json import to_strict_json
+from hma_jax.config.json import diff, to_strict_json
 
 CONFIGS = [found for found in map(config.__dict__.get, config.__all__) if dataclasses.is_dataclass(found)]
 
@@ -97,3 +97,16 @@ def test_limits_that_can_work_are_accepted():
 def test_files_for_other_programs_hold_no_number_that_json_does_not_have():
     text = to_strict_json({"mean": 1.5, "sem": math.nan, "errors": [math.inf, -math.inf]})
     assert json.loads(text, parse_constant=pytest.fail) == {"mean": 1.5, "sem": None, "errors": [None, None]}
+
+
+def test_robots_that_differ_are_named_and_not_written_out():
+    arm, base = ({"name": name, "stride": 3, "mean": [0.1] * 26} for name in ("arm", "base"))
+
+    def told(here):
+        return diff({"entries": [arm, base]}, {"entries": here}, "table")
+
+    assert told([arm]) == ["table.entries: ['arm', 'base'] -> ['arm']"]
+    assert told([base, arm]) == ["table.entries: ['arm', 'base'] -> ['base', 'arm']"]
+    assert told([arm, base | {"stride": 2}]) == ["table.entries.base.stride: 3 -> 2"]
+    assert told([arm, dict(base)]) == []
+    assert told([arm, arm]) != [] and told([]) != []
