@@ -40,3 +40,19 @@ def test_the_summary_is_that_of_the_table_and_of_the_page(directory):
             assert agreed["spearman"]["mean"] == pytest.approx(spearman(true, rates), abs=1e-4)
         cells = " | ".join(shown(agreed[name]) for name in ("pearson", "spearman", "rank violation"))
         assert f"| {kind} | {cells} |" in page, kind
+
+
+@pytest.mark.parametrize("robot", ["pusher_sand", "arm_chalk"])
+def test_another_seed_came_as_the_page_says(robot):
+    """And within what had been expected."""
+    page = (ROOT / "docs" / "judging.md").read_text()
+    for name, label in (("pearson", "Pearson"), ("bias", "bias")):
+        first, other = (
+            json.loads((ROOT / "experiments" / "results" / f"judge-{robot}-reach-{run}" / "agreement.json").read_text())
+            ["agreement"]["learned model"]["policies and starts"][name]["mean"]
+            for run in ("weighed", "seed1")
+        )  # fmt: skip
+        (line,) = [line for line in page.splitlines() if line.startswith(f"| {label}, `{robot}` |")]
+        expected, came, before = (cell.strip() for cell in line.strip("|").split("|")[1:])
+        low, high = map(float, expected.partition("(")[2].strip(")").split(" to "))
+        assert (came, before) == (f"{other:.2f}", f"{first:.2f}") and low <= other <= high
