@@ -20,7 +20,7 @@ from experiments.rows import LOSS, OVERALL, UNTRAINED, Row
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
-from hma_jax.evaluation.summary import Summary, means_and_errors
+from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable
 
 Verdict = Literal["good", "bad", "open"]
@@ -130,9 +130,9 @@ def _same(a: float, b: float) -> bool:
 
 def _follows(result: Mapping[str, Any], windows: WindowTable, group: int) -> bool:
     """Whether the means of a result, and their errors, are those of the windows."""
-    said, found = Summary.from_dict(result["evaluation"]).datasets, means_and_errors(windows, group)
+    said, found = Summary.from_dict(result["evaluation"]).datasets, summarise(windows, group).datasets
     return said.keys() == found.keys() and all(
-        metric in found[robot] and all(map(_close, (stat.mean, stat.sem), found[robot][metric]))
+        metric in found[robot] and _close(stat.mean, found[robot][metric].mean) and _close(stat.sem, found[robot][metric].sem)
         for robot, stats in said.items()
         for metric, stat in stats.items()
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -64,27 +63,6 @@ def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
     return Summary(found)
 
 
-def means_and_errors(windows: WindowTable, perplexity_group: int) -> dict[str, dict[str, tuple[float, float]]]:
-    """{dataset: {metric: (mean, standard error)}} that `summarise` finds, to rounding: errors of all metrics of a dataset
-    are taken together, in a third of the time."""
-    found = {}
-    for name in windows.datasets:
-        own = windows.of(name)
-        there = _there(own.metrics)
-        whole = _estimates(own, perplexity_group)
-        whole |= {m: estimate_mean(own.metrics[m]) for m, known in there.items() if known.all()}
-        _, episode = np.unique(own.episode, return_inverse=True)
-        groups = int(episode.max()) + 1
-        few = groups / (groups - 1) if groups > 1 else math.nan
-        with np.errstate(invalid="ignore"):  # of an infinite perplexity nothing is known
-            sums = np.stack([e.influence for e in whole.values()]) @ (episode[:, None] == np.arange(groups))
-            sems = np.sqrt(few * (sums**2).sum(1)) / len(own)
-        found[name] = {m: (e.value, float(sem)) for (m, e), sem in zip(whole.items(), sems, strict=True)}
-        some = {m: own.metrics[m] for m, known in there.items() if not known.all()}
-        found[name] |= {m: (stat.mean, stat.sem) for m, stat in _of_some(own, some).items()}
-    return found
-
-
 def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> Summary:
     """`a` minus `b`, window by window, on the datasets and metrics that both have.
 
@@ -118,11 +96,6 @@ def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimat
 
 def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray]) -> dict[str, Stat]:
     """Means of the optional metrics in `columns`, of the windows that have them."""
-    there = _there(columns)
-    return {m: stat_of(estimate_mean(columns[m][known]), windows.episode[known]) for m, known in there.items()}
-
-
-def _there(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Which windows have each of the optional metrics that any has."""
     known = {metric: ~np.isnan(columns[metric]) for metric in OPTIONAL if metric in columns}
-    return {metric: there for metric, there in known.items() if there.any()}
+    there = {metric: which for metric, which in known.items() if which.any()}
+    return {m: stat_of(estimate_mean(columns[m][which]), windows.episode[which]) for m, which in there.items()}
