@@ -17,9 +17,11 @@ from tyro.conf import UseAppendAction, arg
 from experiments.override import override
 from experiments.presets import get_preset
 from experiments.program import PROGRAM
+from experiments.progress import console
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
 from experiments.study import Study, on_tokenizer, on_user_data
+from experiments.words import few
 from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.claim import is_address
 
@@ -150,6 +152,7 @@ def make_setting(where: StudyArguments, model: ModelConfig | None = None) -> Set
 
         study = on_tokenizer(study, load_config(asked.tokenizer))
     study = override(study, asked.set, model)
+    say_unmatched(asked.registry, study.all_names())
     if asked.mesh is not None:
         sizes = dict(zip(("data", "fsdp", "tensor"), asked.mesh, strict=True))
         mesh = replace(study.execution.mesh, **sizes)
@@ -164,6 +167,25 @@ def use_entries(registry: Path | None) -> None:
         from data_pipelines.registry.toml_file import load_entries
 
         register(load_entries(registry))
+
+
+def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
+    """Says which of the datasets `names` are read by the project's own entries, where the file has unused ones: the
+    heading of such a one may be misspelt, which reads as an entry of another dataset."""
+    if registry is None:
+        return
+    from data_pipelines.registry import find_spec
+    from data_pipelines.registry.toml_file import load_entries
+
+    given = [entry.name for entry in load_entries(registry)]
+    unused, own = [n for n in given if n not in names], [n for n in names if n not in given and find_spec(n)]
+    if unused and own:
+        console.print(
+            f"note: {short(registry)} has no entry called {few(own)}: the project's own is used. "
+            f"Its entries that nothing here uses: {few(unused)}",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def find_directories(names: Sequence[str], roots: Sequence[str]) -> tuple[str, ...]:

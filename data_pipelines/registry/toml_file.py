@@ -35,6 +35,8 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
         try:
             if not isinstance(fields, dict):
                 raise ConfigError(f"{name} = {fields!r} stands outside of a [dataset] table")
+            if "name" in fields:  # it would be the entry of another dataset than the heading says
+                raise ConfigError(f"{name}: leave out name = {fields['name']!r}: the heading is an entry's name")
             entries.append(from_dict(DatasetSpec, {"name": name} | fields, name))
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error

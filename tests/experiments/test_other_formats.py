@@ -23,6 +23,8 @@ def test_lerobot_and_robomimic_go_from_inspection_and_view_to_tokens(tmp_path, c
         sheets = ["--out", str(tmp_path / "sheets")]
         assert main(["data", "inspect", place, "--entry", str(entries), "--frames", "2", *sheets]) == 0
         assert "Hz: stride" in capsys.readouterr().out  # the files say the rate
+    assert main(["data", "view", *data, "--frames", "2", "--out", str(tmp_path / "first.html")]) == 0
+    assert "rate unknown" not in capsys.readouterr().out
     # These recordings are short, and frames of one colour look blank, as real ones would not.
     text = entries.read_text().replace("video_targets = false\n", "")
     entries.write_text(text.replace("hz = 20.0", "hz = 4.0"))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from data_pipelines.inspection.inspect import Shown
+from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.toml_file import to_toml
 from experiments.cli.main import main
 from experiments.contact_sheet import TILE, draw_sheet
 from experiments.setting import StudyArguments, find_directories, make_setting
@@ -110,6 +113,20 @@ def test_inspection_of_a_known_dataset_takes_the_registry_s_rate(tmp_path, capsy
     assert facts["episodes"] == 3 and len(facts["actions"][0]["dimensions"]) == 7
 
 
+def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
+    """An entry's own rate of frames counts; another native rate than the entry's is none that a study would take."""
+    entry = replace(get_spec("bridge_dataset"), rate=2.5)
+    (tmp_path / "my.toml").write_text(to_toml(entry))
+    assert main(["data", "inspect", str(REAL_DATA), "--out", str(tmp_path), "--registry", str(tmp_path / "my.toml")]) == 0
+    assert "rate 5 Hz (registry): stride 2, 2.50 Hz" in capsys.readouterr().out
+    registry_table._registered.clear()
+    for looked in (["inspect", str(REAL_DATA)], ["view", str(REAL_DATA), "--episodes", "2", "--shown", "1"]):
+        out = tmp_path / looked[0]
+        assert main(["data", *looked, "--hz", "10", "--out", str(out)]) == 0
+        said = capsys.readouterr().out
+        assert f"hma data inspect {REAL_DATA}/1.0.0 --hz 10 --entry my_robots.toml" in said and "hma tokenize" not in said
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -136,6 +153,27 @@ def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path):
         assert main(["data", "inspect", str(robot), *arguments]) == 0
     text = file.read_text()
     assert text.count('["my_robot"]') == 1 and "hz = 5.0" in text and "hz = 4" not in text
+
+
+def test_a_misspelt_heading_of_a_known_dataset_is_told(tmp_path, capsys):
+    """A file with an entry too many may be meant: of several datasets, say. That the project's own is used is said."""
+    file = tmp_path / "my.toml"
+    arguments = [str(REAL_DATA), "--hz", "10", "--out", str(tmp_path)]
+    assert main(["data", "inspect", *arguments, "--entry", str(file)]) == 0
+    right = file.read_text()
+    told = "note: {} has no entry called bridge_dataset: the project's own is used. Its entries that nothing here uses: "
+    for entries, noted in (
+        (right, False),
+        (right + right.replace("bridge_dataset", "another"), False),
+        (right.replace("bridge_dataset", "bridge_datset"), True),
+    ):
+        registry_table._registered.clear()
+        file.write_text(entries)
+        capsys.readouterr()
+        assert main(["data", "inspect", *arguments, "--registry", str(file)]) == 0
+        assert (told.format(file) + "bridge_datset" in capsys.readouterr().out) == noted
+        make_setting(StudyArguments("smoke", tmp_path, (str(REAL_DATA),), file))
+        assert (told.format(file) + "bridge_datset" in capsys.readouterr().out) == noted
 
 
 def test_mixture_names_the_datasets_of_a_study(tmp_path, capsys):

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from data_pipelines.inspection.inspect import Facts
 
 
+ENTRIES = "my_robots.toml"
+
+
 def tokenize_command(
     directories: Sequence[str], frames: int, registry: Path | None, longest: int, rate: float | None = None
 ) -> str:
@@ -46,3 +49,15 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
         f"{words}  (no episode that was read has the {2 * stride} steps that the shortest window takes at stride "
         f"{stride}; the longest has {longest}: every frame is needed, or the rate is another one, --hz)"
     )
+
+
+def other_rate(facts: Facts, hz: float | None) -> str | None:
+    """What to run first where a known dataset was looked at with another native rate than its entry's, which is the
+    one that a study takes; None where they agree."""
+    from data_pipelines.registry import find_spec
+
+    known = find_spec(facts.name)
+    if known is None or hz is None or known.hz == hz:
+        return None
+    words = command("data inspect", facts.directory, "--hz", f"{hz:g}", "--entry", ENTRIES)
+    return f"{words}  (its entry says {known.hz:g} Hz, which a study takes, not {hz:g}; this writes another entry)"

@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from experiments.cli.data.next_command import no_window, tokenize_command
+from experiments.cli.data.next_command import no_window, other_rate, tokenize_command
 from experiments.progress import console, step, tidy_table
-from experiments.setting import use_entries
+from experiments.setting import say_unmatched, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import to_strict_json
@@ -130,17 +130,19 @@ def data_inspect(
         sample = inspect_dataset(directory, split, episodes=episodes)
     facts = sample.facts
     known = find_spec(facts.name)
-    hz = hz or facts.hz
-    suggestion = suggest_entry(facts, hz or (known.hz if known else None))
+    say_unmatched(registry, (facts.name,))
+    suggested = hz or facts.hz or (known.hz if known else None)
+    suggestion = suggest_entry(facts, suggested)
     if entry is not None and (suggestion is None or not suggestion.hz):
         raise ConfigError("--entry needs the native rate, which is not in the files: add --hz")
     print_facts(facts)
-    rate, windows = hz or (known.hz if known else None), None
+    taken = None if entry else known  # as the dataset is read afterwards
+    rate, windows = hz or (taken.hz if taken else suggested), None
     if rate:
-        stride = stride_of(rate)
+        stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate)
         windows = window_facts(facts, stride, frames)
         console.print(
-            f"[bold]rate[/] {rate:g} Hz{'' if hz else ' (registry)'}: stride {stride}, "
+            f"[bold]rate[/] {rate:g} Hz{'' if hz or not taken else ' (registry)'}: stride {stride}, "
             f"{rate / stride:.2f} Hz; a whole window of {frames} frames takes {windows.native} steps, the shortest "
             f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
             f"{windows.total:,.0f} windows in the split"
@@ -161,7 +163,7 @@ def data_inspect(
     if entry is not None:
         _write_entry(entry, suggestion)
     if known is not None or entry is not None:
-        _say_next(facts, windows, entry or registry)
+        _say_next(facts, windows, entry or registry, other_rate(facts, rate) if taken else None)
 
 
 def print_facts(facts: Facts) -> None:
@@ -215,7 +217,7 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
     else:
         same = (known.image_key, known.action_keys, known.action_dims)
         fits = same == (suggestion.image_key, suggestion.action_keys, suggestion.action_dims)
-        fits &= set(suggestion.angles) <= set(known.angles)
+        fits &= set(suggestion.angles) <= set(known.angles) and suggestion.hz == known.hz
         agrees = ", as its contents suggest" if fits else ". Its contents alone would suggest:"
         console.print(f"[bold]in the registry[/]: {escape(_in_words(known))}{agrees}", soft_wrap=True)
         if fits:
@@ -244,11 +246,14 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
     wrote(path)
 
 
-def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None) -> None:
-    """The command that reads the dataset as it was counted here, or what to try where nothing can be read."""
+def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, first: str | None) -> None:
+    """The command that reads the dataset as it was counted here, or what to try where nothing can be read. `first`: what
+    comes before either."""
     if windows is None:
         return
-    if windows.total:
+    if first:
+        words = first
+    elif windows.total:
         spans = facts.lengths.longest // windows.stride
         words = tokenize_command((facts.directory,), windows.frames, entries, spans)
     else:

@@ -12,9 +12,9 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from experiments.cli.data.next_command import no_window, tokenize_command
+from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, tokenize_command
 from experiments.progress import console, step
-from experiments.setting import command, use_entries
+from experiments.setting import command, say_unmatched, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.runtime.files import write_file
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from data_pipelines.inspection.duplicates import Fingerprint
     from data_pipelines.inspection.inspect import Facts
     from experiments.report.data_page import Viewed
-
-ENTRIES = "my_robots.toml"
 
 OTHER_SPLITS = 2
 """Splits beside the one shown that are searched for the same episodes."""
@@ -48,7 +46,7 @@ def view(
         datasets: RLDS directories (paths or URLs), LeRobot folders, robomimic files.
         out: The page, a single file that needs nothing else.
         split: The split to look at; the registry's, or train, if not given.
-        hz: Native rate of the frames, if the registry does not know the dataset or is wrong.
+        hz: Native rate of the frames, where neither a file nor the registry says it, or is wrong.
         stride: Native frames per frame of the model; what comes nearest to 2 Hz if not given.
         frames: Frames of the model's window, to count windows.
         episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
@@ -68,6 +66,7 @@ def view(
         with step(f"read {directory}"):
             viewed.append(_view_one(directory, split, hz, stride, frames, episodes, shown))
         _say_remarks(viewed[-1])
+    say_unmatched(registry, [one.facts.name for one in viewed])
     given = {
         "split": split, "hz": hz and f"{hz:g}", "stride": stride, "frames": frames, "episodes": episodes,
         "shown": shown, "registry": registry,
@@ -95,7 +94,7 @@ def _view_one(
     split = split or (known.split if known else "train")
     sample = inspect_dataset(directory, split, episodes=episodes, shown=shown, frames=CLIP_FRAMES)
     facts = sample.facts
-    rate = hz or (known.hz if known else None)
+    rate = hz or (known.hz if known else facts.hz)
     entry = replace(known, hz=rate) if known else None
     if known is None and rate is not None:
         suggestion = suggest_entry(facts, rate)
@@ -145,6 +144,8 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
             after = f"{words}  (it is not in the registry; this writes its entry)"
         elif any(r.title == MISFIT for r in v.remarks):
             after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
+        elif first := other_rate(f, v.hz):
+            after = first
         elif not window_facts(f, v.stride, frames).total:
             after = no_window(f, v.stride, registry)
         elif v.stride != v.entry.stride and v.entry.rate is not None:

@@ -232,6 +232,7 @@ def test_registered_entry_is_found_and_takes_the_place_of_a_known_one(registered
         ("hz = 3", "hz = 3 stands outside"),
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\n', "robot: missing field.* hz"),
         ('[robot]\nimage = "i"\n', "unknown field.* image; known"),
+        ('[robot]\nname = "arm"\nimage_key = "i"\n', "robot: leave out name = 'arm'"),
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\nhz = -1\n', "hz, the native rate"),
     ],
 )
