@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from data_pipelines.sampling.splits import check_bounds
+from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, check_bounds
 from hma_jax.config import (
     AnyTokenizerConfig,
     ConfigError,
@@ -47,10 +47,10 @@ class SuiteConfig:
 class StoreConfig:
     """What the token store keeps (`data_pipelines.tokens.tokenize_job`)."""
 
-    val_fraction: float = 0.05  # of episodes that are held out
-    min_val: int = 2  # held-out episodes per dataset, at least
-    max_val: int = 200  # and at most
-    max_val_fraction: float = 0.25  # of a dataset, at most, whatever min_val says
+    val_fraction: float = VAL_FRACTION  # of episodes that are held out
+    min_val: int = MIN_VAL  # held-out episodes per dataset, at least
+    max_val: int = MAX_VAL  # and at most
+    max_val_fraction: float = MAX_VAL_FRACTION  # of a dataset, at most, whatever min_val says
     frame_step: int | None = None  # None: only the frames of the study's rate; 1: those of any rate
     corrupt: Literal["raise", "skip"] = "raise"  # damaged records: stop, or leave out and count
     max_skipped: float = 16.0  # damaged episodes per dataset that may be left out; below 1: this share of them

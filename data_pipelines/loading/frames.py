@@ -20,7 +20,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sampling.draws import Draws
 from data_pipelines.sampling.mixture import make_mixture
 from data_pipelines.sampling.order import ENDLESS, endless_shuffle, hash64, stream_seed
-from data_pipelines.sampling.splits import held_out_episodes
+from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, held_out_episodes
 from data_pipelines.sources.identity import describe
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
@@ -42,10 +42,10 @@ def make_frame_loader(
     seed: int,
     start_step: int = 0,
     tau: float = 3.0,
-    val_fraction: float = 0.05,
-    min_val: int = 2,
-    max_val: int = 200,
-    max_val_fraction: float = 0.25,
+    val_fraction: float = VAL_FRACTION,
+    min_val: int = MIN_VAL,
+    max_val: int = MAX_VAL,
+    max_val_fraction: float = MAX_VAL_FRACTION,
     split: Literal["train", "val"] = "train",
     corrupt: Literal["raise", "skip"] = "raise",
     max_skipped: float = MAX_SKIPPED,

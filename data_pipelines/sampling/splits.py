@@ -17,6 +17,9 @@ from data_pipelines.sampling.order import hash64, stream_seed
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
 from hma_jax.config import require
 
+VAL_FRACTION, MIN_VAL, MAX_VAL, MAX_VAL_FRACTION = 0.05, 2, 200, 0.25
+"""How many episodes are held out, unless a study says otherwise: see `count_held_out`."""
+
 
 def held_out_episodes(
     spec: DatasetSpec, runs: Sequence[EpisodeRun], fraction: float, min_val: int, max_val: int, max_fraction: float
@@ -37,10 +40,10 @@ def held_out_episodes(
 def held_out(
     dataset: str,
     ids: np.ndarray,
-    fraction: float = 0.05,
-    min_val: int = 2,
-    max_val: int = 200,
-    max_fraction: float = 0.25,
+    fraction: float = VAL_FRACTION,
+    min_val: int = MIN_VAL,
+    max_val: int = MAX_VAL,
+    max_fraction: float = MAX_VAL_FRACTION,
 ) -> np.ndarray:
     """bool [episodes], True for validation. `ids`: uint64 [episodes], of all, readable or not.
 

@@ -19,7 +19,7 @@ import numpy as np
 from data_pipelines.columns import Column, write_columns
 from data_pipelines.errors import DataError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
-from data_pipelines.sampling.splits import check_bounds, count_held_out
+from data_pipelines.sampling.splits import MAX_VAL, MIN_VAL, VAL_FRACTION, check_bounds, count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
 from data_pipelines.tokens.row_sample import Spread
@@ -73,9 +73,9 @@ class TokenizerFacts:
 class JobSettings:
     """What a tokenising job may choose. Equal settings on equal input give equal stores."""
 
-    val_fraction: float = 0.05
-    min_val: int = 2
-    max_val: int = 200
+    val_fraction: float = VAL_FRACTION
+    min_val: int = MIN_VAL
+    max_val: int = MAX_VAL
     keep_frames: str = "val"  # which splits keep raw frames: none, val or all
     frame_step: int = 1  # stored frames are every frame_step-th native one
     # Of a dataset, whatever min_val says. Stores of earlier versions do not say it, and had this (`LATER`).

@@ -22,7 +22,7 @@ import numpy as np
 
 from data_pipelines.errors import EpisodeError
 from data_pipelines.registry import FRAME_RATE, DatasetSpec
-from data_pipelines.sampling.splits import held_out_episodes
+from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, held_out_episodes
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.images import fit_image
 from data_pipelines.sources.source import MAX_SKIPPED, EpisodeSource
@@ -53,10 +53,10 @@ def tokenize_dataset(
     tokenizer: Tokenizer,
     store_root: str | Path,
     *,
-    val_fraction: float = 0.05,
-    min_val: int = 2,
-    max_val: int = 200,
-    max_val_fraction: float = 0.25,
+    val_fraction: float = VAL_FRACTION,
+    min_val: int = MIN_VAL,
+    max_val: int = MAX_VAL,
+    max_val_fraction: float = MAX_VAL_FRACTION,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
     rate: float | None = FRAME_RATE,
@@ -119,7 +119,7 @@ def plan_dataset(
     min_val: int,
     max_val: int,
     *,
-    max_val_fraction: float = 0.25,
+    max_val_fraction: float = MAX_VAL_FRACTION,
     keep_frames: Literal["none", "val", "all"] = "val",
     frame_step: int | None = None,
     rate: float | None = FRAME_RATE,
