@@ -179,19 +179,39 @@ def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOp
 
 def _require_trained_here(setting: Setting, run: Path) -> None:
     """Raises ConfigError for a run that was converted: it was trained on no data that training could go on with."""
-    from hma_jax.training.reading import CheckpointError, list_steps, read_description
-
-    checkpoints, described, latest = run.absolute() / "checkpoints", {}, 0
-    for latest in list_steps(checkpoints)[-1:]:
-        with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
-            described = read_description(checkpoints / str(latest))
+    step, described = _newest(run)
     # What has no table is no model, of which the restoring speaks too. Training saves nothing before its first step:
     # weights of step 0 are another run's, under its description perhaps (`hma convert from-safetensors`).
     require(
-        "table" not in described or (latest > 0 and "loader" in described["provenance"]),
+        "table" not in described or (step > 0 and "loader" in described["provenance"]),
         f"{short(run)} was converted, not trained here, so it cannot be resumed; fine-tune it with: "
         f"{setting.command('train', '--from', run)} --run NEW",
     )
+
+
+def _newest(run: Path) -> tuple[int, dict[str, Any]]:
+    """(step, description) of the newest checkpoint of a run that says what it is; (0, {}) without any."""
+    from hma_jax.training.reading import CheckpointError, list_steps, read_description
+
+    checkpoints = run.absolute() / "checkpoints"
+    for step in reversed(list_steps(checkpoints)):
+        with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
+            return step, read_description(checkpoints / str(step))
+    return 0, {}
+
+
+def _taken(run: Path, origin: dict[str, Any]) -> dict[str, Any]:
+    """What `run` began with, if that is an earlier step of `origin`, which has trained on since; otherwise `origin`."""
+    taken = _newest(run)[1].get("provenance", {}).get("origin", origin)
+    if taken["provenance"] != origin["provenance"] or taken["step"] >= origin["step"]:
+        return origin
+    console.print(
+        f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and goes on "
+        "from its own checkpoint",
+        markup=False,
+        soft_wrap=True,
+    )
+    return taken
 
 
 def _require_devices(setting: Setting) -> None:
@@ -237,6 +257,8 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
 
     materials, steps = open_materials(setting.workspace), trial.train.steps
     say_data(trial, materials)
+    if "origin" in start:
+        start["origin"] = _taken(run, start["origin"])
     with step(f"train width {trial.model.width} for {steps:,} steps of {trial.train.batch} windows") as update:
         result = train_trial(
             trial,

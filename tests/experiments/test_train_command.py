@@ -1,6 +1,7 @@
 """`hma train`: its own settings, and what it says it trains on."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -203,6 +204,31 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
     assert main(other) != 0
     said = capsys.readouterr().err
     assert "is another model than --set asks for (there -> asked for): model.width: 16 -> 24. Leave out" in said
+
+
+@pytest.mark.parametrize("command", ["train", "adapt"])
+def test_a_run_goes_on_though_the_one_that_it_began_with_has_trained_on(command, tmp_path, capsys):
+    source, run, damaged = tmp_path / "a" / "model", tmp_path / "b" / "model", tmp_path / "b" / "model" / "checkpoints" / "3"
+    known, new = write_rlds(tmp_path / "known", ARM, [18] * 12), write_rlds(tmp_path / "new", BASE, [40] * 12)
+    trained = ["train", *SMOKE, "--out", str(tmp_path / "a"), "--data", str(known)]
+    begun = [*SMOKE, "--out", str(tmp_path / "b"), "--data", str(known if command == "train" else new), "--skip-damaged"]
+    begun = [command, *(["--from"] if command == "train" else []), str(source), *begun, "--checkpoint-every", "1"]
+
+    def said(arguments: list[str], steps: int, code: int = 0) -> str:
+        assert main([*arguments, "--set", f"train.steps={steps}", "--set", "train.optimizer.schedule=constant"]) == code
+        return " ".join("".join(capsys.readouterr()).split())
+
+    said(trained, 2)
+    said(begun, 3)
+    said(trained, 4)
+    next(damaged.rglob("_CHECKPOINT_METADATA")).write_bytes(b"")  # what is left to say what it began with is earlier
+    note = f"note: {run} began with step 2 of a model that has 4 by now, and goes on from its own checkpoint"
+    assert note in said(begun, 4)
+    assert load_run(run).step == 4 and load_run(run).provenance["origin"]["step"] == 2
+    shutil.rmtree(source / "checkpoints" / "4")
+    shutil.rmtree(source / "checkpoints" / "2")
+    said(trained, 1)
+    assert "provenance.origin.step: 2 -> 1" in said(begun, 5, code=2)  # it is another one, or was trained anew
 
 
 def test_robots_are_added_to_the_averaged_weights_of_a_run_that_keeps_them(tmp_path):
