@@ -48,8 +48,10 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
 
     require_free(out)
     run = read_official(checkpoint)
-    write_run(run, out)
-    _write_rates(run, out / RATES)
+    rates, without = _rates(run)
+    write_run(run, out, {RATES: rates})
+    for note in without:
+        console.print(note, markup=False, soft_wrap=True)
     if run.model.conditioning == "cross_attention":
         console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
     _describe(run)
@@ -176,11 +178,10 @@ def to_stablehlo(
     wrote(out, then=f"read {_quoted(out / 'model.json')} for the program's inputs and outputs")
 
 
-def _write_rates(run: Run, path: Path) -> None:
-    """Registry entries of the run's robots, at the rates that give their strides. Says which robots have none."""
+def _rates(run: Run) -> tuple[str, list[str]]:
+    """Registry entries of the run's robots, at the rates that give their strides; notes on robots that have none."""
     from data_pipelines.registry import find_spec
     from data_pipelines.registry.toml_file import to_toml
-    from hma_jax.runtime.files import write_file
 
     entries, unknown, other = [], [], []
     for robot in run.table.entries:
@@ -191,14 +192,11 @@ def _write_rates(run: Run, path: Path) -> None:
             other.append(f"{robot.name} ({robot.action_dim} values, {spec.action_dim} here)")
         else:
             entries.append(to_toml(replace(spec, rate=spec.rate_for(robot.stride))))
-    write_file(path, "\n".join(entries))
-    for names, why in ((unknown, "which the registry does not know"), (other, "of other actions than the registry's")):
-        if names:
-            console.print(
-                f"note: not in {path.name}: {', '.join(names)}, {why}; to use one write an entry (docs/own_data.md)",
-                markup=False,
-                soft_wrap=True,
-            )
+    return "\n".join(entries), [
+        f"note: not in {RATES}: {', '.join(names)}, {why}; to use one write an entry (docs/own_data.md)"
+        for names, why in ((unknown, "which the registry does not know"), (other, "of other actions than the registry's"))
+        if names
+    ]
 
 
 def _study_of(run: Run, rates: Path) -> str:

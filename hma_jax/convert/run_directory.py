@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
 
@@ -10,14 +11,15 @@ import numpy as np
 
 from hma_jax.convert.aside import written_aside
 from hma_jax.model.params import Use
+from hma_jax.runtime.files import write_file
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.optimizer import AdamState
 from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState
 
 
-def write_run(run: Run, directory: Path) -> None:
-    """Writes a checkpoint of step 0 with an optimiser that has not moved yet.
+def write_run(run: Run, directory: Path, beside: Mapping[str, str] | None = None) -> None:
+    """Writes a checkpoint of step 0 with an optimiser that has not moved yet, and texts beside it, by their files' names.
 
     Raises ConfigError if `directory` exists.
     """
@@ -25,6 +27,8 @@ def write_run(run: Run, directory: Path) -> None:
         meta = describe_run(run.model, run.train, run.table, run.provenance)
         with Checkpoints(aside / "checkpoints", meta) as checkpoints:
             checkpoints.save(0, fresh_state(run))
+        for name, text in (beside or {}).items():
+            write_file(aside / name, text)
 
 
 def fresh_state(run: Run) -> TrainState:

@@ -1,6 +1,7 @@
 """`hma convert`, from an official checkpoint through every format and back."""
 
 import json
+import os
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,20 @@ def test_a_released_model_comes_with_the_rates_that_give_its_strides_and_the_com
     first, second = (shlex.split(part) for part in command.split("&&"))
     assert first[:2] == ["hma", "tokenize"] and second[:3] == ["hma", "evaluate", str(run)] and first[2:] == second[3:]
     assert str(run / "rates.toml") in first and "model.frames=3" in first and "eval.prompt_frames=1" in first
+
+
+def test_a_run_comes_to_its_place_with_its_rates(tmp_path, monkeypatch):
+    """A kill after the run is there leaves nothing out: all of it is renamed at once."""
+    start, run = make_checkpoint(tmp_path / "a", DISCRETE, [("bridge_dataset", 7, 2)]), tmp_path / "run"
+
+    def killed(made, place, replace=os.replace):
+        replace(made, place)
+        if Path(place) == run:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", killed)
+    main(["convert", "from-official", str(start), "--out", str(run)])
+    assert [entry.rate for entry in load_entries(run / "rates.toml")] == [2.5] and load_run(run).step == 0
 
 
 @pytest.mark.parametrize(("base", "loads"), [(DISCRETE, True), (CONTINUOUS, False)], ids=["discrete", "continuous"])
