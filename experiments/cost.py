@@ -151,6 +151,18 @@ def devices_of(mesh: MeshConfig, share: float | None) -> float:
     return share
 
 
+def devices_for(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
+    """`devices_of` every trial of `sweeps`. Raises ConfigError also where a batch or a model does not divide over them."""
+    from hma_jax.runtime.mesh import check_sizes, mesh_sizes
+
+    execution = study.execution
+    devices = devices_of(execution.mesh, share)
+    sizes = mesh_sizes(execution.mesh, math.ceil(devices))
+    for trial in unique_trials(sweeps, UNKNOWN).values():
+        check_sizes(sizes, trial.model, trial.train.batch, execution.accumulate)
+    return devices
+
+
 def plan_trials(
     study: Study, sweeps: Sequence[Sweep], devices: float = 1.0, evaluated: bool = True
 ) -> dict[str, TrialPlan]:

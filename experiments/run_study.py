@@ -12,6 +12,7 @@ from experiments.progress import SweepMonitor, console
 from experiments.report.draw import draw
 from experiments.running.attempts import State, read_states
 from experiments.running.closure import Closure
+from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import FINISHED, Ledger
 from experiments.running.provenance import Provenance
@@ -47,20 +48,18 @@ def run_study(
     directory holds another study, unless `replace` allows it, and before any trial, if one that is finished was
     changed, or if trials ran other sources than there are now and nobody accepts that.
     """
-    from experiments.cost import devices_of
     from experiments.preparing.pipeline import prepare
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
 
     study, workspace = setting.study, setting.workspace
-    with launcher.launcher(workspace.root):
-        pass  # or nothing could run, once all is prepared
-    devices_of(study.execution.mesh, launcher.share())  # or every trial would fail, once all is prepared
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
-    with workspace.locked():
+    require_devices(study, sweeps, launcher)
+    # Without the place, or its devices, every trial would fail once all is prepared.
+    with launcher.launcher(workspace.root) as place, workspace.locked():
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
         provenance = prepare(study, workspace, setting.data, setting.tokenizer, replace=replace)
@@ -77,9 +76,21 @@ def run_study(
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
         jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common)
-        states = run_jobs(jobs, workspace, launcher, retry_failed)
+        states = run_jobs(jobs, workspace, place, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
+
+
+def require_devices(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
+    """Raises ConfigError for a mesh that does not fit what a trial gets, or that a batch or a model does not divide over."""
+    from experiments.cost import devices_for
+
+    share = launching.share()
+    if share is None and launching.name == "local":  # no accelerators are known: trials have what JAX finds, as it does here
+        import jax
+
+        share = float(jax.device_count())
+    devices_for(study, sweeps, share)
 
 
 def make_jobs(
@@ -140,9 +151,7 @@ def find_earlier(workspace: Workspace, study: Study, replace: Step | None) -> Re
     return None if lines else earlier
 
 
-def run_jobs(
-    jobs: Sequence[Job], workspace: Workspace, launching: Launching, retry_failed: bool
-) -> dict[str, State]:
+def run_jobs(jobs: Sequence[Job], workspace: Workspace, launcher: Launcher, retry_failed: bool) -> dict[str, State]:
     """Runs what is missing, visibly."""
     ledger = Ledger(workspace.ledger)
     before = read_states([job.id for job in jobs], workspace.trials, ledger)
@@ -151,10 +160,8 @@ def run_jobs(
         console.print(f"{kept} of {len(jobs)} trials are finished already")
     if kept == len(jobs):
         return before
-    with launching.launcher(workspace.root) as launcher, SweepMonitor(len(jobs), kept) as monitor:
-        return run_missing(
-            jobs, workspace.trials, ledger, launcher, retry_failed=retry_failed, monitor=monitor
-        )
+    with SweepMonitor(len(jobs), kept) as monitor:
+        return run_missing(jobs, workspace.trials, ledger, launcher, retry_failed=retry_failed, monitor=monitor)
 
 
 def require_results(jobs: Sequence[Job], states: dict[str, State], again: str) -> None:

@@ -76,10 +76,10 @@ def _run(
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launching = Launching(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
-        from experiments.cost import Devices, devices_of, plan_table
+        from experiments.cost import Devices, devices_for, plan_table
 
-        devices = Devices(devices_of(setting.study.execution.mesh, launching.share()), launching.at_once)
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
+        devices = Devices(devices_for(setting.study, sweeps, launching.share()), launching.at_once)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained))
         return
     from experiments.run_study import run_study

@@ -240,14 +240,15 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 
 def _print_cost(setting: Setting, trial: Trial, processes: int) -> None:
     """The dry run of a study with nothing but this trial, on the devices of so many `processes` as this one."""
-    from experiments.cost import Devices, devices_of, plan_table
+    from experiments.cost import Devices, devices_for, plan_table
     from experiments.running.launchers.registry import Launching
     from experiments.sweeps.sweep import Point, Sweep
 
     mesh, own = setting.study.execution.mesh, Launching().share()
     share = own * processes if own else float(max(processes, mesh.least))
     model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
-    devices, given, trained = Devices(devices_of(mesh, share)), bool(setting.data), setting.tokenizer is None
+    devices = Devices(devices_for(setting.study, [model], share))
+    given, trained = bool(setting.data), setting.tokenizer is None
     console.print(plan_table(setting.study, [model], devices, given=given, trained=trained, evaluated=False))
 
 

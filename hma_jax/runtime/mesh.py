@@ -67,12 +67,17 @@ def split_over_slices(sizes: Sequence[int], slices: int) -> list[int]:
 
 def check_mesh(mesh: Mesh, model: ModelConfig, batch: int, accumulate: int = 1) -> None:
     """Raises ConfigError if a batch, or what `tensor` splits of the model, does not divide over the mesh."""
-    ways, tensor = mesh.shape["data"] * mesh.shape["fsdp"], mesh.shape["tensor"]
+    check_sizes([mesh.shape[axis] for axis in AXES], model, batch, accumulate)
+
+
+def check_sizes(sizes: Sequence[int], model: ModelConfig, batch: int, accumulate: int = 1) -> None:
+    """`check_mesh` by the sizes of the mesh's axes, for devices that are elsewhere."""
+    data, fsdp, tensor = sizes
     parts = f" in {accumulate} micro-batches" if accumulate > 1 else ""
     require(
-        batch % (ways * accumulate) == 0,
-        f"a batch of {batch}{parts} does not divide over data={mesh.shape['data']} x fsdp={mesh.shape['fsdp']} "
-        f"devices; make it a multiple of {ways * accumulate}, or change the mesh",
+        batch % (data * fsdp * accumulate) == 0,
+        f"a batch of {batch}{parts} does not divide over data={data} x fsdp={fsdp} devices; make it a multiple of "
+        f"{data * fsdp * accumulate}, or change the mesh",
     )
     for name, size in (("heads", model.heads), ("mlp_width", model.mlp_width)):
         require(

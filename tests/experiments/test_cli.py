@@ -3,7 +3,7 @@
 import shlex
 import subprocess
 import sys
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -167,6 +167,25 @@ def test_a_place_without_its_engine_is_refused_before_anything_is_prepared(monke
     monkeypatch.setattr(pipeline, "prepare", lambda *_, **__: pytest.fail("hours were spent on preparing"))
     assert main(["study", "--preset", "smoke", "--out", str(tmp_path / "out")]) == 2
     assert "no Slurm here" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_the_place_where_trials_run_is_entered_once(instant_trials, tmp_path, monkeypatch):
+    """A Ray cluster was joined to see that it is there, left, and joined again once all was prepared."""
+    entered, place = [], object()
+
+    @contextmanager
+    def enter(*_):
+        entered.append("in")
+        yield place
+        entered.append("out")
+
+    monkeypatch.setattr(Launching, "launcher", enter)
+    real = study_runs.run_missing
+    monkeypatch.setattr(
+        study_runs, "run_missing", lambda *given, **more: entered.append(given[3] is place) or real(*given, **more)
+    )
+    assert main(["sweep", "settings", "--preset", "smoke", "--out", str(tmp_path)]) == 0
+    assert entered == ["in", True, "out"]
 
 
 def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp_path, capsys):

@@ -110,6 +110,7 @@ def test_every_launcher_says_which_devices_a_trial_runs_on(gpus, launching, mesh
 def test_the_plan_prices_the_devices_that_trials_run_on(capsys):
     """Before, a rate was that of a whole machine, for each worker."""
     plan = ["study", "--preset", "smoke", "--dry-run", "--set", "trial_seconds=3600", "--set", "flops_per_second=1e20"]
+    plan += ["--set", "train.batch=8"]
     for more, said in (
         ("", "priced for 1 device at 100.0 EFLOP/s each (flops_per_second); 5.0 device-hours"),
         ("--workers 5", "priced for 5 devices, 1 for each trial, at 100.0 EFLOP/s each (flops_per_second); 5.0 dev"),
@@ -138,6 +139,15 @@ def test_a_mesh_that_does_not_fit_what_a_trial_gets_is_refused_before_it_is_pric
     assert devices_of(MeshConfig(1, 1, 1), 0.5) == 0.5
     with pytest.raises(ConfigError, match="a mesh of data=8, fsdp=1, tensor=1 does not fit 4 device"):
         devices_of(MeshConfig(8, 1, 1), 4.0)
+
+
+def test_a_mesh_that_a_trial_does_not_divide_over_is_refused_before_it_is_priced(capsys, monkeypatch):
+    monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", ("0", "1", "2")))
+    for command in ("train", "study"):
+        assert main([command, "--preset", "smoke", "--dry-run"]) == 2
+        assert "a batch of 4 does not divide over data=3 x fsdp=1 devices" in capsys.readouterr().err
+        assert main([command, "--preset", "smoke", "--dry-run", "--mesh", "1", "1", "3"]) == 2
+        assert "tensor=3 does not divide the model's heads of 2" in capsys.readouterr().err
 
 
 def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):

@@ -73,6 +73,7 @@ def test_all_trajectories_unless_told_otherwise(train, tmp_path):
 def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(local, "find_accelerators", lambda: None)
     dry = ["train", "--preset", "smoke", "--dry-run", "--out", str(tmp_path), "--set", "flops_per_second=1e20"]
+    dry += ["--set", "train.batch=16"]
     for more, said in (
         ("", "priced for 1 device at 100.0 EFLOP/s each"),
         ("--mesh 2 -1 2", "priced for 4 devices at"),
@@ -89,10 +90,14 @@ def test_a_dry_run_prices_the_one_model_and_makes_nothing(tmp_path, monkeypatch,
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", ["train", "adapt", "sweep"])
-def test_a_mesh_that_does_not_fit_is_refused_before_anything_is_prepared(command, where, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("command", "gpus"), [("train", ()), ("adapt", ()), ("sweep", ("0",)), ("sweep", ())], ids=lambda x: x or "cpu"
+)
+def test_a_mesh_that_does_not_fit_is_refused_before_anything_is_prepared(
+    command, gpus, where, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
-    monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", ("0",)))
+    monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", gpus) if gpus else None)
     study = [*SMOKE, "--out", str(tmp_path / "out"), "--data", *where[where.index("--data") + 1 :], "--mesh", "3", "1", "1"]
     more = {"train": [], "sweep": ["width"]}
     if command == "adapt":
