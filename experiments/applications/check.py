@@ -18,7 +18,8 @@ from data_pipelines.windows.evalset import EvalManifest, eval_batches
 from experiments.running.trial import Materials, open_materials
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
-from hma_jax.config import ConfigError, require
+from experiments.words import few
+from hma_jax.config import require
 from hma_jax.evaluation.effects import FEWEST, Effect, find_effects, make_loss
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.folder import find_robots
@@ -41,37 +42,47 @@ def open_study(workspace: Workspace) -> Materials:
     return open_materials(workspace)
 
 
+def choose_robots(
+    run: Path, model: Model, materials: Materials, robots: Sequence[str], windows: int, out: Path
+) -> tuple[list[str], dict[str, str]]:
+    """(robots to be checked, why each of the others has too few episodes) of those that are asked for, () for all of the
+    study in `out`, whose tokens are the model's.
+
+    Raises ConfigError where the study does not know a robot, or none is left.
+    """
+    store, manifest = materials.store, materials.manifest
+    frozen = [d.dataset for d in manifest.datasets]
+    there = [r.name for r in find_robots(run, model.table) if r.name in frozen]
+    names = list(robots) or there
+    unknown = [name for name in names if name not in there]
+    require(bool(names) and not unknown, f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}")
+    why = {name: short for name in names if (short := shortage(store, manifest, name, windows, out))}
+    left = [name for name in names if name not in why]
+    others = f". Nor are there enough of {few(names[1:])}" if len(names) > 1 else ""
+    require(bool(left), f"{why.get(names[0])}{others}")
+    return left, why
+
+
 def check_run(
     run: Path,
     model: Model,
     materials: Materials,
     robots: Sequence[str],
     windows: int,
-    out: Path,
     spoil: Spoil = lambda actions: actions,
 ) -> dict[str, list[Effect]]:
-    """Effects of each robot's dimensions, on so many held-out windows of the study in `out`, whose tokens are the model's.
-
-    Raises ConfigError where the study does not know a robot, or has too few episodes of it.
-    """
-    store, manifest = materials.store, materials.manifest
+    """Effects of each robot's dimensions, on so many held-out windows of each."""
     known = {r.name: r for r in find_robots(run, model.table)}
-    there = [name for name in known if name in manifest.names]
-    names = list(robots) or there
-    unknown = [name for name in names if name not in there]
-    require(bool(names) and not unknown, f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}")
-    for name in names:
-        require_episodes(store, manifest, name, windows, out)
     loss = jax.jit(make_loss(model.config, model.table, model.execution))
-    return {name: _check(model, loss, store, manifest, known[name], windows, spoil) for name in names}
+    return {name: _check(model, loss, materials.store, materials.manifest, known[name], windows, spoil) for name in robots}
 
 
-def require_episodes(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> None:
-    """Raises ConfigError, which says what took how many, if the first `windows` of a robot are of too few episodes."""
+def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
+    """What took how many, if the first `windows` of a robot are of too few episodes; None if they are of enough."""
     (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
     judged, of_all = (len({episode for episode, _ in some}) for some in (frozen[:windows], frozen))
     if judged >= FEWEST:
-        return
+        return None
     there = store.manifest(robot)
     held_out, settings = len(there.val.steps), there.settings
     if of_all >= FEWEST:
@@ -94,8 +105,7 @@ def require_episodes(store: TokenStore, manifest: EvalManifest, robot: str, wind
             f"store.val_fraction={settings.val_fraction:g} and at most "
             f"store.max_val_fraction={settings.max_val_fraction:g}. {_hold_out_more(settings, episodes)}"
         )
-    needs = f"what actions do is told from at least {FEWEST}"
-    raise ConfigError(f"{robot} has {judged} episodes to be judged; {needs}. {why}")
+    return f"{robot} has {judged} episodes to be judged; what actions do is told from at least {FEWEST}. {why}"
 
 
 def _hold_out_more(settings: JobSettings, episodes: int) -> str:

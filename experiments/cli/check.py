@@ -24,7 +24,7 @@ def check(
 
     Held-out windows are judged under the recorded actions and with one dimension held still, negated, scaled or
     exchanged with another. The table gives what a dimension is worth: nats per token that are lost when it is held still.
-    Writes RUN/check.json.
+    Robots of too few held-out episodes are left out, and named. Writes RUN/check.json.
 
     Args:
         run: Directory of a training run.
@@ -32,7 +32,7 @@ def check(
         robots: Only these. Otherwise all that have windows there.
         windows: Of each robot.
     """
-    from experiments.applications.check import check_run, open_study, verdict, write_effects
+    from experiments.applications.check import check_run, choose_robots, open_study, verdict, write_effects
     from experiments.cli.evaluate import check_fits
     from hma_jax.simulator.folder import find_robots
     from hma_jax.training.runs import load_model
@@ -43,7 +43,10 @@ def check(
     with step(f"check {run}"):
         model, materials = load_model(run), open_study(workspace)
         check_fits(model.run, materials)
-        found = check_run(run, model, materials, robots, windows, workspace.root)
+        chosen, left_out = choose_robots(run, model, materials, robots, windows, workspace.root)
+        for why in left_out.values():
+            console.print(f"not checked: {why}", markup=False, soft_wrap=True)
+        found = check_run(run, model, materials, chosen, windows)
     names = {robot.name: robot.dimensions for robot in find_robots(run, model.table)}
     for robot, effects in found.items():
         table = tidy_table(robot, "dimension", "worth", "verdict")
@@ -52,4 +55,6 @@ def check(
             table.add_row(names[robot][effect.dimension], worth, verdict(effect, names[robot]))
         console.print(table)
     write_effects(run / "check.json", found, names)
+    if left_out:
+        console.print(f"not checked, for want of episodes: {', '.join(left_out)}; what to do stands above", soft_wrap=True)
     console.print(f"wrote {run / 'check.json'}", soft_wrap=True)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.applications.check import require_episodes
+from experiments.applications.check import choose_robots, shortage
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -31,9 +32,25 @@ from tests.data_pipelines.windows.test_evalset import small_store
 def test_too_few_episodes_are_told_with_what_took_them(episodes, min_val, frozen, windows, said, tmp_path):
     store = small_store(tmp_path, lengths=(20,) * episodes, min_val=min_val)
     manifest = freeze_manifest(store, ("toy",), 4, frozen, 0)
-    if not said:
-        require_episodes(store, manifest, "toy", windows, Path("runs/a"))
-        return
-    with pytest.raises(ConfigError) as refused:
-        require_episodes(store, manifest, "toy", windows, Path("runs/a"))
-    assert said in str(refused.value)
+    found = shortage(store, manifest, "toy", windows, Path("runs/a"))
+    assert said in found if said else found is None
+
+
+def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path):
+    for name, count in (("few", 5), ("many", 20), ("none", 4)):
+        store = small_store(tmp_path, name, lengths=(8 if name == "none" else 20,) * count, min_val=5)
+    manifest = freeze_manifest(store, ("few", "many", "none"), 10, 64, 0)
+    model = SimpleNamespace(table=store.embodiment_table(store.names))
+    materials = SimpleNamespace(store=store, manifest=manifest)
+
+    def choose(*robots: str) -> tuple[list[str], dict[str, str]]:
+        return choose_robots(tmp_path, model, materials, robots, 64, Path("runs/a"))
+
+    chosen, left_out = choose()
+    assert chosen == ["many"] and list(left_out) == ["few", "none"]
+    assert left_out["few"].startswith("few has 1 episodes") and left_out["none"].startswith("none has 0 episodes")
+    assert choose("many", "few") == (["many"], {"few": left_out["few"]})
+    with pytest.raises(ConfigError, match=r"^few has 1 episodes .*\. Nor are there enough of none$"):
+        choose("few", "none")
+    with pytest.raises(ConfigError, match="no windows of other here; there are few, many, none"):
+        choose("many", "other")
