@@ -151,15 +151,18 @@ def devices_of(mesh: MeshConfig, share: float | None) -> float:
     return share
 
 
-def devices_for(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
-    """`devices_of` every trial of `sweeps`. Raises ConfigError also where a batch or a model does not divide over them."""
+def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
+    """`devices_of` each trial. Raises ConfigError also for one whose batch or model does not divide over them, or whose
+    learning rate would not do what is said of it."""
     from hma_jax.runtime.mesh import check_sizes, mesh_sizes
+    from hma_jax.training.optimizer import check_schedule
 
     execution = study.execution
     devices = devices_of(execution.mesh, share)
     sizes = mesh_sizes(execution.mesh, math.ceil(devices))
     for trial in unique_trials(sweeps, UNKNOWN).values():
         check_sizes(sizes, trial.model, trial.train.batch, execution.accumulate)
+        check_schedule(trial.train.optimizer, trial.train.steps)
     return devices
 
 

@@ -57,8 +57,8 @@ def run_study(
     if not setting.data:
         require_simulated(study.all_names(), "Give RLDS directories with --data, or add --dry-run to see the plan")
     sweeps, sources = plan_sweeps(study, axes), trial_closure()  # a later change is refused by the trials
-    require_devices(study, sweeps, launcher)
-    # Without the place, or its devices, every trial would fail once all is prepared.
+    require_trainable(study, sweeps, launcher)
+    # Without the place every trial would fail, once all is prepared.
     with launcher.launcher(workspace.root) as place, workspace.locked():
         require_same_windows(study, workspace, replace)
         earlier = find_earlier(workspace, study, replace)
@@ -81,16 +81,16 @@ def run_study(
     require_results(jobs, states, again)
 
 
-def require_devices(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
-    """Raises ConfigError for a mesh that does not fit what a trial gets, or that a batch or a model does not divide over."""
-    from experiments.cost import devices_for
+def require_trainable(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
+    """Raises ConfigError for a trial that would fail once all is prepared (`cost.check_trials`)."""
+    from experiments.cost import check_trials
 
     share = launching.share()
     if share is None and launching.name == "local":  # no accelerators are known: trials have what JAX finds, as it does here
         import jax
 
         share = float(jax.device_count())
-    devices_for(study, sweeps, share)
+    check_trials(study, sweeps, share)
 
 
 def make_jobs(

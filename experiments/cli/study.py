@@ -76,10 +76,10 @@ def _run(
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launching = Launching(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
-        from experiments.cost import Devices, devices_for, plan_table
+        from experiments.cost import Devices, check_trials, plan_table
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
-        devices = Devices(devices_for(setting.study, sweeps, launching.share()), launching.at_once)
+        devices = Devices(check_trials(setting.study, sweeps, launching.share()), launching.at_once)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained))
         return
     from experiments.run_study import run_study

@@ -172,7 +172,10 @@ def adapt_model(
 
 def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOptions) -> None:
     """Raises ConfigError, before any work, for options that cannot be and for a run that was not trained here."""
+    from hma_jax.training.optimizer import check_schedule
+
     options.check()
+    check_schedule(setting.study.train.optimizer, setting.study.train.steps)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
 
@@ -240,14 +243,14 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 
 def _print_cost(setting: Setting, trial: Trial, processes: int) -> None:
     """The dry run of a study with nothing but this trial, on the devices of so many `processes` as this one."""
-    from experiments.cost import Devices, devices_for, plan_table
+    from experiments.cost import Devices, check_trials, plan_table
     from experiments.running.launchers.registry import Launching
     from experiments.sweeps.sweep import Point, Sweep
 
     mesh, own = setting.study.execution.mesh, Launching().share()
     share = own * processes if own else float(max(processes, mesh.least))
     model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
-    devices = Devices(devices_for(setting.study, [model], share))
+    devices = Devices(check_trials(setting.study, [model], share))
     given, trained = bool(setting.data), setting.tokenizer is None
     console.print(plan_table(setting.study, [model], devices, given=given, trained=trained, evaluated=False))
 

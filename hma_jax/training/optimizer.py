@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import optax
 import optax.contrib
 
-from hma_jax.config import ModelConfig, OptimizerConfig
+from hma_jax.config import ModelConfig, OptimizerConfig, require
 from hma_jax.model.params import Params, ParamSpec, Use, is_spec
 from hma_jax.training import robots
 from hma_jax.training.robots import Active
@@ -66,6 +66,17 @@ def make_schedule(config: OptimizerConfig, steps: int) -> optax.Schedule:
 def decay_steps(config: OptimizerConfig, steps: int) -> int:
     """Steps of the decay phase of wsd."""
     return max(int(steps * config.decay_fraction), 1)
+
+
+def check_schedule(config: OptimizerConfig, steps: int) -> None:
+    """Raises ConfigError for a decay phase of wsd that would begin within the warm-up and end above final_fraction."""
+    decay, warmup = decay_steps(config, steps), config.warmup_steps
+    require(
+        config.schedule != "wsd" or warmup + decay <= steps,
+        f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={warmup}) and the decay of "
+        f"schedule wsd ({decay}: train.optimizer.decay_fraction={config.decay_fraction:g} of all steps): the rate would "
+        "not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
+    )
 
 
 def steps_in_common(config: OptimizerConfig, steps: int, others: int) -> float:

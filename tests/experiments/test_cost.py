@@ -150,6 +150,18 @@ def test_a_mesh_that_a_trial_does_not_divide_over_is_refused_before_it_is_priced
         assert "tensor=3 does not divide the model's heads of 2" in capsys.readouterr().err
 
 
+def test_a_decay_that_begins_within_the_warm_up_is_refused_before_anything_is_made(capsys, tmp_path):
+    """The rate came down to half of its peak at the end of this one, not to a tenth."""
+    short = [word for one in ("schedule=wsd", "warmup_steps=8") for word in ("--set", f"train.optimizer.{one}")]
+    for command in (["train"], ["study"], ["study", "--dry-run"], ["train", "--dry-run"], ["sweep", "compute"]):
+        steps = ("designs.compute=[9, 10]", "train.steps=10") if "compute" in command else ("train.steps=9",)
+        given = [*short, *(word for one in steps for word in ("--set", one)), "--set", "train.optimizer.decay_fraction=0.3"]
+        assert main([*command, "--preset", "smoke", "--out", str(tmp_path / "out"), *given]) == 2
+        said = capsys.readouterr().err
+        assert "train.steps=9 are too few for the warm-up (train.optimizer.warmup_steps=8) and the decay of" in said
+        assert not (tmp_path / "out").exists()
+
+
 def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     before = estimate_preparing(PAPER)
     words = describe(before, lambda seconds: f"{seconds:.0f} s")

@@ -1,4 +1,5 @@
 import functools
+from dataclasses import replace
 from typing import get_args
 
 import jax
@@ -7,12 +8,13 @@ import numpy as np
 import optax
 import pytest
 
-from hma_jax.config import MupConfig, OptimizerConfig
+from hma_jax.config import ConfigError, MupConfig, OptimizerConfig
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec, Use, is_spec
 from hma_jax.training.optimizer import (
     Presence,
     apply_update,
+    check_schedule,
     clip_by_global_norm,
     init_adam,
     learning_rate_multiplier,
@@ -183,6 +185,16 @@ def test_schedules_warm_up_hold_and_fall():
     assert cosine[10] == 1 and (np.diff(cosine[10:]) <= 0).all() and 0.1 <= cosine[-1] < 0.102
     wsd = rates(schedule="wsd", warmup_steps=10)
     assert (wsd[10:80] == 1).all() and wsd[90] == pytest.approx(0.55, abs=0.02) and wsd[-1] < 0.16
+
+
+def test_a_decay_that_fits_after_the_warm_up_comes_to_its_end():
+    """Of the shortest run that is not refused as well."""
+    config = OptimizerConfig(learning_rate=1.0, warmup_steps=90, schedule="wsd", decay_fraction=0.25)
+    check_schedule(config, 120)
+    assert make_schedule(config, 120)(119) == pytest.approx(0.1 + 0.9 / 30, abs=1e-3)
+    with pytest.raises(ConfigError, match=r"train.steps=119 are too few .*decay of schedule wsd \(29: "):
+        check_schedule(replace(config, warmup_steps=91), 119)
+    check_schedule(replace(config, schedule="constant"), 1)
 
 
 def test_clipping_leaves_small_gradients_alone_and_reports_the_norm_before():
