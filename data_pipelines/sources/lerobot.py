@@ -113,6 +113,11 @@ class LeRobotSource:
             (value,) = self._tables.read(entry.data, [camera], first + n, 1)[camera].to_pylist()
         return self._image_bytes(value, f"{where}: {shown(camera)} at row {n}")
 
+    @property
+    def loaded(self) -> int:
+        """Bytes of tables that were read so far, of whole groups of rows."""
+        return self._tables.loaded
+
     def _place(self, entry: EpisodeEntry) -> tuple[int, int]:
         """(first row, rows) in the episode's file."""
         there = self._tables.columns(entry.data)

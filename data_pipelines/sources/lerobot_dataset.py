@@ -163,17 +163,21 @@ class LeRobotDataset(EpisodeSource):
 class _Frames(Sequence[Fetched]):
     """The frames of one camera, each read when it is asked for."""
 
-    nbytes = 0  # none is held
-
     def __init__(self, source: LeRobotDataset, entry: EpisodeEntry, *place: Any):
         self._source, self._entry, self._place, self._length = source, entry, place, entry.length
+        self.nbytes = 0
+        """What was read for the frames that were asked for: of a table whole groups of rows, of a video its pixels."""
 
     def __len__(self) -> int:
         return self._length
 
     def __getitem__(self, n: int) -> Fetched:
+        before = self._source._read.loaded
         with ExitStack() as stack:
-            return self._source._fetch(stack, self._entry, *self._place)(n)
+            frame = self._source._fetch(stack, self._entry, *self._place)(n)
+        size = frame.nbytes if isinstance(frame, np.ndarray) else len(frame)
+        self.nbytes += max(self._source._read.loaded - before, size)
+        return frame
 
 
 def dataset_name(root: Path) -> str:

@@ -53,6 +53,8 @@ class ParquetRows:
         self._layouts: OrderedDict[Path, _Layout] = OrderedDict()
         self._groups: OrderedDict[tuple[Path, int], dict[str, Any]] = OrderedDict()  # by column
         self._held = 0
+        self.loaded = 0
+        """Bytes of columns that were read so far."""
 
     def __reduce__(self):
         return type(self), (self._label,)
@@ -101,7 +103,8 @@ class ParquetRows:
         layout = self._layout(path)
         for g, found in (_reading(path, lambda: _read_groups(path, layout, missing)) if missing else {}).items():
             held[g].update(found)
-            self._held += sum(column.nbytes for column in found.values())
+            size = sum(column.nbytes for column in found.values())
+            self._held, self.loaded = self._held + size, self.loaded + size
         for g in groups:
             self._groups.move_to_end((path, g))
         while self._held > KEPT and len(self._groups) > 1:

@@ -126,6 +126,14 @@ class RobomimicDataset(EpisodeSource):
                     found[key] = np.array([success], np.int64)
         return found
 
+    @contextmanager
+    def _camera(self, i: int, key: str) -> Iterator[_Frames]:
+        where = self._where(i)
+        with self._read.open() as file:
+            with damage(where):
+                frames = _Frames(file["data"][self._demos[i]], _path(key, image=True), where)
+            yield frames
+
     def _length(self, file: Any, i: int) -> int:
         """Steps by the actions, -1 where there are none or nobody can tell: then reading the episode says why."""
         try:
@@ -159,6 +167,8 @@ class _Frames(Sequence[Fetched]):
         self._demo, self._key, self._where, self._length = demo, key, where, len(array)
         self._rows = max(array.chunks[0] if array.chunks else 1, BLOCK)
         self._at, self._block = -1, np.zeros((0, 0, 0, 3), np.uint8)
+        self.nbytes = 0
+        """Of the frames that were read."""
 
     def __len__(self) -> int:
         return self._length
@@ -168,23 +178,26 @@ class _Frames(Sequence[Fetched]):
         if at != self._at:
             rows = slice(at * self._rows, (at + 1) * self._rows)
             self._at, self._block = at, read_rows(self._demo, self._key, rows, self._where)
+            self.nbytes += self._block.nbytes
         return self._block[n - at * self._rows]
 
 
 class _Opened(Sequence[Fetched]):
     """The frames of one camera, each read when it is asked for."""
 
-    nbytes = 0  # none is held
-
     def __init__(self, source: RobomimicDataset, i: int, key: str, length: int):
         self._source, self._i, self._key, self._length = source, i, key, length
+        self.nbytes = 0
+        """Of the frames that were read for those that were asked for."""
 
     def __len__(self) -> int:
         return self._length
 
     def __getitem__(self, n: int) -> np.ndarray:
-        with self._source.open_episode(self._i, self._key, ()) as episode:
-            return episode.image(n)
+        with self._source._camera(self._i, self._key) as frames:
+            frame = frames[n]
+            self.nbytes += frames.nbytes
+            return frame
 
 
 def dataset_name(source: RobomimicSource) -> str:

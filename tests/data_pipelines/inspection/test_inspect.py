@@ -12,6 +12,7 @@ from data_pipelines.inspection.suggest import choose_camera, suggest_entry, wind
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.registry.own import OWN
 from hma_jax.config import ConfigError
+from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, picture, write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
 
 LENGTHS = [6, 7, 8, 9, 10, 11]
@@ -74,6 +75,20 @@ def test_sample_is_bounded_in_episodes_and_bytes(toy):
     assert (facts.sampled, facts.episodes, len(shown)) == (3, 6, 2)
     assert inspect_dataset(toy, episodes=3).facts.steps == inspect_dataset(toy, episodes=3).facts.steps
     assert inspect_dataset(toy, max_bytes=1).facts.sampled == 1
+
+
+def test_frames_that_are_read_one_by_one_count_as_what_is_read(tmp_path):
+    """Of a video its pixels; of images in a table, and of an HDF5 file, all that lies in the group that is read."""
+    pytest.importorskip("av")
+    frame = HEIGHT * WIDTH * 3
+    places = {
+        write_lerobot(tmp_path / "video", "v3.0", lengths=(12, 9, 10)): frame * 8,
+        write_lerobot(tmp_path / "images", "v2.1", lengths=(12, 9, 10), camera="image"): 12 * len(png(picture(0))) // 2,
+        write_robomimic(tmp_path / "image.hdf5", lengths=(5, 7, 4)): 4 * frame * 4,
+    }
+    for place, least in places.items():
+        facts = inspect_dataset(place, max_bytes=least // 2).facts
+        assert facts.sampled == 1 < facts.episodes == 3 and facts.bytes_read > least // 2
 
 
 def test_shown_frames_are_those_of_their_times(toy):
