@@ -50,7 +50,7 @@ class GeneratedSource:
         height, width = simulator.tokenizer.image_shape
         chunk = robot.stride * robot.action_dim
         self.layout = Layout({IMAGE: image_field(height, width)}, {ACTION: chunk}, knows_success=False)
-        self.hz = robot.hz / robot.stride or 2.0
+        self.hz = recorded.hz / robot.stride  # a run alone may not know how often its robot acts
         self.description = f"{recorded.name} ({recorded.split}) as a model sees it under the recorded actions."
         self.batches = [range(i, min(i + len(simulator), count)) for i in range(0, count, len(simulator))]
         self.units = [f"episodes {b.start} to {b.stop - 1}" for b in self.batches]

@@ -42,6 +42,7 @@ class Trajectories(ABC):
     name: str  # of the dataset
     split: str
     fingerprint: str  # of its contents
+    hz: float  # recorded actions per second
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -61,6 +62,7 @@ class RldsTrajectories(Trajectories):
         """Raises ConfigError for a dataset whose actions are not this robot's."""
         self._source, self._spec, self._robot, self._size = open_source(directory, split), spec, robot, size
         self.name, self.split, self.fingerprint = spec.name, split, self._source.fingerprint()
+        self.hz = spec.hz
         _require_fit(spec, robot)
         self._source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 
@@ -98,7 +100,7 @@ class StoredTrajectories(Trajectories):
         )
         self._store, self._tokenizer, self._robot = store, tokenizer, robot
         self._every = robot.stride // manifest.frame_step
-        self.name, self.split, self.fingerprint = name, split, manifest.hash()
+        self.name, self.split, self.fingerprint, self.hz = name, split, manifest.hash(), manifest.spec.hz
         self._count = len(manifest.split(split).episodes)
 
     def __len__(self) -> int:

@@ -16,11 +16,14 @@ from data_pipelines.suite.generate import generate_suite
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.applications.generating import source as source_module
 from experiments.applications.generating.trajectories import open_trajectories
+from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
 from hma_jax.config import ConfigError
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.folder import save_robots
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.io import load_tokenizer
+from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.applications.runs import TABLE, make_run
 
 ROBOT = Robot.of(TABLE.entries[0])
@@ -99,6 +102,17 @@ def test_what_was_made_under_other_ranges_of_actions_is_not_taken_for_the_same(r
     finally:
         (run / "robots.json").unlink()
     assert "was not made of this source with these settings" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_rate_is_the_recordings_where_the_run_does_not_know_it(tmp_path):
+    """As that of a robot which the model knew before others were added: its tokens are in another study."""
+    spec = get_spec("berkeley_gnm_cory_hall")
+    table = EmbodimentTable((*TABLE.entries, Embodiment(spec.name, 2, 2, (0.0,) * 2, (1.0,) * 2)))
+    simulator = load_simulator(make_run(tmp_path / "study", table=table))
+    robot, rlds = simulator.robot(spec.name), write_rlds(tmp_path, spec, [9, 9])
+    recorded, _ = open_trajectories(str(rlds), "train", robot, {}, simulator.tokenizer, tmp_path)
+    source = source_module.GeneratedSource(simulator, robot, recorded, given=1, count=2, seed=0, checkpoint="")
+    assert robot.hz == 0 and source.hz == spec.hz / 2 == 2.5
 
 
 def episode_seed(i: int) -> int:
