@@ -59,8 +59,11 @@ class JudgeConfig:
         require(self.demonstrations >= 1, f"--demonstrations must be at least 1, got {self.demonstrations}")
         fewest = 3  # a third of them are play
         require(self.head_episodes >= fewest, f"--head-episodes must be at least {fewest}, got {self.head_episodes}")
+        last = 2**32 - self.starts  # the i-th start has the seed plus i
+        require(0 <= self.seed <= last, f"--seed must lie in 0..{last}, got {self.seed}")
+        fewest = 2  # with one at a time the control has no other episode to take actions from
+        require(self.batch >= fewest, f"--batch must be at least {fewest}, got {self.batch}")
         require(self.starts % self.batch == 0, f"{self.starts} starts cannot be run {self.batch} at a time")
-        require(self.batch >= 2, "with one episode at a time the control has no other episode to take actions from")
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from experiments.applications.policies.learning import FitConfig, Report, ladder
 from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
+from hma_jax.config import require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 
@@ -36,6 +37,11 @@ class LadderConfig:
     learning_rate: float = 2e-3
     frames: int = 1  # one shows all there is; of two, what was just done can be read, and is then merely done again
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
+
+    def __post_init__(self):
+        for kind in ("cloned", "diffusion"):
+            rungs = getattr(self, kind)
+            require(rungs >= 0, f"--{kind} must not be negative, got {rungs}")
 
     def fit(self, rungs: int) -> FitConfig:
         keep = ladder(self.steps, rungs, self.first) if rungs > 1 else (self.steps,)

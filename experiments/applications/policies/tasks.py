@@ -78,7 +78,8 @@ class Task:
     def __post_init__(self):
         require(
             self.robot in SPECS or self.robot in EXPERTS,
-            f"no task of a robot {self.robot!r}; there are {', '.join([*SPECS, *EXPERTS])}",
+            f"no task of a robot {self.robot!r}: a task needs a true simulator that says when it is done, and an expert "
+            f"in it, as there are of {', '.join([*SPECS, *EXPERTS])}",
         )
         known = TASKS if self.in_suite else (OWN,)
         require(self.name in known, f"no task {self.name!r} of {self.robot}; there are {', '.join(known)}")

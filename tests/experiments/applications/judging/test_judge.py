@@ -62,11 +62,25 @@ def test_every_policy_is_judged_at_every_start_in_every_world(judged):
     np.testing.assert_array_equal(control.actions[[1, 0]], found.rollouts("random", TRUE).actions[:2])
 
 
-@pytest.mark.parametrize(("name", "least"), [("demonstrations", 1), ("head_episodes", 3)])
-def test_recordings_that_cannot_be_made_are_refused_before_policies_are_trained(name, least):
+@pytest.mark.parametrize(("name", "least"), [("demonstrations", 1), ("head_episodes", 3), ("batch", 2)])
+def test_what_is_too_little_to_judge_by_is_refused_before_policies_are_trained(name, least):
     assert replace(ASKED, **{name: least})
     with pytest.raises(ConfigError, match=f"--{name.replace('_', '-')} must be at least {least}"):
         replace(ASKED, **{name: least - 1})
+
+
+@pytest.mark.parametrize("kind", ["cloned", "diffusion"])
+def test_a_negative_number_of_checkpoints_is_not_taken_for_one(kind):
+    assert names(replace(ASKED.ladder, **{kind: 0}))
+    with pytest.raises(ConfigError, match=f"--{kind} must not be negative, got -1"):
+        replace(ASKED.ladder, **{kind: -1})
+
+
+@pytest.mark.parametrize(("first", "beyond"), [(0, -1), (2**32 - 4, 2**32 - 3)])
+def test_seeds_that_no_episode_can_have_are_refused_before_policies_are_trained(first, beyond):
+    assert replace(ASKED, seed=first)
+    with pytest.raises(ConfigError, match=f"--seed must lie in 0..{2**32 - 4}, got {beyond}"):
+        replace(ASKED, seed=beyond)
 
 
 def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged):

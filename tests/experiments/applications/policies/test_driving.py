@@ -60,5 +60,5 @@ def test_a_physics_simulator_knows_its_own_task_alone():
     assert TASK.goal == "drawer open"
     with pytest.raises(ConfigError, match="no task 'reach' of metaworld_drawer; there are own"):
         find_task("metaworld_drawer", "reach")
-    with pytest.raises(ConfigError, match="no task of a robot 'metaworld_sawyer'"):
+    with pytest.raises(ConfigError, match="no task of a robot 'metaworld_sawyer': a task needs a true simulator"):
         find_task("metaworld_sawyer")
