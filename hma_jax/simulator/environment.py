@@ -70,7 +70,11 @@ class _Task:
         if starts is None:
             starts = getattr(simulator, "starts", ())
         names = [name for name in simulator.robots if any(s.robot == name for s in starts)]
-        require(bool(names), "there is no start to begin at: give `starts`, or a run that has some beside it")
+        require(
+            bool(names),
+            "there is no start to begin at: give `starts`, a run that has some beside it, or a `simulator` that has found "
+            "some (docs/simulator.md)",
+        )
         robot = names[0] if robot is None else robot
         self.simulator, self.judge, self.max_steps = simulator, judge, max_steps
         require(robot in names, f"no start of robot {robot!r}; there are starts of {', '.join(names)}")
