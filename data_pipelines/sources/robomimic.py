@@ -58,7 +58,8 @@ class RobomimicSource:
             self.units = _demonstrations(self.path, file, settings.filter_key)
             self.layout, self.cameras = self._read_layout(file["data"][self.units[0]], settings.camera)
         self.task = str(args.get("env_name", "robomimic"))
-        self.hz = float(settings.hz or _control_rate(self.path, args))
+        self.own_hz = _control_rate(self.path, args)
+        self.hz = float(settings.hz or self.own_hz or CONTROL_RATE)
         self.description = f"Robomimic demonstrations of {self.task} ({self.path.name}), {self.hz:g} Hz."
 
     def identity(self) -> dict[str, Any]:
@@ -202,16 +203,18 @@ def _env_args(path: Path, text: Any) -> dict[str, Any]:
     return args if isinstance(args, dict) else {}
 
 
-def _control_rate(path: Path, args: dict[str, Any]) -> float:
-    """Hz, as `env_args` says it; DataError for what is none."""
+def _control_rate(path: Path, args: dict[str, Any]) -> float | None:
+    """Hz, as `env_args` says it, None where it does not; DataError for what is none."""
     kwargs = args.get("env_kwargs")
-    rate = (kwargs.get("control_freq") if isinstance(kwargs, dict) else None) or CONTROL_RATE
+    rate = kwargs.get("control_freq") if isinstance(kwargs, dict) else None
+    if rate is None:
+        return None
     if type(rate) not in (int, float) or not 0 < rate < math.inf:
         raise DataError(
             f"{path}: the attribute env_args of 'data' says control_freq {shown(rate)}, which is no rate in Hz. "
             "Correct it."
         )
-    return rate
+    return float(rate)
 
 
 def _demonstrations(path: Path, file: Any, filter_key: str | None) -> list[str]:

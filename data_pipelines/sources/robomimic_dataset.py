@@ -66,8 +66,8 @@ class RobomimicDataset(EpisodeSource):
         return len(self._demos)
 
     @property
-    def hz(self) -> float:
-        return self._read.hz
+    def hz(self) -> float | None:
+        return self._read.own_hz  # not the rate of published files, where this one does not say its own
 
     def fingerprint(self) -> str:
         """Hash over the file's size, and the name and actions of every demonstration."""

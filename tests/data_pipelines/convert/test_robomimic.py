@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.sources.robomimic import RobomimicSource, succeeded
+from data_pipelines.sources.robomimic_dataset import RobomimicDataset
 from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
@@ -65,9 +66,11 @@ def env_args(value):
 
 
 @pytest.mark.parametrize("kwargs", ["null", "[]", "{}"])
-def test_a_file_that_does_not_say_its_rate_has_that_of_the_published_tasks(tmp_path, kwargs):
+def test_a_file_that_does_not_say_its_rate_is_converted_at_that_of_the_published_tasks(tmp_path, kwargs):
+    """Read where it lies it has none: an entry must say it."""
     path = write_robomimic(tmp_path / "image.hdf5", change=env_args(f'{{"env_name": "Lift", "env_kwargs": {kwargs}}}'))
-    assert RobomimicSource(path).hz == 20
+    assert RobomimicSource(path).hz == 20 and RobomimicDataset(path).hz is None
+    assert RobomimicDataset(write_robomimic(tmp_path / "says.hdf5")).hz == 20
 
 
 def shorten(file):
