@@ -21,7 +21,7 @@ STAMP = "evaluation.made_from.json"
 
 def describe_evaluation(trained: Run, names: Sequence[str], materials: Materials, config: EvalConfig) -> MadeFrom:
     """The stamp of an evaluation on the windows of the datasets `names`. The step is recorded only: of a run that trains
-    on, later results replace earlier ones."""
+    on, later results replace earlier ones. So is the seed, for whoever compares; the model is named by it as well."""
     train = {key: value for key, value in to_dict(trained.train).items() if key != "steps"}
     chosen = {d.dataset: d.windows for d in materials.manifest.datasets}
     data = {
@@ -42,7 +42,8 @@ def describe_evaluation(trained: Run, names: Sequence[str], materials: Materials
         "datasets": sorted(names),
         "data": data,
     }
-    return MadeFrom(inputs, {"step": trained.step})
+    trained_here = "loader" in trained.provenance  # a converted model does not know its seed
+    return MadeFrom(inputs, {"step": trained.step} | ({"seed": trained.train.seed} if trained_here else {}))
 
 
 def require_same_evaluation(place: Path, wanted: MadeFrom) -> None:

@@ -169,11 +169,16 @@ def read_rows(workspace: Workspace) -> list[Row]:
 
 def write_csv(path: Path, kind: type, rows: Iterable[Any]) -> None:
     """A line for each of `rows`, dataclasses of one `kind`."""
+    write_file(path, csv_text(kind, rows))
+
+
+def csv_text(kind: type, rows: Iterable[Any]) -> str:
+    """What `write_csv` writes."""
     content = io.StringIO()
     writer = csv.DictWriter(content, [f.name for f in dataclasses.fields(kind)], lineterminator="\n")
     writer.writeheader()
     writer.writerows(vars(row) for row in rows)
-    write_file(path, content.getvalue())
+    return content.getvalue()
 
 
 def read_csv(path: Path) -> list[Row]:

@@ -28,6 +28,7 @@ class Side:
     name: str
     seeds: Mapping[int, WindowTable]
     tokenizer: str  # "": nobody knows
+    says_seed: bool = True  # otherwise its seed is a guess
 
 
 @dataclass(frozen=True)

@@ -79,17 +79,19 @@ def read_side(path: Path) -> Side:
         judged = read_trial(path)
         return Side(path.name, {judged.seed: judged.windows}, judged.provenance.tokenizer)
     if (path / FILE).exists():
-        return Side(path.name, {0: WindowTable.load(path / FILE)}, _tokenizer_of(path))
+        tokenizer, seed = _said_of(path)
+        return Side(path.name, {seed or 0: WindowTable.load(path / FILE)}, tokenizer, says_seed=seed is not None)
     raise ConfigError(f"{path}: neither a study, nor a finished trial, nor a model that was evaluated (no {FILE})")
 
 
-def _tokenizer_of(run: Path) -> str:
-    """The identity of the tokenizer whose tokens were judged: by the stamp of `hma evaluate`, else by the run's latest
-    checkpoint; "" where neither says it."""
+def _said_of(run: Path) -> tuple[str, int | None]:
+    """Of a model that was evaluated: the identity of the tokenizer whose tokens were judged, and the seed of its training.
+    By the stamp of `hma evaluate`, else by the run's latest checkpoint; "" and None where neither says it."""
     from hma_jax.training.reading import list_steps, read_description
 
     if (stamp := read_stamp(run, STAMP)) is not None:
-        return stamp.inputs.get("tokenizer", "")
+        return stamp.inputs.get("tokenizer", ""), stamp.recorded.get("seed")
     steps = list_steps(run / "checkpoints")
     described = read_description(run / "checkpoints" / str(steps[-1])) if steps else {}
-    return described.get("provenance", {}).get("tokenizer", "")
+    provenance = described.get("provenance", {})
+    return provenance.get("tokenizer", ""), described["train"]["seed"] if "loader" in provenance else None

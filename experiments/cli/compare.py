@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +13,15 @@ from experiments.progress import console, tidy_table
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import require
+from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from experiments.analysis.compare import Difference, Side
+
+DEFAULT = Path("comparison.csv")
 
 SHOWN = ("cross_entropy", "diffusion_loss", "action_nats", "psnr", "delta_psnr", "counterfactual_gain")
 """Metrics in the table, as far as both have them; the CSV has all."""
@@ -26,7 +30,7 @@ SHOWN = ("cross_entropy", "diffusion_loss", "action_nats", "psnr", "delta_psnr",
 def compare(
     a: Annotated[Positional[Path], arg(metavar="A")],
     b: Annotated[Positional[Path], arg(metavar="B")],
-    to: Path = Path("comparison.csv"),
+    to: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint=f"(default: {DEFAULT})")] = None,
 ) -> None:
     """Compare two models, or the reference models of two studies, on the windows that both saw.
 
@@ -37,19 +41,28 @@ def compare(
     Args:
         a: Directory of a finished trial, of an evaluated model, or of a study.
         b: The one it is compared with.
-        to: Where the CSV is written.
+        to: Where the CSV is written. A file there is replaced; the one of the default only by the same comparison.
     """
     from experiments.analysis import compare as analysis
     from experiments.analysis.tables import read_side
-    from experiments.rows import write_csv
+    from experiments.rows import csv_text
 
-    require(not to.is_dir(), f"--to {to} is a directory; name a file, such as --to {to / 'comparison.csv'}")
-    make_directory(to.parent, "--to")
+    place = to or DEFAULT
+    require(not place.is_dir(), f"--to {place} is a directory; name a file, such as --to {place / DEFAULT}")
+    make_directory(place.parent, "--to")
     first, second = read_side(a), read_side(b)
+    if first.name == second.name:  # as of two runs that are called model
+        first, second = replace(first, name=str(a)), replace(second, name=str(b))
     rows = analysis.compare(first, second)
     console.print(_table(rows, first, second))
-    write_csv(to, analysis.Difference, rows)
-    wrote(to)
+    text = csv_text(analysis.Difference, rows)
+    require(
+        to is not None or not place.exists() or place.read_bytes() == text.encode(),
+        f"{place}: another comparison is there, and stays. Name a file for this one with --to FILE, or add --to {place}, "
+        "which puts it in place of that one",
+    )
+    write_file(place, text)
+    wrote(place)
 
 
 def _table(rows: list[Difference], a: Side, b: Side) -> Table:
@@ -70,6 +83,8 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
         if len(side.seeds) > several:
             kept, there = (", ".join(map(str, x)) for x in ([s for s in side.seeds if s in other.seeds], side.seeds))
             table.caption += f" Of the seeds of {escape(side.name)} ({there}) only {kept} is compared."
+            if not other.says_seed:
+                table.caption += f" {escape(other.name)} does not say with which seed it was trained, and stands for {kept}."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         table.caption += f" No error of {few(alone)}: one held-out episode."
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:

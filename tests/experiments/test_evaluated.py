@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.evaluated import STAMP, require_same_evaluation
+from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
-from hma_jax.config import ConfigError, EvalConfig
+from hma_jax.config import ConfigError, EvalConfig, TrainConfig
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.windows import FILE, WindowTable
 
@@ -43,6 +44,15 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
     with pytest.raises(ConfigError) as refused:
         require_same_evaluation(tmp_path, wanted)
     assert line in str(refused.value) and "--to DIR" in str(refused.value) and "--replace" in str(refused.value)
+
+
+@pytest.mark.parametrize(("provenance", "recorded"), [({"loader": {}}, {"step": 3, "seed": 7}), ({"official": 1}, {"step": 3})])
+def test_the_seed_of_the_training_is_recorded_where_the_run_knows_it(provenance, recorded):
+    of = {"model": {}, "train": TrainConfig(seed=7), "provenance": provenance, "weights": "last", "step": 3}
+    materials = SimpleNamespace(
+        manifest=SimpleNamespace(datasets=(), frames=4, rate=2.0), tokenizer=SimpleNamespace(identity="t")
+    )
+    assert describe_evaluation(SimpleNamespace(**of), (), materials, EvalConfig()).recorded == recorded
 
 
 def test_a_setting_of_the_protocol_that_came_later_is_no_difference(tmp_path):

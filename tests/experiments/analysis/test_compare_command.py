@@ -8,8 +8,11 @@ import pytest
 
 from experiments.analysis.intervals import OVERALL
 from experiments.cli.main import main
+from experiments.evaluated import STAMP
+from experiments.preparing.made_from import MadeFrom
 from experiments.running.workspace import Workspace, save_record
 from experiments.sweeps.sweep import reference_trial
+from hma_jax.evaluation.windows import FILE
 from hma_jax.runtime.exits import Exit
 from tests.experiments.analysis.trials import write_trial
 from tests.experiments.analysis.worlds import judged, under_seeds, with_loss
@@ -98,3 +101,43 @@ def test_nats_of_two_tokenizers_are_left_out_and_it_is_said(table, tmp_path, cap
     assert main(["compare", str(a), str(b), "--to", str(tmp_path / "c.csv")]) == 0
     assert {metric for _, metric in rows_of(tmp_path / "c.csv")} == {"psnr"}
     assert "Nats are not compared: the tokenizers differ (70c3, other)" in " ".join(capsys.readouterr().out.split())
+
+
+def write_evaluated(directory, windows, seed=None):
+    directory.mkdir(parents=True)
+    windows.save(directory / FILE, directory.name)
+    recorded = {"step": 3} | ({} if seed is None else {"seed": seed})
+    MadeFrom({"tokenizer": PROVENANCE.tokenizer}, recorded).save(directory, STAMP)
+    return directory
+
+
+@pytest.mark.parametrize(
+    ("seed", "kept"), [(1, "1 is compared."), (None, "0 is compared. model does not say with which seed it was trained, and")]
+)
+def test_an_evaluated_model_is_compared_with_a_study_of_its_seed(seed, kept, table, tmp_path, capsys):
+    """It stood for seed 0, whichever it was trained with."""
+    workspace = Workspace(tmp_path / "study")
+    for number, by in ((0, 0.1), (1, 0.2)):
+        write_trial(workspace.trials, reference_trial(STUDY, number), better(table, by))
+    save_record(workspace, record_of())
+    model = write_evaluated(tmp_path / "a" / "model", table, seed)
+    assert main(["compare", str(model), str(workspace.root), "--to", str(tmp_path / "c.csv")]) == 0
+    assert f"Of the seeds of study (0, 1) only {kept}" in " ".join(capsys.readouterr().out.split())
+    found = float(rows_of(tmp_path / "c.csv")[OVERALL, "cross_entropy"]["mean"])
+    assert found == pytest.approx(0.1 if seed is None else 0.2, abs=1e-6)
+
+
+def test_a_comparison_stays_where_no_place_is_named_for_another(table, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name, by in (("a", 0.1), ("b", 0.0), ("d", 0.3)):
+        write_evaluated(tmp_path / name / "model", better(table, by), 0)
+    for _ in range(2):
+        assert main(["compare", "a/model", "b/model"]) == 0
+        assert "a/model - b/model" in capsys.readouterr().out
+    before = (tmp_path / "comparison.csv").read_bytes()
+    assert main(["compare", "a/model", "d/model"]) == 2
+    said = capsys.readouterr()
+    assert "a/model - d/model" in said.out and "comparison.csv: another comparison is there, and stays" in said.err
+    assert (tmp_path / "comparison.csv").read_bytes() == before
+    assert main(["compare", "a/model", "d/model", "--to", "comparison.csv"]) == 0
+    assert (tmp_path / "comparison.csv").read_bytes() != before
