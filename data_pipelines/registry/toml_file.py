@@ -11,12 +11,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import tomllib
 from pathlib import Path
 
 from data_pipelines.registry.spec import DatasetSpec
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict
+
+_HEADING = re.compile(r"""\s*\[\s*(?:"([^"]*)"|'([^']*)'|([A-Za-z0-9_-]+))\s*\]\s*(?:#.*)?""")
 
 
 def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
@@ -52,3 +55,22 @@ def to_toml(spec: DatasetSpec) -> str:
             # JSON's strings, numbers, booleans and lists are TOML's too, but for its escapes of rare characters.
             lines.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join(lines) + "\n"
+
+
+def put_entry(text: str, spec: DatasetSpec, where: str) -> str:
+    """The text of a file of entries with this one at its end, or in place of that of the same name; all else stays, and
+    comments outside of that one too. ConfigError, naming `where`, for a text in which no place is found."""
+    lines = [f"{line}\n" for line in text.splitlines()]
+    headings = {i: m[1] or m[2] or m[3] for i, line in enumerate(lines) if (m := _HEADING.fullmatch(line.rstrip()))}
+    begin = next((i for i, name in headings.items() if name == spec.name), len(lines))
+    end = next((i for i in headings if i > begin), len(lines))
+    while end > begin + 1 and (not lines[end - 1].strip() or lines[end - 1].lstrip().startswith("#")):
+        end -= 1  # what stands before the next heading is about that
+    space = ["\n"] if begin == len(lines) > 0 else []
+    put = "".join([*lines[:begin], *space, to_toml(spec), *lines[end:]])
+    try:
+        right = tomllib.loads(put) == tomllib.loads(text) | tomllib.loads(to_toml(spec))
+    except tomllib.TOMLDecodeError:  # it is there in another form than a table of its own
+        right = False
+    require(right, f"{where}: no place for the entry of {spec.name} is found there; write it to another file")
+    return put

@@ -146,13 +146,16 @@ def test_mistakes_are_one_message(arguments, code, message, robot, capsys):
     assert said.startswith("error: ") and message in said
 
 
-def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path):
+def test_entry_replaces_one_of_the_same_name_in_its_file(robot, tmp_path, capsys):
     file = tmp_path / "my.toml"
+    file.write_text("# what the lab has\n")
     for hz in ("4", "5"):
         arguments = ["--hz", hz, "--entry", str(file), "--out", str(tmp_path)]
         assert main(["data", "inspect", str(robot), *arguments]) == 0
     text = file.read_text()
     assert text.count('["my_robot"]') == 1 and "hz = 5.0" in text and "hz = 4" not in text
+    assert text.startswith("# what the lab has\n")
+    assert "in place of the entry of my_robot that was there; changed: hz: 4.0 -> 5.0\n" in capsys.readouterr().out
 
 
 def test_a_misspelt_heading_of_a_known_dataset_is_told(tmp_path, capsys):

@@ -17,7 +17,7 @@ from experiments.progress import console, step, tidy_table
 from experiments.setting import say_unmatched, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
-from hma_jax.config.json import to_strict_json
+from hma_jax.config.json import diff, to_strict_json
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.outputs import make_directory
 
@@ -238,12 +238,16 @@ def _in_words(spec: DatasetSpec) -> str:
 
 
 def _write_entry(path: Path, suggestion: Suggestion) -> None:
-    """Adds the entry to a TOML file, in place of one of the same name."""
-    from data_pipelines.registry.toml_file import load_entries, to_toml
+    """Adds the entry to a TOML file, in place of one of the same name. Says what that said otherwise."""
+    from data_pipelines.registry.toml_file import load_entries, put_entry
 
-    others = [e for e in load_entries(path) if e.name != suggestion.name] if path.exists() else []
-    write_file(path, "\n".join(to_toml(e) for e in (*others, suggestion.spec())))
+    spec = suggestion.spec()
+    there = [entry for entry in load_entries(path) if entry.name == spec.name] if path.exists() else []
+    write_file(path, put_entry(path.read_text() if path.exists() else "", spec, str(path)))
     wrote(path)
+    if lines := [line for entry in there for line in diff(entry, spec)]:
+        text = f"note: in place of the entry of {spec.name} that was there; changed: {'; '.join(lines)}"
+        console.print(text, markup=False, soft_wrap=True)
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, first: str | None) -> None:

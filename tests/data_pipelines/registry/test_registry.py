@@ -15,7 +15,7 @@ from data_pipelines.registry.openx import OPENX
 from data_pipelines.registry.openx_counts import EPISODES, LONG
 from data_pipelines.registry.openx_more import OPENX_MORE
 from data_pipelines.registry.openx_rest import OPENX_REST
-from data_pipelines.registry.toml_file import load_entries, to_toml
+from data_pipelines.registry.toml_file import load_entries, put_entry, to_toml
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.embodiments import EMBODIMENTS
 from hma_jax.config import ConfigError
@@ -240,6 +240,37 @@ def test_toml_file_with_a_mistake_is_named(text, message, tmp_path):
     (tmp_path / "my.toml").write_text(text)
     with pytest.raises(ConfigError, match=rf"my.toml: .*{message}"):
         load_entries(tmp_path / "my.toml")
+
+
+ENTRIES = """# of our lab
+["a.rm"]  # the left one
+image_key = "i"
+action_keys = [
+  "action",
+]
+action_dims = [3]
+hz = 4.0
+
+# asked in May
+[bot]
+image_key = "i"
+action_keys = []
+action_dims = []
+hz = 5
+"""
+
+
+@pytest.mark.parametrize("name", ["a.rm", "bot", "new"])
+def test_an_entry_is_put_into_a_file_and_nothing_else_changes(name, tmp_path):
+    spec = make_spec(name, (2,), hz=9)
+    text = put_entry(ENTRIES, spec, "my.toml")
+    (tmp_path / "my.toml").write_text(text)
+    assert dict.fromkeys(("a.rm", "bot", name)) == dict.fromkeys(e.name for e in load_entries(tmp_path / "my.toml"))
+    assert spec in load_entries(tmp_path / "my.toml") and "# of our lab\n" in text and "\n\n# asked in May\n" in text
+    assert ('["a.rm"]  # the left one' in text) == (name != "a.rm") and put_entry(text, spec, "my.toml") == text
+    assert put_entry("", spec, "my.toml") == to_toml(spec)
+    with pytest.raises(ConfigError, match="my.toml: no place for the entry of x"):
+        put_entry('x = {image_key = "i", action_keys = [], action_dims = [], hz = 1}', make_spec("x"), "my.toml")
 
 
 def test_missing_toml_file_is_named(tmp_path):
