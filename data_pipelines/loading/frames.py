@@ -72,7 +72,8 @@ def make_frame_loader(
             reasons[spec.name] = f"it has no {split} episode"
             if split == "val":
                 reasons[spec.name] += (
-                    f": of {len(mask)} none is held out, for which there must be at least two, and a max_val above 0"
+                    f": of {len(mask)} none is held out, for which there must be at least two; val_fraction="
+                    f"{val_fraction:g}, min_val={min_val} and max_val={max_val} say how many are"
                 )
             continue
         order = stream_seed(seed, "frames", split, spec.name)

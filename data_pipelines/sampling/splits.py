@@ -60,7 +60,7 @@ def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, m
     """`fraction` of all, at least `min_val` and at most `max_val`, but never more than `max_fraction` of a dataset.
 
     Of a small dataset the last decides: with min_val 8, two of nine episodes are held out, not four. One is, of
-    two episodes or more, unless `max_val` is 0.
+    two episodes or more, where the others ask for any.
     """
     most = max(int(max_fraction * episodes), 1)
     return min(max(round(fraction * episodes), min_val), max_val, most, episodes // 2)

@@ -89,6 +89,10 @@ def test_one_episode_alone_is_refused_before_a_tokenizer_is_trained_on_it(tmp_pa
     rlds = write_rlds(tmp_path / "rlds", ARM, [12])
     message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds)
     assert f"{ARM.name}: it has no val episode: of 1 none is held out, for which there must be at least two" in message
+    rlds = write_rlds(tmp_path / "more", ARM, [12] * 7)
+    none = ("--set", "store.val_fraction=0.01", "--set", "store.min_val=0")
+    message = refused(1, "tokenize", *SMOKE, "--out", tmp_path / "out", "--data", rlds, *none)
+    assert "of 7 none is held out" in message and "val_fraction=0.01, min_val=0 and max_val=200 say how many" in message
 
 
 # --- Data ------------------------------------------------------------------------------------
