@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +31,8 @@ def written_aside(directory: Path) -> Iterator[Path]:
     """
     require_free(directory)
     directory = Path(directory).absolute()
-    aside = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
+    # Not by the process's number: in a container that is the one that a killed process had, which left its directory.
+    aside = directory.with_name(f".{directory.name}.{secrets.token_hex(4)}.tmp")
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
         aside.mkdir()
