@@ -112,6 +112,7 @@ class Facts:
     actions: tuple[ActionFacts, ...]
     damaged: dict[str, int]  # reason -> episodes
     hz: float | None = None  # native rate, where the files say it
+    stopped: bool = False  # before all that were drawn were read: they come to too many bytes
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,9 @@ def inspect_dataset(
     steps, examples, prints, bytes_read = [], [], [], 0
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
     first = np.unique(np.linspace(0, len(drawn) - 1, shown).round().astype(int))  # those to look at
+    stopped = False
     for i in [*drawn[first], *np.delete(drawn, first)]:
-        if bytes_read > max_bytes:
+        if stopped := bytes_read > max_bytes:
             break
         try:
             record = _read(source, int(i), cameras, numbers)
@@ -189,6 +191,7 @@ def inspect_dataset(
         actions=tuple(ActionFacts(key, dimension_facts(rows[key])) for key in numbers),
         damaged=dict(source.skipped),
         hz=source.hz,
+        stopped=stopped,
     )
     return Sample(facts, tuple(examples), tuple(prints))
 

@@ -171,7 +171,8 @@ def print_facts(facts: Facts) -> None:
     sampled = "all" if facts.sampled == facts.episodes else f"{facts.sampled} of {facts.episodes:,}"
     console.print(
         f"[bold]{escape(facts.name)}[/] {facts.version}  {escape(facts.directory)}\n"
-        f"read {sampled} episodes of split {facts.split!r} ({facts.bytes_read / 1e6:,.1f} MB)",
+        f"read {sampled} episodes of split {facts.split!r} ({facts.bytes_read / 1e6:,.1f} MB"
+        f"{', no more: they are large' if facts.stopped else ''})",
         soft_wrap=True,
     )
     for reason, count in facts.damaged.items():

@@ -74,7 +74,8 @@ def test_sample_is_bounded_in_episodes_and_bytes(toy):
     facts, shown = sample.facts, sample.shown
     assert (facts.sampled, facts.episodes, len(shown)) == (3, 6, 2)
     assert inspect_dataset(toy, episodes=3).facts.steps == inspect_dataset(toy, episodes=3).facts.steps
-    assert inspect_dataset(toy, max_bytes=1).facts.sampled == 1
+    facts = inspect_dataset(toy, max_bytes=1).facts
+    assert facts.sampled == 1 and facts.stopped and not sample.facts.stopped
 
 
 def test_frames_that_are_read_one_by_one_count_as_what_is_read(tmp_path):
