@@ -13,6 +13,7 @@ RESULTS_VERSION = max(CHANGES)
 
 OF_SOME = {
     "a frame's own action is told from earlier ones by its weight": {"model.conditioning": "cross_attention"},
+    "robots without actions have no error of predicted actions": {"model.action_heads": True},
 }
 """Changes that alter the numbers of a few trials only: those whose fields have such values. They are part of the names
 of these trials, and all others stay finished."""

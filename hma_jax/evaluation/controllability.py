@@ -30,8 +30,12 @@ OPTIONAL = (
     "counterfactual_psnr",
     "counterfactual_copy",
     "counterfactual_gain",
+    "action_error",
+    "action_error_of_mean",
+    "action_gain",
 )
-"""Metrics that some windows have not (nan): there is no other episode, or nobody simulates their robot."""
+"""Metrics that some windows have not (nan): there is no other episode, nobody simulates their robot, or it has no actions
+to predict."""
 
 
 def under_each(

@@ -231,8 +231,8 @@ def _policy_errors(
     statistics: tuple[jax.Array, jax.Array],
     real_BT: jax.Array | None,
 ) -> dict[str, jax.Array]:
-    """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live
-    action value, of the model and of always giving the mean."""
+    """Per window [B]: mean squared error of the chunks after the prompt, in variances of each live action value, of the
+    model and of always giving the mean; nan where no value is live, as of a robot without actions."""
     decode, first = config.decode, config.prompt_frames - 1
     if causally:
         predicted = predict_next_actions(model, tokens, actions_BTU, embodiment_B, key_B, decode)
@@ -250,7 +250,7 @@ def _policy_errors(
         if real_BT is not None:
             real = real_BT[:, first:, None]
             of_window = jnp.sum(error_BTU * real, 1) / jnp.maximum(jnp.sum(real, 1), 1)
-        return jnp.sum(of_window * alive_BU, -1) / jnp.maximum(alive_BU.sum(-1), 1)
+        return jnp.sum(of_window * alive_BU, -1) / alive_BU.sum(-1)
 
     error, of_mean = mean((guess - truth) ** 2), mean(truth**2)
     return {"action_error": error, "action_error_of_mean": of_mean, "action_gain": of_mean - error}

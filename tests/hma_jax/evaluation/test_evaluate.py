@@ -9,10 +9,13 @@ import pytest
 
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig, SamplerConfig
 from hma_jax.evaluation import evaluate as module
+from hma_jax.evaluation import protocol
 from hma_jax.evaluation.evaluate import Evaluation, evaluate, in_groups, make_evaluator, one_ahead, plan_groups
 from hma_jax.evaluation.images import decode_in_pieces
 from hma_jax.evaluation.metrics import psnr, ssim
 from hma_jax.evaluation.protocol import evaluation_inputs
+from hma_jax.evaluation.summary import summarise
+from hma_jax.evaluation.windows import WindowTable
 from hma_jax.generation import rollout
 from hma_jax.model.embodiments import Embodiment
 from hma_jax.model.hma import declare_model
@@ -101,6 +104,22 @@ def test_new_robots_change_no_number_of_the_old_ones(diffusion):
     assert old.names == new.names and "action_error" in old.metrics
     for metric, column in old.metrics.items():
         np.testing.assert_allclose(new.metrics[metric], column, rtol=1e-4, atol=1e-4, err_msg=metric)
+
+
+def test_robots_without_actions_have_no_error_of_predicted_ones(monkeypatch):
+    """They do not count as predicted without error in the mean over robots."""
+    (batch,) = make_batches(CONFIG, each=2)
+    monkeypatch.setattr(protocol, "predict_actions", lambda model, tokens, actions, *_, **__: actions + 1)
+    arguments = (CONFIG, batch["tokens"], batch["actions"], batch["embodiment"], None, EVAL, False)
+    mean, std = (np.asarray(x)[batch["embodiment"]] for x in TABLE.statistics())
+    film = np.asarray(batch["dataset"]) == "arm"
+    found = protocol._policy_errors(*arguments, (mean, np.where(film[:, None], 0, std)), None)
+    names, frames = np.asarray(batch["dataset"]), np.full(len(film), CONFIG.frames)
+    windows = WindowTable(names, batch["episode"], batch["start"], frames, {k: np.asarray(x) for k, x in found.items()})
+    summary = summarise(windows, 1)
+    of_robots, overall = summary.datasets, summary.overall
+    for name in ("action_error", "action_error_of_mean", "action_gain"):
+        assert name not in of_robots["arm"] and overall[name].mean == of_robots["pusher"][name].mean != 0
 
 
 @pytest.mark.slow
