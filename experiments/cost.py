@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Table
 
+from experiments.done import NOTHING, UNKNOWN, Done
 from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
 from experiments.progress import tidy_table
 from experiments.running.provenance import Provenance
@@ -30,10 +31,6 @@ from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
-
-UNKNOWN = Provenance("", "", "")
-"""Stands in where only the trials' own fields matter."""
-
 
 @dataclass(frozen=True)
 class Cost:
@@ -167,17 +164,20 @@ def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> 
 
 
 def plan_trials(
-    study: Study, sweeps: Sequence[Sweep], devices: float = 1.0, evaluated: bool = True
+    study: Study, sweeps: Sequence[Sweep], devices: float = 1.0, evaluated: bool = True, done: Done = NOTHING
 ) -> dict[str, TrialPlan]:
-    """Every trial of `sweeps` by id, each on so many `devices`. `evaluated`: not only trained."""
-    trials = unique_trials(sweeps, UNKNOWN)
+    """Every trial of `sweeps` by id, each on so many `devices`: what is left of it. `evaluated`: not only trained."""
+    trials = unique_trials(sweeps, done.provenance)
     shared = share_runs(trials)
     plans = {}
     for id, trial in trials.items():
         cost = estimate(trial)
+        if id in done.finished:
+            plans[id] = TrialPlan(trial, cost, 0.0, 0.0)
+            continue
         whole = cost.flops if evaluated else cost.train_flops
-        begun = max((step for _, step in shared[id].before), default=0) / trial.train.steps
-        flops = whole - begun * cost.train_flops
+        begun = max(done.steps.get(id, 0), *(step for _, step in shared[id].before), 0) / trial.train.steps
+        flops = whole - min(begun, 1.0) * cost.train_flops
         plans[id] = TrialPlan(trial, cost, flops, flops / (devices * study.flops_per_second) + study.trial_seconds)
     return plans
 
@@ -190,10 +190,11 @@ def plan_table(
     given: bool = False,
     trained: bool = True,
     evaluated: bool = True,
+    done: Done = NOTHING,
 ) -> Table:
     """Every trial once, with the axes it belongs to, its size and its cost. `given`: the user has the data, `trained`:
-    the tokenizer is trained here, `evaluated`: trials are judged, not only trained."""
-    plans = plan_trials(study, sweeps, devices.each, evaluated)
+    the tokenizer is trained here, `evaluated`: trials are judged, not only trained; `done` is not counted again."""
+    plans = plan_trials(study, sweeps, devices.each, evaluated, done)
     several = len({plan.trial.train.steps for plan in plans.values()}) > 1
     budget = f"{all_steps(sweeps)} steps x batch {study.train.batch}"
     table = tidy_table(
@@ -201,11 +202,14 @@ def plan_table(
         "trial", "sets", "videos", "width", *["steps"] * several, "params", "one robot", "FLOPs", "time",
     )  # fmt: skip
     table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
-    before = estimate_preparing(study, simulated=not given, trained=trained)
-    table.caption = _caption(study, list(plans.values()), devices, before, evaluated)
+    before = estimate_preparing(
+        study, simulated=not (given or done.suite), trained=trained and not done.tokenizer, tokenised=not done.tokens
+    )
+    left = [plan for id, plan in plans.items() if id not in done.finished]
+    table.caption = _say_done(done, len(plans)) + (_caption(study, left, devices, before, evaluated) if left else "")
     seeds = {p.trial.train.seed for p in plans.values()}
-    shared = {trial_id(reference_trial(study, seed), UNKNOWN) for seed in seeds}
-    axes = _axes(sweeps)
+    shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
+    axes = _axes(sweeps, done.provenance)
     for id, plan in plans.items():
         trial, cost = plan.trial, plan.cost
         seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
@@ -217,10 +221,18 @@ def plan_table(
             *[f"{trial.train.steps:,}"] * several,
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
-            _flops(plan.flops).removesuffix("FLOP"),
-            _duration(plan.seconds),
+            *(("", "finished") if id in done.finished else (_flops(plan.flops).removesuffix("FLOP"), _duration(plan.seconds))),
         )
     return table
+
+
+def _say_done(done: Done, trials: int) -> str:
+    """What is not counted, since it is there."""
+    before = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
+    parts = [name for name, there in before.items() if there]
+    parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
+    parts += [f"{sum(done.steps.values()):,} steps of unfinished training"] if done.steps else []
+    return f"There already, and not counted: {', '.join(parts)}. " if parts else ""
 
 
 def _caption(
@@ -238,7 +250,9 @@ def _caption(
         what = f"for the trials, one after the other; {_duration(alone)} if the cluster runs all at a time"
     else:
         what = f"for the trials, {'one after the other' if workers == 1 else f'{workers} at a time'}"
-    if before.unknown:
+    if not before.seconds and not before.unknown:
+        whole = f"About {_duration(spent)} {what}"
+    elif before.unknown:
         whole = f"About {_duration(spent)} {what}, and what it takes to prepare: {describe(before, _duration)}"
     else:
         whole = (
@@ -267,13 +281,13 @@ def checkpoint_bytes(plan: TrialPlan) -> int:
     return UNWATCHED.keep_checkpoints * copies * 4 * plan.cost.parameters
 
 
-def _axes(sweeps: Sequence[Sweep]) -> dict[str, str]:
+def _axes(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
     """What every trial is, by id: the control, a variant, or a point of one axis or several."""
     names: dict[str, dict[str, str]] = {}
     for sweep in sweeps:
         for point in sweep.points:
             own = "control" if point.role == CONTROL else sweep.remark(point) or sweep.name
-            names.setdefault(trial_id(point.trial, UNKNOWN), {}).setdefault(sweep.name, own)
+            names.setdefault(trial_id(point.trial, provenance), {}).setdefault(sweep.name, own)
     return {id: " + ".join(dict.fromkeys(own.values())) for id, own in names.items()}
 
 

@@ -37,7 +37,8 @@ class PreparingCost:
 
     @property
     def seconds(self) -> float:
-        return START + self.simulating + self.tokenizer + self.tokens
+        making = self.simulating + self.tokenizer + self.tokens
+        return START + making if making else 0.0
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,13 @@ class Frames:
     simulated: bool
 
 
-def estimate_preparing(study: Study, simulated: bool = True, trained: bool = True) -> PreparingCost:
-    """`simulated`: the suite is made, no data is given. `trained`: the tokenizer is trained, none is given."""
+def estimate_preparing(
+    study: Study, simulated: bool = True, trained: bool = True, tokenised: bool = True
+) -> PreparingCost:
+    """`simulated`: the suite is made, no data is given. `trained`: the tokenizer is trained, none is given. `tokenised`:
+    tokens are made, which are not there yet; when they are, nothing else is made either."""
+    if not tokenised:
+        return PreparingCost()
     counts = {name: count_frames(study, name) for name in study.all_names()}
     known = [frames for frames in counts.values() if frames]
     kept = sum(frames.kept for frames in known)

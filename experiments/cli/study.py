@@ -77,10 +77,12 @@ def _run(
     launching = Launching(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
         from experiments.cost import Devices, check_trials, plan_table
+        from experiments.done import find_done
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
         devices = Devices(check_trials(setting.study, sweeps, launching.share()), launching.at_once)
-        console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained))
+        done = find_done(setting, sweeps)
+        console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))
         return
     from experiments.run_study import run_study
 

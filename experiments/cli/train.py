@@ -61,7 +61,7 @@ def train(
         require_another_place(begin, run)
     if dry_run:
         _check(setting, run, one.trajectories, options)
-        _print_cost(setting, _single_trial(setting, one.trajectories), hosts.count())
+        _print_cost(setting, _single_trial(setting, one.trajectories), run, hosts.count())
         return
     train_model(setting, run, options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
 
@@ -241,10 +241,13 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
     return dataclasses.replace(reference_trial(study, study.seeds[0]), max_trajectories=trajectories)
 
 
-def _print_cost(setting: Setting, trial: Trial, processes: int) -> None:
-    """The dry run of a study with nothing but this trial, on the devices of so many `processes` as this one."""
+def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> None:
+    """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so many
+    `processes` as this one."""
     from experiments.cost import Devices, check_trials, plan_table
+    from experiments.done import UNKNOWN, find_prepared, newest_step
     from experiments.running.launchers.registry import Launching
+    from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import Point, Sweep
 
     mesh, own = setting.study.execution.mesh, Launching().share()
@@ -252,7 +255,10 @@ def _print_cost(setting: Setting, trial: Trial, processes: int) -> None:
     model = Sweep("model", axis="", scope=trial.evaluated, points=(Point(0, trial),))
     devices = Devices(check_trials(setting.study, [model], share))
     given, trained = bool(setting.data), setting.tokenizer is None
-    console.print(plan_table(setting.study, [model], devices, given=given, trained=trained, evaluated=False))
+    id, made = trial_id(trial, UNKNOWN), newest_step(run)
+    done = dataclasses.replace(find_prepared(setting), steps={id: made} if made else {})
+    table = plan_table(setting.study, [model], devices, given=given, trained=trained, evaluated=False, done=done)
+    console.print(table)
 
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:

@@ -65,6 +65,14 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
     return [(spec, workspace.suite / spec.name / VERSION) for spec in specs]
 
 
+def suite_is_there(study: Study, workspace: Workspace) -> bool:
+    """Whether all datasets of the study are there, with the settings that it has."""
+    from data_pipelines.sources.rlds.writer import VERSION
+
+    places = {name: workspace.suite / name / VERSION for name in study.all_names()}
+    return all(place.exists() and not _differences(name, place, study.suite) for name, place in places.items())
+
+
 def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | None:
     """How the inputs of a dataset that is there differ from `suite`; [] if only the simulator does; None if it
     is as it should be, is not there, or lacks shards and is to be made in any case."""

@@ -109,6 +109,14 @@ def test_a_mesh_that_does_not_fit_is_refused_before_anything_is_prepared(
     assert "a mesh of data=3, fsdp=1, tensor=1 does not fit 1 device(s); set one axis to -1" in said
 
 
+def test_a_dry_run_counts_nothing_that_is_there(train):
+    train()
+    said, *_ = train("--set", "train.steps=6", "--dry-run")
+    said = " ".join(said.split())
+    assert "There already, and not counted: the tokenizer, tokens, 3 steps of unfinished training. About" in said
+    assert "to prepare" not in said
+
+
 def test_fewer_trajectories_when_asked_for(train):
     said, trial, _ = train("--trajectories", "3")
     assert trial.max_trajectories == 3

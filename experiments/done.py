@@ -1,0 +1,107 @@
+"""What of a study is there already, for dry runs: what is prepared and which trials are finished, or how far they are.
+
+Nothing is made and no data are read, so that a dataset that was changed since is not noticed: the study's own command
+refuses it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from experiments.preparing.made_from import read_stamp
+from experiments.running.attempts import RESULT, RUN
+from experiments.running.provenance import Provenance
+from experiments.running.results_version import RESULTS_VERSION
+from experiments.running.workspace import Workspace, find_record
+from experiments.setting import Setting
+from experiments.study import Study
+from experiments.sweeps.sweep import Sweep, unique_trials
+from hma_jax.config import ConfigError
+from hma_jax.config.json import to_dict
+
+UNKNOWN = Provenance("", "", "")
+"""Stands in where nothing is known of it, and only the trials' own fields matter."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """Trials are named by what they hold and their `provenance`."""
+
+    suite: bool = False
+    tokenizer: bool = False
+    tokens: bool = False  # and the evaluation windows
+    provenance: Provenance = UNKNOWN
+    finished: frozenset[str] = frozenset()
+    steps: Mapping[str, int] = field(default_factory=dict)  # that trials have made, of those that have begun
+
+
+NOTHING = Done()
+
+
+def find_done(setting: Setting, sweeps: Sequence[Sweep]) -> Done:
+    """What there is of the trials of `sweeps` in the study's directory; nothing where another study is."""
+    study, workspace = setting.study, setting.workspace
+    try:
+        record = find_record(workspace)
+        if record is not None and _prepared_by(record.study) != _prepared_by(study):
+            return NOTHING
+    except ConfigError:  # it cannot be read, of which the study's own command speaks
+        return NOTHING
+    done = find_prepared(setting)
+    if record is None or record.provenance is None:
+        return done
+    provenance = dataclasses.replace(record.provenance, results=RESULTS_VERSION)
+    return dataclasses.replace(done, provenance=provenance, **_trials(workspace, unique_trials(sweeps, provenance)))
+
+
+def find_prepared(setting: Setting) -> Done:
+    """What is prepared, of the settings that the study has."""
+    return Done(_suite(setting), _tokenizer(setting), _tokens(setting.study, setting.workspace))
+
+
+def newest_step(run: Path) -> int:
+    """Of the checkpoints of a run; 0 without any."""
+    steps = [int(path.name) for path in (run / "checkpoints").glob("*") if path.name.isdigit()]
+    return max(steps, default=0)
+
+
+def _trials(workspace: Workspace, ids: Iterable[str]) -> dict[str, Any]:
+    finished = frozenset(id for id in ids if (workspace.trials / id / RESULT).exists())
+    steps = {id: newest_step(workspace.trials / id / RUN) for id in ids if id not in finished}
+    return {"finished": finished, "steps": {id: n for id, n in steps.items() if n}}
+
+
+def _prepared_by(study: Study) -> list[Any]:
+    """The settings on which it depends what trials are given."""
+    protocol = study.eval
+    return [
+        study.all_names(), study.suite, study.tokenizer, study.tokenizer_train, study.store, study.tau, study.rate,
+        study.model.frames, protocol.windows_per_dataset, protocol.seed, protocol.prompt_frames,
+    ]  # fmt: skip
+
+
+def _suite(setting: Setting) -> bool:
+    from experiments.preparing.suite import suite_is_there
+
+    return not setting.data and suite_is_there(setting.study, setting.workspace)
+
+
+def _tokenizer(setting: Setting) -> bool:
+    stamp = read_stamp(setting.workspace.tokenizer)
+    wanted = {name: to_dict(getattr(setting.study, name)) for name in ("tokenizer", "tokenizer_train")}
+    return stamp is not None and all(stamp.inputs.get(name) == value for name, value in wanted.items())
+
+
+def _tokens(study: Study, workspace: Workspace) -> bool:
+    from data_pipelines.errors import DataError
+    from experiments.preparing.windows import require_same_windows, windows_are_frozen
+
+    try:
+        require_same_windows(study, workspace, None)
+        return windows_are_frozen(study, workspace)
+    except (ConfigError, DataError):  # others, or none of some datasets
+        return False

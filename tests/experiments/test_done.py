@@ -1,0 +1,55 @@
+"""What a dry run does not count again."""
+
+from dataclasses import replace
+
+import pytest
+
+from experiments.cost import plan_table, plan_trials
+from experiments.done import NOTHING, find_done
+from experiments.running.attempts import RESULT
+from experiments.running.workspace import save_record
+from experiments.setting import Setting, StudyArguments
+from experiments.study import TokenizerTrainConfig
+from experiments.sweeps.registry import SCALING, plan_sweeps
+from tests.experiments import fakes
+
+STUDY = replace(fakes.STUDY, datasets=("pusher_sand", "rover_road", "arm_chalk"))  # robots whose sizes are known
+
+
+@pytest.fixture
+def setting(tmp_path) -> Setting:
+    """Of a study all of whose trials are finished."""
+    workspace = fakes.finished_study(tmp_path, STUDY)
+    save_record(workspace, fakes.record_of(STUDY))
+    return Setting(StudyArguments(out=tmp_path), STUDY, (), workspace)
+
+
+def test_finished_trials_are_not_priced_again_and_begun_ones_from_their_step(setting):
+    sweeps = plan_sweeps(STUDY, SCALING)
+    whole = sum(plan.flops for plan in plan_trials(STUDY, sweeps).values())
+    done = find_done(setting, sweeps)
+    assert whole > 0 and {plan.seconds for plan in plan_trials(STUDY, sweeps, done=done).values()} == {0.0}
+    said = plan_table(STUDY, sweeps, done=done).caption
+    assert said == f"There already, and not counted: {len(done.finished)} of {len(done.finished)} trials. "
+
+    first, second, *_ = sorted(done.finished)
+    for id in (first, second):
+        (setting.workspace.trials / id / RESULT).unlink()
+    (setting.workspace.trials / first / "run" / "checkpoints" / "2").mkdir(parents=True)
+    done = find_done(setting, sweeps)
+    plans = plan_trials(STUDY, sweeps, done=done)
+    assert {id for id, plan in plans.items() if plan.seconds} == {first, second}
+    assert plans[first].flops == pytest.approx(plans[first].cost.flops - 2 / 3 * plans[first].cost.train_flops)
+    assert plans[second].flops == plans[second].cost.flops
+    said = plan_table(STUDY, sweeps, done=done).caption
+    assert f"{len(done.finished)} of {len(plans)} trials, 2 steps of unfinished training. About " in said
+
+
+def test_nothing_of_a_study_on_other_tokens_or_none_is_taken_for_done(setting, tmp_path):
+    sweeps = plan_sweeps(STUDY, SCALING)
+    other = replace(setting, study=replace(STUDY, tokenizer_train=TokenizerTrainConfig(steps=7)))
+    assert find_done(other, sweeps) == NOTHING
+    setting.workspace.record.write_text("{")
+    assert find_done(setting, sweeps) == NOTHING
+    setting.workspace.record.unlink()
+    assert find_done(setting, sweeps) == NOTHING
