@@ -211,7 +211,7 @@ def plan_table(
     shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
     axes = _axes(sweeps, done.provenance)
     for id, plan in plans.items():
-        trial, cost = plan.trial, plan.cost
+        trial, cost, over = plan.trial, plan.cost, id in done.finished
         seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
         table.add_row(
             escape(("reference" if id in shared else axes.get(id, "source")) + seed),
@@ -221,7 +221,8 @@ def plan_table(
             *[f"{trial.train.steps:,}"] * several,
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
-            *(("", "finished") if id in done.finished else (_flops(plan.flops).removesuffix("FLOP"), _duration(plan.seconds))),
+            "" if over else _flops(plan.flops).removesuffix("FLOP"),
+            "finished" if over else _duration(plan.seconds),
         )
     return table
 

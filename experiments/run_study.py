@@ -86,7 +86,7 @@ def require_trainable(study: Study, sweeps: Sequence[Sweep], launching: Launchin
     from experiments.cost import check_trials
 
     share = launching.share()
-    if share is None and launching.name == "local":  # no accelerators are known: trials have what JAX finds, as it does here
+    if share is None and launching.name == "local":  # trials have what JAX finds, as it does here
         import jax
 
         share = float(jax.device_count())

@@ -58,8 +58,8 @@ def compare(
     text = csv_text(analysis.Difference, rows)
     require(
         to is not None or not place.exists() or place.read_bytes() == text.encode(),
-        f"{place}: another comparison is there, and stays. Name a file for this one with --to FILE, or add --to {place}, "
-        "which puts it in place of that one",
+        f"{place}: another comparison is there, and stays. Name a file for this one with --to FILE, or add "
+        f"--to {place}, which puts it in place of that one",
     )
     write_file(place, text)
     wrote(place)
@@ -84,7 +84,8 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
             kept, there = (", ".join(map(str, x)) for x in ([s for s in side.seeds if s in other.seeds], side.seeds))
             table.caption += f" Of the seeds of {escape(side.name)} ({there}) only {kept} is compared."
             if not other.says_seed:
-                table.caption += f" {escape(other.name)} does not say with which seed it was trained, and stands for {kept}."
+                unsaid = "does not say with which seed it was trained, and stands for"
+                table.caption += f" {escape(other.name)} {unsaid} {kept}."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         table.caption += f" No error of {few(alone)}: one held-out episode."
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:

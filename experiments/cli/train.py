@@ -209,8 +209,8 @@ def _taken(run: Path, origin: dict[str, Any]) -> dict[str, Any]:
     if taken["provenance"] != origin["provenance"] or taken["step"] >= origin["step"]:
         return origin
     console.print(
-        f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and goes on "
-        "from its own checkpoint",
+        f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and goes "
+        "on from its own checkpoint",
         markup=False,
         soft_wrap=True,
     )
@@ -242,8 +242,8 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 
 
 def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> None:
-    """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so many
-    `processes` as this one."""
+    """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so
+    many `processes` as this one."""
     from experiments.cost import Devices, check_trials, plan_table
     from experiments.done import UNKNOWN, find_prepared, newest_step
     from experiments.running.launchers.registry import Launching

@@ -74,8 +74,8 @@ def check_schedule(config: OptimizerConfig, steps: int) -> None:
     require(
         config.schedule != "wsd" or warmup + decay <= steps,
         f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={warmup}) and the decay of "
-        f"schedule wsd ({decay}: train.optimizer.decay_fraction={config.decay_fraction:g} of all steps): the rate would "
-        "not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
+        f"schedule wsd ({decay}: train.optimizer.decay_fraction={config.decay_fraction:g} of all steps): the rate "
+        "would not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
     )
 
 

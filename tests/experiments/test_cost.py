@@ -155,7 +155,8 @@ def test_a_decay_that_begins_within_the_warm_up_is_refused_before_anything_is_ma
     short = [word for one in ("schedule=wsd", "warmup_steps=8") for word in ("--set", f"train.optimizer.{one}")]
     for command in (["train"], ["study"], ["study", "--dry-run"], ["train", "--dry-run"], ["sweep", "compute"]):
         steps = ("designs.compute=[9, 10]", "train.steps=10") if "compute" in command else ("train.steps=9",)
-        given = [*short, *(word for one in steps for word in ("--set", one)), "--set", "train.optimizer.decay_fraction=0.3"]
+        steps = (*steps, "train.optimizer.decay_fraction=0.3")
+        given = [*short, *(word for one in steps for word in ("--set", one))]
         assert main([*command, "--preset", "smoke", "--out", str(tmp_path / "out"), *given]) == 2
         said = capsys.readouterr().err
         assert "train.steps=9 are too few for the warm-up (train.optimizer.warmup_steps=8) and the decay of" in said

@@ -46,7 +46,9 @@ def test_what_differs_is_named_and_the_way_on(wanted, line, tmp_path):
     assert line in str(refused.value) and "--to DIR" in str(refused.value) and "--replace" in str(refused.value)
 
 
-@pytest.mark.parametrize(("provenance", "recorded"), [({"loader": {}}, {"step": 3, "seed": 7}), ({"official": 1}, {"step": 3})])
+@pytest.mark.parametrize(
+    ("provenance", "recorded"), [({"loader": {}}, {"step": 3, "seed": 7}), ({"official": 1}, {"step": 3})]
+)
 def test_the_seed_of_the_training_is_recorded_where_the_run_knows_it(provenance, recorded):
     of = {"model": {}, "train": TrainConfig(seed=7), "provenance": provenance, "weights": "last", "step": 3}
     materials = SimpleNamespace(

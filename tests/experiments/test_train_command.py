@@ -221,11 +221,12 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
 
 @pytest.mark.parametrize("command", ["train", "adapt"])
 def test_a_run_goes_on_though_the_one_that_it_began_with_has_trained_on(command, tmp_path, capsys):
-    source, run, damaged = tmp_path / "a" / "model", tmp_path / "b" / "model", tmp_path / "b" / "model" / "checkpoints" / "3"
+    source, run = tmp_path / "a" / "model", tmp_path / "b" / "model"
+    damaged = run / "checkpoints" / "3"
     known, new = write_rlds(tmp_path / "known", ARM, [18] * 12), write_rlds(tmp_path / "new", BASE, [40] * 12)
     trained = ["train", *SMOKE, "--out", str(tmp_path / "a"), "--data", str(known)]
-    begun = [*SMOKE, "--out", str(tmp_path / "b"), "--data", str(known if command == "train" else new), "--skip-damaged"]
-    begun = [command, *(["--from"] if command == "train" else []), str(source), *begun, "--checkpoint-every", "1"]
+    begun = [command, *(["--from"] if command == "train" else []), str(source), *SMOKE, "--out", str(tmp_path / "b")]
+    begun += ["--data", str(known if command == "train" else new), "--skip-damaged", "--checkpoint-every", "1"]
 
     def said(arguments: list[str], steps: int, code: int = 0) -> str:
         assert main([*arguments, "--set", f"train.steps={steps}", "--set", "train.optimizer.schedule=constant"]) == code
