@@ -8,6 +8,7 @@ printing are the caller's.
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -169,7 +170,7 @@ def inspect_dataset(
         actions = {key: np.asarray(record[step_key(key)]).reshape(count, -1) for key in numbers}
         for key in numbers:
             rows[key].append(actions[key])
-        prints.append(take_fingerprint(split, int(i), count, looked, list(actions.values())))
+        prints.append(take_fingerprint(*_named(source, int(i)), count, looked, list(actions.values())))
         if len(examples) < shown:
             examples.append(_shown(int(i), count, record, times, looked, actions))
     if not steps:
@@ -232,6 +233,17 @@ def _field(key: str, feature: FlatFeature) -> FieldFacts:
 
 
 # --- one episode ------------------------------------------------------------------------------
+
+
+def _named(source: EpisodeSource, i: int) -> tuple[str, int]:
+    """(split, number in it) of an episode, also where several splits are read together ("train+val")."""
+    number, before = int(source.numbers[i]), Counter[str]()
+    for run in source.runs:
+        if number < run.count:
+            return run.split or source.split, before[run.split] + number
+        number -= run.count
+        before[run.split] += run.count
+    raise IndexError(i)
 
 
 def _read(source: EpisodeSource, i: int, cameras: dict, numbers: Sequence[str]) -> dict:

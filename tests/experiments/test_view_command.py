@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -160,3 +162,21 @@ def test_the_same_page_twice_is_the_same_bytes(toy, tmp_path):
         assert main(["data", "view", str(directory), "--registry", str(entries), "--out", str(out)]) == 0
         pages.append(out.read_bytes())
     assert pages[0] == pages[1]
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_splits_that_are_read_together_are_two_splits_none_of_which_is_another(same, toy, tmp_path, capsys):
+    """An entry with split = "train+val": its episodes are not those of train again, but one may lie in both."""
+    directory, entries = toy
+    other = directory if same else write_rlds(tmp_path / "b", SPEC, [21] * 4, change=lambda e, f: change(e + 9, f))
+    shard = "toy-{}.tfrecord-00000-of-00001"
+    shutil.copy(other / shard.format("train"), directory / shard.format("val"))
+    info = json.loads((directory / "dataset_info.json").read_text())
+    info["splits"].append(info["splits"][0] | {"name": "val"})
+    (directory / "dataset_info.json").write_text(json.dumps(info))
+    entries.write_text(to_toml(replace(SPEC, split="train+val", val_split="val")))
+    arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert ("same episodes in two splits" in said) == same and ("train 3 = val 3" in said) == same
+    assert "likely duplicates" not in said

@@ -101,7 +101,7 @@ def _view_one(
         entry = suggestion.spec() if suggestion else None
     usual = entry.stride if entry else stride_of(rate) if rate else None
     stride = (stride or usual) if rate else None
-    others = [s.name for s in facts.splits if s.name != split and s.episodes][:OTHER_SPLITS]
+    others = [s.name for s in facts.splits if s.name not in split.split("+") and s.episodes][:OTHER_SPLITS]
     prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes))]
     windows = window_facts(facts, stride, frames) if stride else None
     remarks = make_remarks(facts, entry, windows, find_duplicates(prints))
