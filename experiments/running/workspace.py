@@ -13,7 +13,7 @@ from experiments.program import PROGRAM
 from experiments.running.former import modernise
 from experiments.running.provenance import Provenance, inputs_of
 from experiments.study import Study
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held, exclusive
@@ -200,11 +200,12 @@ def find_record(workspace: Workspace) -> Record | None:
 
 
 def load_record(workspace: Workspace) -> Record:
-    """Raises ConfigError if no study lives there."""
+    """Raises ConfigError if no study lives there, or one that does not say what its axes are."""
     record = find_record(workspace)
     if record is None:
         raise ConfigError(
             f"no study in {workspace.root} (it has no {workspace.record.name}); start one with "
             f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
         )
+    require(bool(record.axes), f"{workspace.record}: axes is empty; name those that it had, or run `{record.command}`")
     return record

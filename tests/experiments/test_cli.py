@@ -144,6 +144,15 @@ def test_report_is_drawn_again_from_disk(tmp_path, capsys):
     assert "report.html" in capsys.readouterr().out and workspace.report.exists()
 
 
+@pytest.mark.parametrize("command", ["report", "fit"])
+def test_a_study_whose_axes_were_taken_out_of_its_record_is_told_so(command, tmp_path, capsys):
+    workspace = finished_study(tmp_path)
+    save_record(workspace, record_of(axes=()))
+    assert main([command, str(tmp_path)]) == 2
+    said = f"{workspace.record}: axes is empty; name those that it had, or run `hma study`"
+    assert said in capsys.readouterr().err and not workspace.report.exists()
+
+
 @pytest.fixture
 def instant_trials(monkeypatch):
     """Nothing is prepared; trials have fake results, but those of width 8 fail."""
