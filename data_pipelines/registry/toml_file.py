@@ -40,7 +40,10 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
                 raise ConfigError(f"{name} = {fields!r} stands outside of a [dataset] table")
             if "name" in fields:  # it would be the entry of another dataset than the heading says
                 raise ConfigError(f"{name}: leave out name = {fields['name']!r}: the heading is an entry's name")
-            entries.append(from_dict(DatasetSpec, {"name": name} | fields, name))
+            entry = from_dict(DatasetSpec, {"name": name} | fields, name)
+            if entry.angles and "angle_form" not in fields:  # by default they would stay as they are
+                raise ConfigError(f'{name}: angles say which values wrap; add angle_form = "sine_cosine" or "unwrapped"')
+            entries.append(entry)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error
     return tuple(entries)

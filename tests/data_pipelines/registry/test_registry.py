@@ -234,6 +234,10 @@ def test_registered_entry_is_found_and_takes_the_place_of_a_known_one(registered
         ('[robot]\nimage = "i"\n', "unknown field.* image; known"),
         ('[robot]\nname = "arm"\nimage_key = "i"\n', "robot: leave out name = 'arm'"),
         ('[robot]\nimage_key = "i"\naction_keys = []\naction_dims = []\nhz = -1\n', "hz, the native rate"),
+        (
+            '[robot]\nimage_key = "i"\naction_keys = ["action"]\naction_dims = [2]\nhz = 1\nangles = [1]\n',
+            'robot: angles say which values wrap; add angle_form = "sine_cosine"',
+        ),
     ],
 )
 def test_toml_file_with_a_mistake_is_named(text, message, tmp_path):
