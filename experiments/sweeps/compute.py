@@ -23,10 +23,16 @@ from hma_jax.config import require
 def plan(study: Study) -> Sweep:
     """Steps so that every width spends the FLOPs that the reference spends in each of `designs.compute` steps. Raises
     ConfigError where none of these is enough."""
+    from hma_jax.training.optimizer import decay_fits
+
     widths = sorted({*study.widths, study.model.width})
     flops = {width: flops_per_step(of_width(reference_trial(study, study.seeds[0]), width)) for width in widths}
     budgets = {steps: steps * flops[study.model.width] for steps in study.designs.compute}
     largest = max(flops.values())
+
+    def compares(fewest: int) -> bool:
+        """A run that only warms up, or whose rate does not come down, compares nothing."""
+        return fewest > study.train.optimizer.warmup_steps and decay_fits(study.train.optimizer, fewest)
 
     def point(width: int, budget: float, seed: int) -> Point:
         steps = max(round(budget / flops[width]), 1)
@@ -38,14 +44,15 @@ def plan(study: Study) -> Sweep:
     points = [
         point(width, budget, seed)
         for budget in budgets.values()
-        if budget / largest > study.train.optimizer.warmup_steps  # a run that only warms up compares nothing
+        if compares(round(budget / largest))
         for width in widths
         for seed in study.seeds
     ]
     require(
         bool(points),
         f"designs.compute {study.designs.compute}: at none of these steps' FLOPs the widest model, of {widths[-1]}, trains "
-        f"beyond train.optimizer.warmup_steps, {study.train.optimizer.warmup_steps}; --set designs.compute=...",
+        f"beyond train.optimizer.warmup_steps, {study.train.optimizer.warmup_steps}, and a decay of wsd; "
+        "--set designs.compute=...",
     )
     return Sweep(
         "compute",

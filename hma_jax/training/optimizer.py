@@ -68,14 +68,18 @@ def decay_steps(config: OptimizerConfig, steps: int) -> int:
     return max(int(steps * config.decay_fraction), 1)
 
 
+def decay_fits(config: OptimizerConfig, steps: int) -> bool:
+    """Whether the decay phase, of a schedule that has one, begins after the warm-up."""
+    return config.schedule != "wsd" or config.warmup_steps + decay_steps(config, steps) <= steps
+
+
 def check_schedule(config: OptimizerConfig, steps: int) -> None:
     """Raises ConfigError for a decay phase of wsd that would begin within the warm-up and end above final_fraction."""
-    decay, warmup = decay_steps(config, steps), config.warmup_steps
     require(
-        config.schedule != "wsd" or warmup + decay <= steps,
-        f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={warmup}) and the decay of "
-        f"schedule wsd ({decay}: train.optimizer.decay_fraction={config.decay_fraction:g} of all steps): the rate "
-        "would not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
+        decay_fits(config, steps),
+        f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps}) and the "
+        f"decay of schedule wsd ({decay_steps(config, steps)}: train.optimizer.decay_fraction={config.decay_fraction:g} of all steps): "
+        "the rate would not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
     )
 
 

@@ -153,8 +153,8 @@ def test_a_mesh_that_a_trial_does_not_divide_over_is_refused_before_it_is_priced
 def test_a_decay_that_begins_within_the_warm_up_is_refused_before_anything_is_made(capsys, tmp_path):
     """The rate came down to half of its peak at the end of this one, not to a tenth."""
     short = [word for one in ("schedule=wsd", "warmup_steps=8") for word in ("--set", f"train.optimizer.{one}")]
-    for command in (["train"], ["study"], ["study", "--dry-run"], ["train", "--dry-run"], ["sweep", "compute"]):
-        steps = ("designs.compute=[9, 10]", "train.steps=10") if "compute" in command else ("train.steps=9",)
+    for command in (["train"], ["study"], ["study", "--dry-run"], ["train", "--dry-run"], ["sweep", "horizon"]):
+        steps = ("designs.budgets=[9, 20]", "train.steps=20") if "horizon" in command else ("train.steps=9",)
         steps = (*steps, "train.optimizer.decay_fraction=0.3")
         given = [*short, *(word for one in steps for word in ("--set", one))]
         assert main([*command, "--preset", "smoke", "--out", str(tmp_path / "out"), *given]) == 2

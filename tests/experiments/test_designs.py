@@ -13,13 +13,14 @@ from experiments.analysis.scaling import surface_of
 from experiments.cost import plan_trials
 from experiments.override import override
 from experiments.preparing_cost import estimate_preparing
-from experiments.presets import CPU_FULL, PAPER
+from experiments.presets import ACCELERATOR, CPU_FULL, PAPER
 from experiments.running.trial import training_of, trial_id
 from experiments.sweeps.draws import draw_judged, draw_mixture
 from experiments.sweeps.episodes import count_episodes
 from experiments.sweeps.registry import AXES, find_axis, plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT, reference_trial, unique_trials
 from hma_jax.config import ConfigError
+from hma_jax.training.optimizer import check_schedule
 from tests.experiments.fakes import PROVENANCE
 
 FAMILY = {e.name: e.family for e in EMBODIMENTS}
@@ -106,6 +107,14 @@ def test_newcomers_are_whole_and_of_the_kin_that_is_said():
         assert not ("strangers" in label and kin)
         assert "siblings" not in label or {FAMILY[name] for name in added} <= {FAMILY[name] for name in judged}
         assert len(added) == {"alone": 0, "20": 15, "all robots": 35}[label.split(",")[0]]
+
+
+def test_rates_come_down_at_every_point_of_equal_compute():
+    """The widest model had 512 steps at the smallest of these budgets, 500 of which warm up."""
+    found = find_axis("compute")(ACCELERATOR).points
+    assert {point.series for point in found} and len({point.series for point in found}) < len(ACCELERATOR.designs.compute)
+    for point in found:
+        check_schedule(point.trial.train.optimizer, point.trial.train.steps)
 
 
 def test_every_width_spends_the_same_compute():
