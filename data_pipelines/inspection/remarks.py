@@ -11,6 +11,7 @@ from data_pipelines.inspection.duplicates import Fingerprint
 from data_pipelines.inspection.inspect import ActionFacts, Facts
 from data_pipelines.inspection.suggest import WindowFacts
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.registry.angles import TURN
 from data_pipelines.sources.rlds.schema import field_slice
 
 MISFIT = "entry does not fit"
@@ -148,6 +149,14 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Remark]:
             f'angles = [{numbers}] and angle_form = "sine_cosine" (or "unwrapped") mends it'
         )
         remarks.append(Remark("doubt", "wrapping angle", text))
+    for unit, hint in WRAPPING.items():
+        other = [i for i, d in enumerate(field.dimensions) if d.hint == hint and start + i in handled]
+        if other and unit != entry.angle_unit:
+            text = (
+                f"{_values(field, other)} jump{'s' if len(other) == 1 else ''} by a whole turn of {TURN[unit]:.4g}; the "
+                f"entry's angle_unit is {entry.angle_unit}, not {unit}"
+            )
+            remarks.append(Remark("bad", "unit of angles", text))
     return remarks
 
 

@@ -219,6 +219,7 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
         same = (known.image_key, known.action_keys, known.action_dims)
         fits = same == (suggestion.image_key, suggestion.action_keys, suggestion.action_dims)
         fits &= set(suggestion.angles) <= set(known.angles) and suggestion.hz == known.hz
+        fits &= not suggestion.angles or suggestion.angle_unit == known.angle_unit
         agrees = ", as its contents suggest" if fits else ". Its contents alone would suggest:"
         console.print(f"[bold]in the registry[/]: {escape(_in_words(known))}{agrees}", soft_wrap=True)
         if fits:

@@ -104,6 +104,15 @@ def test_angles_that_wrap_unless_the_entry_mends_them(tmp_path):
         assert "wrapping angle" not in remarks_of(tmp_path / form, wrapping, spec=mended)
 
 
+def test_angles_of_another_unit_than_the_entry_s(tmp_path):
+    """Their sine and cosine would be those of other angles."""
+    mended = replace(SPEC, angles=(2,), angle_form="sine_cosine")
+    assert "unit of angles" not in remarks_of(tmp_path / "a", wrapping, spec=mended)
+    found = remarks_of(tmp_path / "b", wrapping, spec=replace(mended, angle_unit="degree"))
+    said = "bad: action: value 2 jumps by a whole turn of 6.283; the entry's angle_unit is degree, not radian"
+    assert found["unit of angles"] == said
+
+
 def test_angles_are_numbered_as_the_entry_numbers_them(tmp_path):
     """Over all its keys, of which each may be a part of a field; fields that it leaves out have no number."""
     fields = make_spec("toy", (4, 7))
