@@ -9,7 +9,8 @@ Expected: well above random actions; no better than policies made for nothing el
 The world model gets action heads and is post-trained, all of it, to say what an expert does next (`masking.setting` is
 policy). The others are trained on the same episodes. All begin at the same starts, which no recording has.
 
-Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts.
+Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts;
+run, the post-trained model, which `hma judge` takes.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from experiments.applications.policies.learning import FitConfig, Report
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.tasks import Task, find_task
-from experiments.applications.simulators import load_simulator
+from experiments.applications.simulators import load_simulator, save_beside
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
 from experiments.progress import step
@@ -121,7 +122,7 @@ def with_heads(model: Model, seed: int) -> tuple[Params, ModelConfig]:
 def post_train(
     simulator: Simulator, robot: Robot, demos: Demonstrations, settings: Settings, run: Path, report: Report
 ) -> Model:
-    """The world model as a policy, trained or trained on in `run`."""
+    """The world model as a policy, trained or trained on in `run`, which is then a simulator as the first model is."""
     model, tokenizer = simulator.model, simulator.tokenizer
     flat = demos.images.reshape(-1, *demos.images.shape[2:])
     tokens = np.concatenate([np.asarray(tokenizer.encode(flat[i : i + 256])) for i in range(0, len(flat), 256)])
@@ -139,6 +140,7 @@ def post_train(
         provenance={"data": f"demonstrations of {settings.robot}, {settings.task}", "tokenizer": tokenizer.identity},
         progress=lambda done, total, values: report(done, total, ""),
     )  # fmt: skip
+    save_beside(simulator, run, simulator.decode)
     return load_model(run, execution)
 
 

@@ -32,7 +32,7 @@ from PIL import Image
 
 from data_pipelines.publishing.files import publish
 from data_pipelines.suite.simulator import SPECS, SuiteSimulator
-from experiments.applications.simulators import held_out, in_suite, load_simulator, true_simulator
+from experiments.applications.simulators import held_out, in_suite, load_simulator, save_beside, true_simulator
 from experiments.bench.simulate import time_simulator
 from experiments.boundary import guarded
 from experiments.running.machine import describe_machine
@@ -40,12 +40,10 @@ from hma_jax.config import DecodeConfig, require
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.model.params import Params
 from hma_jax.runtime.files import write_file
-from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, USUAL, save_decode, save_robots
+from hma_jax.simulator.folder import USUAL
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
-from hma_jax.simulator.starts import FILE as STARTS
-from hma_jax.simulator.starts import Start, save_starts
-from hma_jax.tokenizers.io import save_tokenizer
+from hma_jax.simulator.starts import Start
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.hashes import write_list
 from hma_jax.training.runs import describe_run, load_run
@@ -89,11 +87,7 @@ def ship(
         with Checkpoints(aside / "checkpoints", described) as checkpoints:
             checkpoints.save(run.step, Shipped(halved(run.params)))
         forget_places(aside / "checkpoints" / str(run.step))
-        save_tokenizer(simulator.tokenizer, aside / TOKENIZER)
-        save_robots(tuple(simulator.robots.values()), aside / ROBOTS)
-        save_starts(simulator.starts, aside / STARTS)
-        if decode is not None:
-            save_decode(decode, aside / DECODE)
+        save_beside(simulator, aside, decode)
         add(aside)
         size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())
         require(size <= LARGEST, f"{size:,} bytes are more than the {LARGEST:,} that a repository should carry")

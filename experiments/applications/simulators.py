@@ -16,13 +16,14 @@ from data_pipelines.suite.simulator import SPECS, SuiteSimulator, suite_robot, s
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.running.workspace import Workspace
-from hma_jax.config import require
-from hma_jax.simulator.folder import ROBOTS, TOKENIZER
+from hma_jax.config import DecodeConfig, require
+from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, save_decode, save_robots
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot, rest_of
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import FILE as STARTS
-from hma_jax.simulator.starts import Start
+from hma_jax.simulator.starts import Start, save_starts
+from hma_jax.tokenizers.io import save_tokenizer
 
 if TYPE_CHECKING:
     from hma_jax.model.embodiments import Embodiment
@@ -56,6 +57,16 @@ def load_simulator(run: Path | str, **options: Any) -> Simulator:
         f"{study.store} to start from",
     )
     return simulator
+
+
+def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | None) -> None:
+    """Writes beside a run in `directory` what `load_simulator` takes from there: tokenizer, robots, starts and, where it
+    is given, how frames are filled."""
+    save_tokenizer(simulator.tokenizer, directory / TOKENIZER)
+    save_robots(tuple(simulator.robots.values()), directory / ROBOTS)
+    save_starts(simulator.starts, directory / STARTS)
+    if decode is not None:
+        save_decode(decode, directory / DECODE)
 
 
 def make_simulator(

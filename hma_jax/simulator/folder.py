@@ -40,14 +40,14 @@ def find_tokenizer(directory: Path, run: Run, given: Path | None) -> BaseTokeniz
     found = [place for place in places if place.is_dir()]
     require(
         bool(found),
-        f"no tokenizer at {' or '.join(map(str, places))}; say where the one is that {directory} was trained with "
-        "(--tokenizer)",
+        f"no tokenizer at {' or '.join(map(str, places))}; put the one there that {directory} was trained with, or name "
+        "it with --tokenizer where the command has that",
     )
     tokenizer, wanted = load_tokenizer(found[0]), run.provenance.get("tokenizer")
     require(
         wanted in (None, tokenizer.identity),
-        f"{directory} was trained on tokens of tokenizer {wanted}, but {found[0]} is {tokenizer.identity}; say where "
-        "the other one is (--tokenizer)",
+        f"{directory} was trained on tokens of tokenizer {wanted}, but {found[0]} is {tokenizer.identity}; put the "
+        "other one there, or name it with --tokenizer where the command has that",
     )
     return tokenizer
 

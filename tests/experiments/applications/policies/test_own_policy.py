@@ -22,9 +22,12 @@ from experiments.applications.own_policy import (
     write_results,
 )
 from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
+from hma_jax.convert.run_directory import write_run
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import path_name
+from hma_jax.training.runs import Run
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
 
@@ -70,6 +73,26 @@ def test_heads_are_added_and_nothing_else_changes():
     assert config.action_heads and known.keys() < made.keys()
     for name, x in known.items():
         np.testing.assert_array_equal(made[name], x)
+
+
+def test_what_is_post_trained_is_a_simulator_with_all_that_the_first_model_has(tmp_path, monkeypatch):
+    """`hma judge` and `hma play` take it."""
+
+    def trained(config, table, training, make, *, run_dir, initial, provenance, **_):
+        write_run(Run(config, training, table, initial, 0, provenance), run_dir)
+
+    monkeypatch.setattr(own_policy, "train_model", trained)
+    first = load_simulator(make_run(tmp_path / "study"), decode=DecodeConfig(temperature=0.5))
+    robot, images = first.robot(FEW.robot), np.zeros((2, 6, 8, 8, 3), np.uint8)
+    first.describe([replace(robot, high=(9.0, 9.0))])
+    none = np.zeros((2, 6), bool)
+    demos = Demonstrations(images, np.zeros((2, 6, 2), np.float32), np.full(2, 6), none, none[:, 0], np.arange(2))
+    own_policy.post_train(first, robot, demos, FEW, tmp_path / "out" / "run", lambda *_: None)
+    made = load_simulator(tmp_path / "out" / "run")
+    assert made.model.config.action_heads and made.robots == first.robots and made.decode == first.decode
+    assert made.tokenizer.identity == first.tokenizer.identity
+    for mine, theirs in zip(made.starts, first.starts, strict=True):
+        np.testing.assert_array_equal(mine.images, theirs.images)
 
 
 def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_path, monkeypatch):
