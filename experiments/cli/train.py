@@ -20,6 +20,7 @@ from experiments.sweeps.sweep import reference_trial
 from experiments.words import few
 from experiments.wrote import wrote
 from hma_jax.config import require
+from hma_jax.training.claim import require_plain
 
 if TYPE_CHECKING:
     from experiments.running.trial import Materials, Trial
@@ -175,6 +176,7 @@ def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOp
     from hma_jax.training.optimizer import check_schedule
 
     options.check()
+    require_plain(run)
     check_schedule(setting.study.train.optimizer, setting.study.train.steps)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)

@@ -21,6 +21,7 @@ from experiments.preparing.windows import freeze_windows, require_same_windows
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import Study
+from hma_jax.training.claim import require_plain
 
 
 def prepare(
@@ -39,6 +40,7 @@ def prepare(
     of training one, a trained `tokenizer` is taken from its directory. What follows from `replace` on may be made
     again in its place. `batch` and `threads` as in `make_store`. Raises ConfigError or DataError.
     """
+    require_plain(workspace.root)
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     if tokenizer is None:

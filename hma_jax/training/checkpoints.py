@@ -25,6 +25,7 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config.json import diff
 from hma_jax.runtime.processes import from_writer, is_writer, writer_first
+from hma_jax.training.claim import require_plain
 from hma_jax.training.hashes import write_list
 from hma_jax.training.reading import (
     CheckpointError,
@@ -57,8 +58,9 @@ class Checkpoints:
         """The newest `keep` checkpoints stay, and those of `keep_steps`. `modernise` brings a description that an
         earlier version wrote to the form of `meta`.
 
-        Raises CheckpointError if `directory` cannot be written.
+        Raises CheckpointError if `directory` cannot be written, ConfigError if what is written there cannot be read.
         """
+        require_plain(directory)
         self.directory = Path(directory).absolute()
         self.meta, self.keep, self.modernise, self.keep_steps = meta, keep, modernise, keep_steps
         try:

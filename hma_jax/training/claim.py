@@ -22,6 +22,17 @@ def is_address(path: Path) -> bool:
     return re.match(r"[a-z][a-z0-9+.-]+:/", str(path)) is not None
 
 
+def require_plain(directory: Path) -> None:
+    """Raises ConfigError for a place where checkpoints would be written that nobody can read: Orbax looks for what the
+    processes have written by a pattern that begins with the path."""
+    found = re.search(r"\[[^/]+\]", str(directory.absolute()))
+    require(
+        found is None,
+        f"{directory.absolute()}: no checkpoint can be kept under a path with {found and found[0]} in it, which Orbax "
+        "takes for a pattern; choose another directory",
+    )
+
+
 @contextmanager
 def locked_run(run_dir: Path, name: str = NAME) -> Iterator[Lock]:
     """Makes `run_dir` and holds it: to train in it or, with EVALUATION, to write the evaluation of its model.

@@ -197,6 +197,14 @@ def test_the_place_where_trials_run_is_entered_once(instant_trials, tmp_path, mo
     assert entered == ["in", True, "out"]
 
 
+@pytest.mark.parametrize("command", ["study --out", "train --out", "train --out plain --run"])
+def test_checkpoints_that_could_not_be_read_are_not_trained_for(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([*command.split(), "a [1]", "--preset", "smoke"]) == 2
+    assert "no checkpoint can be kept under a path with [1] in it" in capsys.readouterr().err
+    assert not (tmp_path / "plain").exists() and not (tmp_path / "a [1]" / "suite").exists()
+
+
 def test_failed_trial_ends_in_exit_code_1_and_is_still_drawn(instant_trials, tmp_path, capsys):
     assert main(["study", "--preset", "smoke", "--out", str(tmp_path)]) == 1
     said = capsys.readouterr()

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+from hma_jax.config import ConfigError
 from hma_jax.training import hashes
 from hma_jax.training.checkpoints import CheckpointError, Checkpoints, SaveError
 from hma_jax.training.hashes import NAME, Damaged, verify, write_list
@@ -169,3 +170,12 @@ def test_a_save_that_fails_in_the_background_is_one_message_and_keeps_the_last(t
                 checkpoints.raise_failure()  # noticed while training goes on, not at the next save only
     assert "give the same command again: it goes on from step" in str(refused.value)
     assert list_steps(tmp_path)[0] == 1
+
+
+def test_a_path_that_orbax_takes_for_a_pattern_is_refused(tmp_path: Path):
+    """Runs in such directories ended well, and no checkpoint of theirs could be read."""
+    with pytest.raises(ConfigError, match=r"no checkpoint can be kept under a path with \[2\] in it.*choose another"):
+        fit_toy(tmp_path / "a [2]" / "run", 4, options=EVERY_TWO)
+    assert not (tmp_path / "a [2]" / "run" / "checkpoints").exists()
+    fit_toy(tmp_path / "what? a[*b" / "run", 4, options=EVERY_TWO)
+    assert fit_toy(tmp_path / "what? a[*b" / "run", 6, options=EVERY_TWO).resumed_from == 4
