@@ -26,16 +26,16 @@ def register(specs: Iterable[DatasetSpec]) -> None:
 
 
 def known_groups() -> dict[str, tuple[DatasetSpec, ...]]:
-    """Every entry, by where it comes from."""
+    """Every entry that is used, by where it comes from."""
     groups = {
-        "given by you": tuple(_registered.values()),
         "own and samples": OWN,
         "Open-X (Open X-Embodiment)": OPENX + OPENX_MORE + OPENX_REST,
         "other datasets of the paper": OTHERS,
         "embedded suite (simulated)": _suite(),
         "simulator suite (extra sim)": _simulators(),
     }
-    return {title: specs for title, specs in groups.items() if specs}
+    left = {title: tuple(s for s in specs if s.name not in _registered) for title, specs in groups.items()}
+    return {title: specs for title, specs in ({"given by you": tuple(_registered.values())} | left).items() if specs}
 
 
 def all_specs() -> tuple[DatasetSpec, ...]:

@@ -223,6 +223,7 @@ def test_registered_entry_is_found_and_takes_the_place_of_a_known_one(registered
     register([replace(get_spec("droid"), hz=7.5)])
     assert get_spec("droid").hz == 7.5
     assert len({s.name for s in all_specs()}) == len(all_specs())
+    assert {s for specs in known_groups().values() for s in specs} == set(all_specs())  # what is listed is what is used
 
 
 @pytest.mark.parametrize(
