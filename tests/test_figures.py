@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_pipelines.suite.world import World
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.intervals import Interval
 from experiments.applications import DRIVEN
-from experiments.applications.plan_actions import read_trials
+from experiments.applications.plan_actions import Settings, read_trials
+from experiments.applications.policies.tasks import Task
 from experiments.bench.beside import OURS, RELEASED, THEIRS
 from experiments.bench.record import read_record
 from experiments.rows import OVERALL, Row, read_csv
@@ -154,14 +156,25 @@ def cloned() -> np.ndarray:
     return np.array(list(found.values()), float)
 
 
+def begins_there(task: Task, seeds: np.ndarray) -> np.ndarray:
+    """bool [starts]: the goal is reached before anything is done."""
+    return World(task.spec, seeds).success()
+
+
+def begun_of_thirty() -> int:
+    settings = Settings()
+    return int(begins_there(settings.make_task(), settings.start_seeds()).sum())
+
+
 def test_plans_from_further_starts_are_as_their_page_says():
     page = " ".join((ROOT / "docs" / "planning.md").read_text().split())
     rows = table(ROOT / "docs" / "planning.md", "| way of acting |")
     summary, plans, policies = planned("planning_more"), planned_by_mppi(), cloned()
     assert policies.shape == (16, 120) and plans.shape == (120,)
 
-    def crossed(values: np.ndarray) -> Interval:
-        panel = Panel(np.zeros(120, str), np.arange(120), (values,), (tuple(range(len(values))),))
+    def crossed(values: np.ndarray, which: np.ndarray = np.ones(120, bool)) -> Interval:
+        starts = np.flatnonzero(which)
+        panel = Panel(np.zeros(len(starts), str), starts, (values[:, starts],), (tuple(range(len(values))),))
         return bootstrap_intervals(panel)[0]
 
     def told(mean: float, low: float, high: float) -> list[str]:
@@ -175,6 +188,12 @@ def test_plans_from_further_starts_are_as_their_page_says():
     assert of_all.high < float(summary["MPPI in the model"]["low"])
     gain = crossed(plans - policies)
     assert f"by {gain.mean:.2f} ({gain.low:.2f} to {gain.high:.2f}), start by start" in page
+    settings = Settings(starts=120, skip=30)
+    away = ~begins_there(settings.make_task(), settings.start_seeds())
+    less = crossed(plans - policies, away)
+    assert f"Of these starts {120 - away.sum()} begin on the mark (of the thirty {begun_of_thirty()})" in page
+    assert f"From the other {away.sum()} MPPI has {plans[away].mean():.2f}, cloning {policies[:, away].mean():.2f}" in page
+    assert f"the difference is {less.mean:.2f} ({less.low:.2f} to {less.high:.2f})" in page
     rates = policies.mean(1)
     first = f"the first, the one in the table of thirty, has {rates[0]:.2f}"
     assert f"from {rates.min():.2f} to {rates.max():.2f}; {first}" in page

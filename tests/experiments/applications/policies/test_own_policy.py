@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from data_pipelines.suite.world import World
 from experiments.applications import own_policy
 from experiments.applications.own_policy import (
     OWN,
@@ -21,6 +22,7 @@ from experiments.applications.own_policy import (
     with_heads,
     write_results,
 )
+from experiments.applications.policies.closed_loop import start_seeds
 from experiments.applications.policies.demonstrations import Demonstrations
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
@@ -121,6 +123,16 @@ def test_the_page_says_what_came(name):
     table = markdown(summarise(read_trials(root / "experiments/results" / name / "trials.csv")))
     assert table == (root / "experiments/results" / name / "table.md").read_text()
     assert table in (root / "docs/policies.md").read_text()
+
+
+def test_the_page_says_what_came_from_starts_that_do_not_begin_at_the_goal():
+    root, task = Path(__file__).parents[4], Settings().make_task()
+    away = ~World(task.spec, start_seeds(task, Settings.starts)).success()
+    trials = read_trials(root / "experiments/results/own_policy/trials.csv")
+    *first, last = (f"{np.mean([s for s, _ in np.array(found)[away]]):.2f}" for found in trials.values())
+    page = " ".join((root / "docs/policies.md").read_text().split())
+    assert f"for 4 frames; {(~away).sum()} starts have it there already" in page
+    assert f"From the {away.sum()} starts that begin elsewhere it is {', '.join(first)} and {last}." in page
 
 
 @pytest.mark.slow
