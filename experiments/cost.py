@@ -26,7 +26,8 @@ from experiments.running.shared_runs import share_runs
 from experiments.running.trial import Trial, trial_id
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial, unique_trials
-from hma_jax.config import MeshConfig, ModelConfig
+from experiments.words import few
+from hma_jax.config import MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 
 if TYPE_CHECKING:
@@ -149,8 +150,8 @@ def devices_of(mesh: MeshConfig, share: float | None) -> float:
 
 
 def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
-    """`devices_of` each trial. Raises ConfigError also for one whose batch or model does not divide over them, or whose
-    learning rate would not do what is said of it."""
+    """`devices_of` each trial. Raises ConfigError also for one whose batch or model does not divide over them, whose
+    learning rate would not do what is said of it, or that is to train robots alone that it does not have."""
     from hma_jax.runtime.mesh import check_sizes, mesh_sizes
     from hma_jax.training.optimizer import check_schedule
 
@@ -160,7 +161,14 @@ def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> 
     for trial in unique_trials(sweeps, UNKNOWN).values():
         check_sizes(sizes, trial.model, trial.train.batch, execution.accumulate)
         check_schedule(trial.train.optimizer, trial.train.steps)
+        require_only(trial.train, [name for one in trial.with_source() for name in one.datasets])
     return devices
+
+
+def require_only(train: TrainConfig, robots: Sequence[str]) -> None:
+    """Raises ConfigError where `train.only` names others than the `robots` that a model is trained on."""
+    without = [name for name in train.only if name not in robots]
+    require(not without, f"train.only: there is no robot {few(without)} to train, but {few(robots)}")
 
 
 def plan_trials(

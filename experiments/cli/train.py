@@ -173,11 +173,13 @@ def adapt_model(
 
 def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOptions) -> None:
     """Raises ConfigError, before any work, for options that cannot be and for a run that was not trained here."""
+    from experiments.cost import require_only
     from hma_jax.training.optimizer import check_schedule
 
     options.check()
     require_plain(run)
     check_schedule(setting.study.train.optimizer, setting.study.train.steps)
+    require_only(setting.study.train, setting.study.dataset_names())
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
 

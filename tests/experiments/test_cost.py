@@ -163,6 +163,15 @@ def test_a_decay_that_begins_within_the_warm_up_is_refused_before_anything_is_ma
         assert not (tmp_path / "out").exists()
 
 
+def test_robots_that_are_to_be_trained_alone_and_are_not_there_are_refused_before_anything_is_made(capsys, tmp_path):
+    for command in (["train"], ["study"], ["sweep", "datasets", "--dry-run"]):
+        only = "rover_mud" if command == ["train"] else SMOKE.dataset_names()[-1]  # not in the first point
+        given = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--set", f"train.only={only}"]
+        assert main([*command, *given]) == 2
+        assert f"train.only: there is no robot {only} to train, but " in capsys.readouterr().err
+        assert not (tmp_path / "out").exists()
+
+
 def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     before = estimate_preparing(PAPER)
     words = describe(before, lambda seconds: f"{seconds:.0f} s")
