@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,9 +80,9 @@ def check_run(
 
 
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
-    """What took how many, if the first `windows` of a robot are of too few episodes; None if they are of enough."""
+    """What took how many, if so many `windows` of a robot are of too few episodes; None if they are of enough."""
     (frozen,) = (d.windows for d in manifest.datasets if d.dataset == robot)
-    judged, of_all = (len({episode for episode, _ in some}) for some in (frozen[:windows], frozen))
+    judged, of_all = (len({episode for episode, _ in some}) for some in (spread(frozen, windows), frozen))
     if judged >= FEWEST:
         return None
     there = store.manifest(robot)
@@ -108,6 +110,17 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
     return f"{robot} has {judged} episodes to be judged; what actions do is told from at least {FEWEST}. {why}"
 
 
+def spread(frozen: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, int], ...]:
+    """So many of the windows (episode, start), of as many episodes as can be: errors are clustered by episode. One of
+    each comes before a second of any."""
+    of_episode = Counter[int]()
+    ranked = []
+    for window in frozen:
+        ranked.append((of_episode[window[0]], window))
+        of_episode[window[0]] += 1
+    return tuple(sorted(window for _, window in sorted(ranked)[:count]))
+
+
 def _hold_out_more(settings: JobSettings, episodes: int) -> str:
     """How to have FEWEST of so many held out."""
     for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
@@ -126,7 +139,8 @@ def _hold_out_more(settings: JobSettings, episodes: int) -> str:
 def _check(
     model: Model, loss: Callable[..., jax.Array], store: TokenStore, manifest: EvalManifest, robot: Robot, windows: int, spoil: Spoil
 ) -> list[Effect]:
-    batches = list(eval_batches(store, model.table, manifest, BATCH, (robot.name,), first=windows))
+    chosen = [replace(d, windows=spread(d.windows, windows)) for d in manifest.datasets]
+    batches = list(eval_batches(store, model.table, replace(manifest, datasets=tuple(chosen)), BATCH, (robot.name,)))
     valid = np.concatenate([batch["valid"] for batch in batches])
     width, chunk = model.table.action_width, robot.stride * robot.action_dim
     flat = np.concatenate([batch["actions"] for batch in batches])[..., :chunk]

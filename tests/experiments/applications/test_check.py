@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.applications.check import choose_robots, shortage
+from experiments.applications.check import choose_robots, shortage, spread
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -25,7 +25,8 @@ from tests.data_pipelines.windows.test_evalset import small_store
         (20, 5, 2, 64, "toy has 2 episodes to be judged; what actions do is told from at least 4. 5 are held out, and the "
                    "2 frozen windows are of 2 of them: eval.windows_per_dataset took no more, or the others are too "
                    "short. Freeze more with `hma tokenize ... --out runs/a --set eval.windows_per_dataset=64 --replace windows`"),
-        (20, 5, 9, 2, "--windows 2 takes 1 of the 5 episodes that the 9 windows there are of; give more"),
+        (20, 5, 9, 2, "--windows 2 takes 2 of the 5 episodes that the 9 windows there are of; give more"),
+        (20, 5, 25, 4, ""),
         (20, 5, 25, 64, ""),
     ],
 )  # fmt: skip
@@ -34,6 +35,12 @@ def test_too_few_episodes_are_told_with_what_took_them(episodes, min_val, frozen
     manifest = freeze_manifest(store, ("toy",), 4, frozen, 0)
     found = shortage(store, manifest, "toy", windows, Path("runs/a"))
     assert said in found if said else found is None
+
+
+def test_windows_are_of_as_many_episodes_as_can_be():
+    frozen = [(0, 0), (0, 4), (0, 8), (1, 4), (3, 0), (3, 8)]
+    assert spread(frozen, 3) == ((0, 0), (1, 4), (3, 0)) and spread(frozen, 4) == ((0, 0), (0, 4), (1, 4), (3, 0))
+    assert spread(frozen, 9) == tuple(frozen)
 
 
 def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path):
