@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.errors import EpisodeError
+from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
@@ -181,8 +181,14 @@ class _Frames(Sequence[Fetched]):
 
 
 def dataset_name(root: Path) -> str:
-    """What the directory is called, as names of datasets are written."""
-    return re.sub(r"[^a-z0-9_]+", "_", root.absolute().name.lower()).strip("_")
+    """What the directory is called, as names of datasets are written. Raises DataError where nothing is left of it."""
+    name = re.sub(r"[^a-z0-9_]+", "_", root.absolute().name.lower()).strip("_")
+    if not name:
+        raise DataError(
+            f"{root}: a LeRobot dataset is called as its folder, which has none of a to z and 0 to 9 in its name. Rename "
+            "it, or give a link to it of another name."
+        )
+    return name
 
 
 def _decode(data: Fetched, where: str) -> np.ndarray:

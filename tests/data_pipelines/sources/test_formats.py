@@ -61,6 +61,10 @@ def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
     assert open_source(root).fingerprint() == source.fingerprint()
     shutil.copytree(root, tmp_path / "elsewhere" / "toy-arm")
     assert open_source(tmp_path / "elsewhere" / "toy-arm").fingerprint() == source.fingerprint()
+    (tmp_path / "机器人").symlink_to(root)
+    for read in (open_source, source_name):
+        with pytest.raises(DataError, match="机器人: a LeRobot dataset is called as its folder, which has none of a to z"):
+            read(tmp_path / "机器人")
 
 
 def test_lerobot_actions_alone_can_be_sliced_and_be_none(tmp_path):
