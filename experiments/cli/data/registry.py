@@ -245,7 +245,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
     spec = suggestion.spec()
     there = [entry for entry in load_entries(path) if entry.name == spec.name] if path.exists() else []
-    write_file(path, put_entry(path.read_text() if path.exists() else "", spec, str(path)))
+    write_file(path, put_entry(path.read_text(encoding="utf-8") if path.exists() else "", spec, str(path)))
     wrote(path)
     if lines := [line for entry in there for line in diff(entry, spec)]:
         text = f"note: in place of the entry of {spec.name} that was there; changed: {'; '.join(lines)}"
