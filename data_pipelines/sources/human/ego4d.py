@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.sources.units import Episode, LeftOut, UnitError
-from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, destination
+from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.settings import Ego4dSettings
 from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
@@ -88,6 +88,8 @@ class Ego4dSource:
         with open_video(self._video(uid)) as video:
             for number, interval in enumerate(self._field(self._labels[uid], "annotated_intervals", uid)):
                 times, positions = self._annotated(uid, number, interval, video)
+                if not len(times):
+                    yield LeftOut(NONE)
                 for first, last in _stretches(times, self.settings.max_gap):
                     yield from self._episodes(uid, video, times[first:last], positions[first:last])
 

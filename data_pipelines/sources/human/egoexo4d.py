@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from data_pipelines.sources.units import Episode, LeftOut, UnitError
-from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, destination
+from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.settings import EgoExo4dSettings
 from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
@@ -82,6 +82,7 @@ class EgoExo4dSource:
         with open_video(path) as video:
             numbers, positions = self._wrists(take, video)
             if not len(numbers):
+                yield LeftOut(NONE)
                 return
             if numbers[-1] >= video.most_frames:
                 raise UnitError(

@@ -21,6 +21,8 @@ LAYOUT = Layout({IMAGE: image_field(None, None)}, {ACTION: 4, STATE: 4}, knows_s
 
 TEXT = "use both hands"
 
+NONE = "no frame with both hands"
+
 Reader = Callable[[np.ndarray], list[bytes]]
 """Encoded frames at these row numbers."""
 
@@ -57,7 +59,10 @@ def cut_episodes(
     text: str = TEXT,
 ) -> Iterator[Episode | LeftOut]:
     """The episodes of [N, 4] positions of evenly spaced frames; `origin` names one by its first row."""
-    for start, stop in runs(both_seen(positions)):
+    found = runs(both_seen(positions))
+    if not found:
+        yield LeftOut(NONE)
+    for start, stop in found:
         if stop - start < min_frames:
             yield LeftOut(f"fewer than {min_frames} frames in a row with both hands")
             continue

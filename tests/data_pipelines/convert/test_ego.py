@@ -174,6 +174,17 @@ def test_clips_of_enough_labelled_frames_are_kept_and_shorter_ones_are_not(tmp_p
     )
 
 
+def test_what_never_shows_both_hands_is_left_out_and_counted(tmp_path):
+    """As takes of which another camera was labelled."""
+    for place in (tmp_path / "a", tmp_path / "b"):
+        place.mkdir()
+    source = egoexo4d(tmp_path / "a", {str(n): pose(n, "cam03") for n in range(40)})
+    with pytest.raises(DataError, match="no episode can be made of it: 1 x no frame with both hands"):
+        convert(source, tmp_path, "exoego4d")
+    with pytest.raises(DataError, match="no episode can be made of it: 1 x no frame with both hands"):
+        convert(ego4d(tmp_path / "b", action(annotated(3, ("left_hand",)))), tmp_path, "ego4d")
+
+
 def test_wrists_outside_the_image_are_not_seen(tmp_path):
     poses = {str(n): pose(n) for n in range(40)}
     poses["20"][0]["annotation2D"]["cam01"]["left_wrist"]["x"] = -3.0
