@@ -35,7 +35,9 @@ def encode(episode: Episode, layout: Layout) -> bytes:
     features = step_features(rewards, episode.instructions)
     features["episode_metadata/file_path"] = [episode.origin.encode()]
     if layout.knows_success:
-        features["episode_metadata/success"] = np.array([bool(episode.success)], np.int64)
+        if episode.success is None:  # a record has no third value, and nobody should take it for a failure
+            raise UnitError(f"{episode.origin}: it does not say whether it succeeded, though others do.")
+        features["episode_metadata/success"] = np.array([episode.success], np.int64)
     for key in layout.images:
         frames = list(episode.images[key])
         if len(frames) != steps:

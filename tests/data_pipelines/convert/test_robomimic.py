@@ -73,6 +73,16 @@ def test_a_file_that_does_not_say_its_rate_is_converted_at_that_of_the_published
     assert RobomimicDataset(write_robomimic(tmp_path / "says.hdf5")).hz == 20
 
 
+def test_a_demonstration_that_does_not_say_its_success_is_not_written_as_a_failure(tmp_path):
+    def change(file):
+        del file["data/demo_10/rewards"], file["data/demo_10/dones"]
+
+    source = RobomimicSource(write_robomimic(tmp_path / "image.hdf5", change=change))
+    with pytest.raises(DataError, match="data/demo_10: it does not say whether it succeeded, though others do"):
+        convert(source, tmp_path, "toy")
+    assert convert(source, tmp_path, "toy", skip_damaged=True).episodes == 2
+
+
 def shorten(file):
     frames = file["data/demo_10/obs/agentview_image"][:-1]
     del file["data/demo_10/obs/agentview_image"]
