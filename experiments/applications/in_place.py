@@ -92,7 +92,7 @@ def in_place(rows: Sequence[Row], view: str) -> tuple[float, float, int]:
         for row in rows
         if float(row["moved_px"]) > CLOSE  # not of what came into view
     ]
-    return over_robots(near, "near") if near else (float("nan"), float("nan"), 0)
+    return over_robots(near, "near")
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,13 @@ from experiments.applications.endurance.tables import Row, over_robots, rows_of
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
-from experiments.progress import console, step
+from experiments.progress import Update, console, step
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require
 from hma_jax.simulator.folder import find_decode
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.simulator.starts import Start
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "shipped": {},
@@ -61,21 +64,27 @@ def film_path(
     return out / "films" / f"{'-'.join([name, variant, kind, f'{minutes:g}', str(which), *robots])}.npz"
 
 
+def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int) -> dict[str, list[Start]]:
+    """The first `count` starts of each robot that the true simulator can begin at. ConfigError where there are fewer."""
+    found = {n: [s for s in simulator.starts if s.robot == n and s.seed is not None][:count] for n in robots}
+    for name, starts in found.items():
+        require(
+            len(starts) == count,
+            f"--starts {count}: {name} has {len(starts)} starts that the true simulator can begin at, too; give fewer",
+        )
+    return found
+
+
 def run_variant(
-    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int, asked: Sequence[str], update
-) -> dict[str, Film]:
-    """The robots `asked` for, or all of a run that the suite knows, each from its start number `which` on, in one
-    batch."""
-    simulator = load_simulator(run, execution=ExecutionConfig(remat="none"))
-    robots = chosen(native_robots(simulator.robots), asked)
+    run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int,
+    robots: Mapping[str, Robot], starts: Mapping[str, Sequence[Start]], update: Update,
+) -> dict[str, Film]:  # fmt: skip
+    """`robots` of a run, each from its start number `which` on, in one batch."""
     decode = replace(find_decode(run), **VARIANTS[variant])
     options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
-    simulator = load_simulator(run, **options)
-    drives = []
+    simulator, drives = load_simulator(run, **options), []
     for name, robot in robots.items():
-        starts = [s for s in simulator.starts if s.robot == name and s.seed is not None]
-        require(which < len(starts), f"{name} has {len(starts)} starts in the true simulator, no number {which}")
-        drives.append(make_drive(robot, starts[which], round(60 * minutes * robot.hz), kind, seed=which))
+        drives.append(make_drive(robot, starts[name][which], round(60 * minutes * robot.hz), kind, seed=which))
     return make_films(simulator, detector, drives, update)
 
 
@@ -100,8 +109,10 @@ def main() -> None:
         f"--every {asked.every:g}: a row of the table needs at least half as many seconds, and --minutes "
         f"{asked.minutes:g} are {60 * asked.minutes:g}; give fewer",
     )
-    detector, rows = Detector.load(asked.detector), []
-    claim_name(asked.out, asked.name, asked.run, load_simulator(asked.run), asked.detector)
+    detector, simulator, rows = Detector.load(asked.detector), load_simulator(asked.run), []
+    robots = chosen(native_robots(simulator.robots), asked.robots)
+    starts = true_starts_of(simulator, robots, asked.starts)
+    claim_name(asked.out, asked.name, asked.run, simulator, asked.detector)
     for kind in asked.drives:
         for variant in asked.variants:
             new: list[Row] = []
@@ -109,7 +120,7 @@ def main() -> None:
                 path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which, asked.robots)
                 if not path.exists():
                     with step(f"{variant}, {kind}, {asked.minutes:g} min, start {which}") as update:
-                        options = (variant, kind, asked.minutes, which, asked.robots)
+                        options = (variant, kind, asked.minutes, which, robots, starts)
                         made = run_variant(asked.run, detector, *options, update)
                     save_films(made, path)
                 films = load_films(path)
@@ -130,7 +141,8 @@ def show(rows: list[Row]) -> None:
     parts = sorted({row["part"] for row in rows})
     for part in dict.fromkeys([parts[0], parts[len(parts) // 2], parts[-1]]):
         mine = [row for row in rows if row["part"] == part]
-        words = [f"{n} {over_robots(mine, n)[0]:.3f}±{over_robots(mine, n)[1]:.3f}" for n in SAID]
+        found = {name: over_robots(mine, name) for name in SAID}
+        words = [f"{name} {mean:.3f}±{half:.3f}" if n else f"{name} –" for name, (mean, half, n) in found.items()]
         console.print(f"{mine[0]['variant']} {mine[0]['drive']} part {part}: " + ", ".join(words), soft_wrap=True)
 
 

@@ -98,9 +98,11 @@ def rows_of(
 
 def over_robots(rows: Iterable[Row], name: str) -> tuple[float, float, int]:
     """(mean, half of the 95 % interval by Student's t, n) over robots, of the mean over each one's starts: robots are a
-    sample here, and others would differ."""
+    sample here, and others would differ. (nan, nan, 0) of what no robot has."""
     rows = [row for row in rows if np.isfinite(float(row[name]))]
     robots = dict.fromkeys(row["robot"] for row in rows)
+    if not robots:
+        return float("nan"), float("nan"), 0
     values = np.array([np.mean([float(row[name]) for row in rows if row["robot"] == robot]) for robot in robots])
     half = critical(len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
     return float(values.mean()), float(half), len(values)

@@ -2,16 +2,19 @@
 
 import dataclasses
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from experiments.applications.endurance.__main__ import main
+from experiments.applications.endurance.__main__ import main, show, true_starts_of
 from experiments.applications.endurance.films import Film, colours_of, load_films, save_films
 from experiments.applications.endurance.hidden import LEAST, find_events
-from experiments.applications.endurance.tables import measure, motion, over_robots, read_rows, rows_of
+from experiments.applications.endurance.tables import MEASURES, measure, motion, over_robots, read_rows, rows_of
 from experiments.applications.tables import write_rows
 from hma_jax.config import ConfigError
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import Start
 
 N = 200
 
@@ -98,6 +101,21 @@ def test_a_drive_too_short_for_a_row_is_refused_before_it_is_made(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["endurance", "nowhere", "--starts", "0"])
     with pytest.raises(ConfigError, match="--starts must be at least 1, got 0"):
         main()
+
+
+def test_starts_that_there_are_not_are_missed_before_anything_is_filmed():
+    starts = [Start("a", np.zeros((1, 8, 8, 3), np.uint8), np.zeros((0, 2)), seed) for seed in (3, None, 5)]
+    simulator, robots = SimpleNamespace(starts=starts), {"a": Robot("a", 1, (0.0,) * 2, (1.0,) * 2, (0.0,) * 2)}
+    assert [s.seed for s in true_starts_of(simulator, robots, 2)["a"]] == [3, 5]
+    with pytest.raises(ConfigError, match="--starts 3: a has 2 starts"):
+        true_starts_of(simulator, robots, 3)
+
+
+def test_a_measure_that_no_robot_has_is_not_a_number_of_none(recwarn, capsys):
+    row = {"variant": "v", "drive": "d", "robot": "a", "start": 0, "part": 1} | dict.fromkeys(MEASURES, 0.5)
+    assert over_robots([row | {"steers": float("nan")}], "steers")[2] == 0
+    show([row | {"steers": float("nan")}])
+    assert "steers –" in capsys.readouterr().out and not recwarn
 
 
 def test_histograms_are_of_colours():
