@@ -119,6 +119,9 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
     (tmp_path / "my.toml").write_text(to_toml(entry))
     assert main(["data", "inspect", str(REAL_DATA), "--out", str(tmp_path), "--registry", str(tmp_path / "my.toml")]) == 0
     assert "rate 5 Hz (registry): stride 2, 2.50 Hz" in capsys.readouterr().out
+    mine = ["--out", str(tmp_path), "--registry", str(tmp_path / "my.toml")]
+    assert main(["data", "inspect", str(REAL_DATA), "--hz", "10", *mine]) == 0
+    assert f"--hz 10 --entry {tmp_path / 'my.toml'}" in capsys.readouterr().out
     registry_table._registered.clear()
     for looked in (["inspect", str(REAL_DATA)], ["view", str(REAL_DATA), "--episodes", "2", "--shown", "1"]):
         out = tmp_path / looked[0]

@@ -136,6 +136,10 @@ def test_an_unknown_dataset_is_shown_and_its_entry_comes_next(toy, tmp_path, cap
     assert re.search(r"next for toy: hma data inspect \S+ --hz HZ --entry my_robots.toml", said)
     assert main(["data", "view", str(directory), "--out", str(out), "--hz", "4"]) == 0
     assert "--hz 4 --entry" in capsys.readouterr().out and "Not in the registry" in out.read_text()
+    others = tmp_path / "others.toml"  # commands take one file of entries, so that they belong together
+    others.write_text(to_toml(replace(SPEC, name="other")))
+    assert main(["data", "view", str(directory), "--out", str(out), "--hz", "4", "--registry", str(others)]) == 0
+    assert f"--hz 4 --entry {others}" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 
 ENTRIES = "my_robots.toml"
+"""Where entries are written if there is no file of them yet: a command takes one."""
 
 
 def tokenize_command(
@@ -51,7 +52,7 @@ def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
     )
 
 
-def other_rate(facts: Facts, hz: float | None) -> str | None:
+def other_rate(facts: Facts, hz: float | None, registry: Path | None) -> str | None:
     """What to run first where a known dataset was looked at with another native rate than its entry's, which is the
     one that a study takes; None where they agree."""
     from data_pipelines.registry import find_spec
@@ -59,5 +60,5 @@ def other_rate(facts: Facts, hz: float | None) -> str | None:
     known = find_spec(facts.name)
     if known is None or hz is None or known.hz == hz:
         return None
-    words = command("data inspect", facts.directory, "--hz", f"{hz:g}", "--entry", ENTRIES)
+    words = command("data inspect", facts.directory, "--hz", f"{hz:g}", "--entry", registry or ENTRIES)
     return f"{words}  (its entry says {known.hz:g} Hz, which a study takes, not {hz:g}; this writes another entry)"

@@ -163,7 +163,7 @@ def data_inspect(
     if entry is not None:
         _write_entry(entry, suggestion)
     if known is not None or entry is not None:
-        _say_next(facts, windows, entry or registry, other_rate(facts, rate) if taken else None)
+        _say_next(facts, windows, entry or registry, other_rate(facts, rate, registry) if taken else None)
 
 
 def print_facts(facts: Facts) -> None:

@@ -135,16 +135,17 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
     from data_pipelines.inspection.remarks import MISFIT
     from data_pipelines.inspection.suggest import window_facts
 
+    file = registry or ENTRIES
     usable: dict[float | None, list[Facts]] = {}
     longest: dict[float | None, int] = {}
     for v in viewed:
         f = v.facts
         if not v.registered:
-            words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", ENTRIES)
+            words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", file)
             after = f"{words}  (it is not in the registry; this writes its entry)"
         elif any(r.title == MISFIT for r in v.remarks):
             after = f"{command('data inspect', f.directory)}  (it says what the registry's entry should be)"
-        elif first := other_rate(f, v.hz):
+        elif first := other_rate(f, v.hz, registry):
             after = first
         elif not window_facts(f, v.stride, frames).total:
             after = no_window(f, v.stride, registry)
