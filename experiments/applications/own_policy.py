@@ -40,6 +40,7 @@ from experiments.applications.policies.demonstrations import (
 )
 from experiments.applications.policies.diffusion import DiffusionConfig, DiffusionPolicy, train_diffusion
 from experiments.applications.policies.learning import FitConfig, Report
+from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.tasks import Task, find_task
@@ -193,6 +194,7 @@ def compare(run: Path, out: Path, settings: Settings) -> dict[str, list[tuple[bo
         f"{run} sees {window} frames, an episode here has {settings.frames}: there is nothing to train it on; name a "
         "run with a shorter window",
     )
+    require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
     claim(out, run, simulator, asdict(settings), unused=("simulator.decode",))  # no frame is made
     seeds, kept = start_seeds(task, settings.starts), out / "demonstrations.npz"
     if not kept.exists():

@@ -72,6 +72,7 @@ from experiments.applications.policies.demonstrations import (
     save_demonstrations,
 )
 from experiments.applications.policies.learning import FitConfig, Report
+from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
@@ -263,6 +264,7 @@ def main() -> None:
         f"{second} says that policies of a model without actions are here: give --without-actions again, or another --out",
     )
     settings, blind = lessons.settings, asked.without_actions and find_blind(asked.without_actions, lessons.robot)
+    require_multiples(*simulator.tokenizer.image_shape, BcConfig().encoder.size)
     claim(out, run, simulator, asdict(settings), grows=("seeds",))
     if blind:
         claim(out, asked.without_actions, blind, {}, file=SECOND)

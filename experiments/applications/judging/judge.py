@@ -25,6 +25,7 @@ from experiments.applications.judging.rollouts import Rollout, load_rollout, mak
 from experiments.applications.made_with import claim
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
 from experiments.applications.policies.learning import Report
+from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import Task, held
 from experiments.applications.simulators import has_truth, load_simulator, true_simulator
@@ -83,6 +84,8 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step) -
     simulator = load_simulator(run_directory, episodes=config.batch)
     robot = simulator.robot(config.task.robot)
     require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
+    for encoder in (config.ladder.encoder, config.head.encoder):
+        require_multiples(*simulator.tokenizer.image_shape, encoder.size)
     policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads  # may refuse the ladder
     claim(out, run_directory, simulator, {"config": to_dict(config)}, file="judge.json")
     size, stride, task = simulator.tokenizer.image_size, robot.stride, config.task

@@ -104,13 +104,19 @@ def points(maps: jax.Array, sharpness: jax.Array) -> jax.Array:
     return jnp.concatenate([x, y, jnp.tanh((weight * flat).sum(1) / 4)], -1)
 
 
+def require_multiples(height: int, width: int, size: int) -> None:
+    """Raises ConfigError for images that cannot be averaged down to `size`."""
+    require(
+        height % size == 0 == width % size,
+        f"images of {height} x {width} pixels cannot be averaged down to the {size} x {size} that policies and success "
+        "heads see here; take a model whose frames are multiples of that",
+    )
+
+
 def shrink(images: jax.Array, size: int) -> jax.Array:
     """[B, size, size, C]: means of squares of pixels. Raises ConfigError where they do not divide."""
     batch, height, width, channels = images.shape
-    require(
-        height % size == 0 == width % size,
-        f"images of {height} x {width} pixels cannot be averaged down to {size}; choose a size that divides them",
-    )
+    require_multiples(height, width, size)
     if (height, width) == (size, size):
         return images
     return images.reshape(batch, size, height // size, size, width // size, channels).mean((2, 4))
@@ -119,9 +125,7 @@ def shrink(images: jax.Array, size: int) -> jax.Array:
 def shrink_bytes(images: np.ndarray, size: int) -> np.ndarray:
     """`shrink` of uint8 images [..., H, W, 3] in advance, rounded: training then moves fewer bytes."""
     height, width = images.shape[-3:-1]
-    require(
-        height % size == 0 == width % size, f"images of {height} x {width} pixels cannot be averaged down to {size}"
-    )
+    require_multiples(height, width, size)
     parts = images.reshape(*images.shape[:-3], size, height // size, size, width // size, images.shape[-1])
     return np.round(parts.mean((-4, -2), dtype=np.float32)).astype(np.uint8)
 

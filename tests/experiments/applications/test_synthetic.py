@@ -175,6 +175,10 @@ def test_recordings_that_do_not_do_are_refused_before_anything_is_claimed(record
     monkeypatch.setattr(sys, "argv", asked[:2] + asked[4:])
     with pytest.raises(ConfigError, match="policies of a model without actions are here: give --without-actions again"):
         synthetic.main()
+    monkeypatch.setattr(sys, "argv", ["synthetic", str(run), "--out", str(tmp_path / "small")])
+    with pytest.raises(ConfigError, match="8 x 8 pixels cannot be averaged down to the 32 x 32 that policies"):
+        synthetic.main()
+    assert not (tmp_path / "small").exists()
 
 
 def test_episodes_that_leave_nothing_to_generate_or_to_judge_are_refused():

@@ -97,6 +97,15 @@ def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged)
         judge_run(root / "model", root / "out", replace(ASKED, starts=2), step)
 
 
+def test_frames_that_no_policy_could_look_at_are_refused_before_anything_is_recorded(judged):
+    root = judged[0]
+    for part in ("ladder", "head"):
+        larger = replace(ASKED, **{part: replace(getattr(ASKED, part), encoder=EncoderConfig())})
+        with pytest.raises(ConfigError, match="8 x 8 pixels cannot be averaged down to the 32 x 32 that policies"):
+            judge_run(root / "model", root / "small", larger, step)
+    assert not (root / "small").exists()
+
+
 def test_table_summary_and_page(judged):
     root, found = judged
     out = root / "out"

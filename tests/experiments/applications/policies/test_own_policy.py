@@ -1,6 +1,7 @@
 """A world model that is post-trained to be a policy."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,8 +23,10 @@ from experiments.applications.own_policy import (
     with_heads,
     write_results,
 )
+from experiments.applications.policies.cloning import BcConfig
 from experiments.applications.policies.closed_loop import start_seeds
 from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.network import EncoderConfig
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.convert.run_directory import write_run
@@ -34,6 +37,7 @@ from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
 
 FEW = Settings(demonstrations=4, starts=3, steps=2, batch=2, frames=6)
+SMALL = partial(BcConfig, encoder=EncoderConfig(8, (4, 4, 4), 8))
 
 
 @pytest.mark.parametrize("name", ["steps", "starts"])
@@ -100,6 +104,7 @@ def test_what_is_post_trained_is_a_simulator_with_all_that_the_first_model_has(t
 def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_path, monkeypatch):
     model, tokenizer = parts()
     robot = replace(ROBOTS[0], name=FEW.robot)
+    monkeypatch.setattr(own_policy, "BcConfig", SMALL)
     monkeypatch.setattr(own_policy, "POLICIES", (RANDOM,))
     monkeypatch.setattr(own_policy, "record", lambda *_, **__: None)
     for name in ("save_demonstrations", "load_demonstrations"):
@@ -113,6 +118,11 @@ def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_pa
         monkeypatch.setattr(own_policy, "load_simulator", lambda _, made=made: made)
         trials.append(compare(tmp_path / "run", tmp_path / "out", FEW))
     assert trials[0] == trials[1] and len(trials[0][RANDOM]) == FEW.starts
+    monkeypatch.undo()
+    monkeypatch.setattr(own_policy, "load_simulator", lambda _: made)
+    with pytest.raises(ConfigError, match="8 x 8 pixels cannot be averaged down to the 32 x 32 that policies"):
+        compare(tmp_path / "run", tmp_path / "small", FEW)
+    assert not (tmp_path / "small").exists()
     with pytest.raises(ConfigError, match="sees 4 frames, an episode here has 3"):
         compare(tmp_path / "run", tmp_path / "shorter", replace(FEW, frames=3, hold=1))
 
@@ -138,6 +148,7 @@ def test_the_page_says_what_came_from_starts_that_do_not_begin_at_the_goal():
 @pytest.mark.slow
 def test_outcomes_are_made_once_and_written_with_intervals(tmp_path, monkeypatch):
     run, out = make_run(tmp_path / "study"), tmp_path / "out"
+    monkeypatch.setattr(own_policy, "BcConfig", SMALL)
     monkeypatch.setattr(own_policy, "POLICIES", (OWN, RANDOM))
     trials = compare(run, out, FEW)
     assert list(trials) == [OWN, RANDOM] and {len(found) for found in trials.values()} == {FEW.starts}
