@@ -20,6 +20,7 @@ from experiments.sweeps.sweep import reference_trial
 from experiments.words import few
 from experiments.wrote import wrote
 from hma_jax.config import require
+from hma_jax.config.json import diff
 from hma_jax.training.claim import require_plain
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def train(
         require_known(begin, trained, setting)
         require_another_place(begin, run)
     if dry_run:
-        _check(setting, run, one.trajectories, options)
+        _check(setting, run, one.trajectories, options, trained)
         _print_cost(setting, _single_trial(setting, one.trajectories), run, hosts.count())
         return
     train_model(setting, run, options, trajectories=one.trajectories, replace=remake.replace, begin=trained)
@@ -115,7 +116,7 @@ def train_model(
 ) -> None:
     """Trains the study's reference trial by itself, on all `trajectories` or so many of each robot, from the weights of
     the run `begin` on where one is given, which knows its robots."""
-    _check(setting, run, trajectories, options)
+    origin = _check(setting, run, trajectories, options, begin)
     _require_devices(setting)
     _prepare(setting, replace)
     start = {}
@@ -123,7 +124,6 @@ def train_model(
         kept = [name for name in begin.table.names if name not in known(begin, setting)]
         if kept:
             console.print(f"note: kept as they are, for want of data here: {', '.join(kept)}", soft_wrap=True)
-        origin = {"step": begin.step, "provenance": begin.provenance}
         start = {"table": begin.table, "initial": begin.params, "origin": origin}
     _train(setting, _single_trial(setting, trajectories), run, options, **start)
 
@@ -156,7 +156,7 @@ def adapt_model(
     )
     run = run or setting.workspace.root / "model"
     require_another_place(source, run)
-    _check(setting, run, trajectories, options)
+    origin = _check(setting, run, trajectories, options, trained)
     _require_devices(setting)
     _prepare(setting, replace)
     study, new = setting.study, strangers(trained, setting)
@@ -165,14 +165,17 @@ def adapt_model(
         _single_trial(setting, trajectories),
         train=dataclasses.replace(study.train, seed=study.seeds[0], only=only),
     )
-    beginning = add_robots(trained, trial, open_materials(setting.workspace))
+    beginning = add_robots(trained, trial, open_materials(setting.workspace)) | {"origin": origin}
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
     _train(setting, trial, run, options, **beginning)
 
 
-def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOptions) -> None:
-    """Raises ConfigError, before any work, for options that cannot be and for a run that was not trained here."""
+def _check(
+    setting: Setting, run: Path, trajectories: int | None, options: RunOptions, begin: Run | None
+) -> dict[str, Any] | None:
+    """What the run begins with (`_taken`). Raises ConfigError, before any work, for options that cannot be and for a run
+    that was not trained here, or began otherwise."""
     from experiments.cost import require_only
     from hma_jax.training.optimizer import check_schedule
 
@@ -182,6 +185,7 @@ def _check(setting: Setting, run: Path, trajectories: int | None, options: RunOp
     require_only(setting.study.train, setting.study.dataset_names())
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
+    return _taken(run, begin)
 
 
 def _require_trained_here(setting: Setting, run: Path) -> None:
@@ -207,17 +211,33 @@ def _newest(run: Path) -> tuple[int, dict[str, Any]]:
     return 0, {}
 
 
-def _taken(run: Path, origin: dict[str, Any]) -> dict[str, Any]:
-    """What `run` began with, if that is an earlier step of `origin`, which has trained on since; otherwise `origin`."""
-    taken = _newest(run)[1].get("provenance", {}).get("origin", origin)
-    if taken["provenance"] != origin["provenance"] or taken["step"] >= origin["step"]:
+def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
+    """What `run` begins with, the model `begin`, or began with: an earlier step of it, if it has trained on since. None
+    for a run of its own. Raises ConfigError for a run that began otherwise."""
+    _, described = _newest(run)
+    origin = None if begin is None else {"step": begin.step, "provenance": begin.provenance}
+    if "table" not in described:  # it has not begun, or is none, of which the restoring speaks
         return origin
-    console.print(
-        f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and goes "
-        "on from its own checkpoint",
-        markup=False,
-        soft_wrap=True,
+    taken, place = described["provenance"].get("origin"), "give the new run a directory of its own with --run NEW"
+    if taken is None or origin is None:
+        began = "by itself, not with the weights of another model" if taken is None else "with the weights of another model"
+        how = "leave out --from" if taken is None else "name that model again, as `hma train --from` or `hma adapt`"
+        require(taken == origin, f"{short(run)} began {began}: {how}, or {place}")
+        return None
+    lines = diff(taken["provenance"], origin["provenance"])
+    lines += [f"step: {taken['step']:,} -> {origin['step']:,}"] if taken["step"] > origin["step"] else []
+    require(
+        not lines,
+        f"{short(run)} began with another model than the one that is asked for (there -> asked for): {'; '.join(lines)}; "
+        f"name that one, or {place}",
     )
+    if taken["step"] < origin["step"]:
+        console.print(
+            f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and goes "
+            "on from its own checkpoint",
+            markup=False,
+            soft_wrap=True,
+        )
     return taken
 
 
@@ -271,8 +291,6 @@ def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **sta
 
     materials, steps = open_materials(setting.workspace), trial.train.steps
     say_data(trial, materials)
-    if "origin" in start:
-        start["origin"] = _taken(run, start["origin"])
     with step(f"train width {trial.model.width} for {steps:,} steps of {trial.train.batch} windows") as update:
         result = train_trial(
             trial,

@@ -242,7 +242,14 @@ def test_a_run_goes_on_though_the_one_that_it_began_with_has_trained_on(command,
     shutil.rmtree(source / "checkpoints" / "4")
     shutil.rmtree(source / "checkpoints" / "2")
     said(trained, 1)
-    assert "provenance.origin.step: 2 -> 1" in said(begun, 5, code=2)  # it is another one, or was trained anew
+    assert "than the one that is asked for (there -> asked for): step: 2 -> 1; name" in said(begun, 5, code=2)
+    assert f"{run} began with the weights of another model: name that model again" in said(
+        ["train", *SMOKE, "--out", str(tmp_path / "b"), "--data", str(known)], 5, code=2
+    )
+    if command == "train":
+        begun[begun.index("--out") :] = ["--out", str(tmp_path / "b"), "--data", str(known), "--run", str(source)]
+        begun[2] = str(run)
+        assert f"{source} began by itself, not with the weights of another model: leave out --from" in said(begun, 5, 2)
 
 
 def test_robots_are_added_to_the_averaged_weights_of_a_run_that_keeps_them(tmp_path):
