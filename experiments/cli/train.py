@@ -174,8 +174,8 @@ def adapt_model(
 def _check(
     setting: Setting, run: Path, trajectories: int | None, options: RunOptions, begin: Run | None
 ) -> dict[str, Any] | None:
-    """What the run begins with (`_taken`). Raises ConfigError, before any work, for options that cannot be and for a run
-    that was not trained here, or began otherwise."""
+    """What the run begins with (`_taken`). Raises ConfigError, before any work, for options that cannot be and for a
+    run that was not trained here, or began otherwise."""
     from experiments.cost import require_only
     from hma_jax.training.optimizer import check_schedule
 
@@ -220,21 +220,22 @@ def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
         return origin
     taken, place = described["provenance"].get("origin"), "give the new run a directory of its own with --run NEW"
     if taken is None or origin is None:
-        began = "by itself, not with the weights of another model" if taken is None else "with the weights of another model"
-        how = "leave out --from" if taken is None else "name that model again, as `hma train --from` or `hma adapt`"
+        began, how = "with the weights of another model", "name that model again, as `hma train --from` or `hma adapt`"
+        if taken is None:
+            began, how = "by itself, not with the weights of another model", "leave out --from"
         require(taken == origin, f"{short(run)} began {began}: {how}, or {place}")
         return None
     lines = diff(taken["provenance"], origin["provenance"])
     lines += [f"step: {taken['step']:,} -> {origin['step']:,}"] if taken["step"] > origin["step"] else []
     require(
         not lines,
-        f"{short(run)} began with another model than the one that is asked for (there -> asked for): {'; '.join(lines)}; "
-        f"name that one, or {place}",
+        f"{short(run)} began with another model than the one that is asked for (there -> asked for): "
+        f"{'; '.join(lines)}; name that one, or {place}",
     )
     if taken["step"] < origin["step"]:
         console.print(
-            f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and goes "
-            "on from its own checkpoint",
+            f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and "
+            "goes on from its own checkpoint",
             markup=False,
             soft_wrap=True,
         )
