@@ -224,12 +224,14 @@ def make_detector(robots: Sequence[str], tokenizer: BaseTokenizer, out: Path) ->
         steps = STEPS + MORE * len(robots)
         detector = train_detector(train, steps=steps, progress=lambda done, total: update(done, total, ""))
     out.mkdir(parents=True, exist_ok=True)
-    detector.save(out / WEIGHTS)
-    detector, rows = Detector.load(out / WEIGHTS), []  # as it was saved
+    aside = out / f".{WEIGHTS}"
+    detector.save(aside)
+    detector, rows = Detector.load(aside), []  # as it was saved
     for name, scenes in held.items():
         for frames, given in (("true", as_given), ("tokenizer", as_shown)):
             rows += [{"frames_of": frames} | row for row in errors(detector, name, given(tokenizer, scenes))]
     write_rows(out / ERRORS, rows)
+    aside.replace(out / WEIGHTS)  # last: whoever finds the weights does not measure them again
     return detector
 
 

@@ -3,6 +3,7 @@
 import sys
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, in_place, 
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from hma_jax.config import ConfigError, DecodeConfig
-from hma_jax.evaluation.detector import Found
+from hma_jax.evaluation.detector import Found, init_detector
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
 
@@ -75,6 +76,27 @@ def test_the_share_is_of_what_moved_and_a_mean_over_robots():
     share, half, robots = in_place(rows, "model")
     assert (round(share, 4), robots) == (0.6667, 3) and half > 0.5
     assert in_place([], "true")[2] == 0
+
+
+def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monkeypatch):
+    """`in_place` does not make it again, so that they would never be written."""
+
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    def untrained(scenes, **_):
+        return Detector(init_detector(jax.random.key(0), 1, 5), list(scenes))
+
+    for name, value in (("EPISODES", 1), ("FEWEST", 1), ("HELD_OUT", (1, 1)), ("train_detector", untrained)):
+        monkeypatch.setattr(detector_module, name, value)
+    monkeypatch.setattr(detector_module, "errors", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        make_detector(["pusher_sand"], simulator.tokenizer, tmp_path)
+    assert not (tmp_path / detector_module.WEIGHTS).exists()
+    monkeypatch.setattr(detector_module, "errors", lambda *_: [{"found": 1.0}])
+    made = make_detector(["pusher_sand"], simulator.tokenizer, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [detector_module.WEIGHTS, detector_module.ERRORS]
+    assert Detector.load(tmp_path / detector_module.WEIGHTS).robots == made.robots == ("pusher_sand",)
 
 
 def test_where_all_episodes_are_too_short_that_is_said(tmp_path, monkeypatch, capsys):
