@@ -214,7 +214,11 @@ def plan_table(
         study, simulated=not (given or done.suite), trained=trained and not done.tokenizer, tokenised=not done.tokens
     )
     left = [plan for id, plan in plans.items() if id not in done.finished]
-    table.caption = _say_done(done, len(plans)) + (_caption(study, left, devices, before, evaluated) if left else "")
+    table.caption = _say_done(done, len(plans))
+    if left:
+        table.caption += _caption(study, left, devices, before, evaluated)
+    elif before.seconds or before.unknown:  # it is made before trials are looked at
+        table.caption += f"About {_duration(before.seconds)} to prepare: {describe(before, _duration)}."
     seeds = {p.trial.train.seed for p in plans.values()}
     shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
     axes = _axes(sweeps, done.provenance)
