@@ -87,7 +87,7 @@ def _of_robot(
     if not np.array_equal(recorded, np.stack(images)):
         raise DataError(
             f"{name}: the simulator does not give back the recorded frames under the recorded actions; the suite was made "
-            "by another version of it. Make the suite again."
+            "by another version of it. --replace suite makes it again, and what follows from it."
         )
     seen = frames_under(spec, seeds, changed, times, size) * valid[..., None, None, None]
     return seen[:, prompt:].astype(np.uint8)
