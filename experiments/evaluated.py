@@ -13,7 +13,7 @@ from hma_jax.config import ConfigError, EvalConfig
 from hma_jax.config.json import from_dict, stable_hash, to_dict
 
 if TYPE_CHECKING:
-    from experiments.running.trial import Materials
+    from experiments.running.run_trial import Materials
     from hma_jax.training.runs import Run
 
 STAMP = "evaluation.made_from.json"

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any
 from experiments.running.attempts import State
 from experiments.running.ledger import FINISHED
 from experiments.running.provenance import Provenance, read_record
-from experiments.running.trial import last_loss, trial_id
+from experiments.running.run_trial import last_loss
+from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.sweep import POINT, Point, Sweep
 from hma_jax.config import ConfigError

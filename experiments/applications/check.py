@@ -17,7 +17,7 @@ from data_pipelines.sampling.splits import count_held_out
 from data_pipelines.tokens.manifest import JobSettings
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.windows.evalset import EvalManifest, eval_batches
-from experiments.running.trial import Materials, open_materials
+from experiments.running.run_trial import Materials, open_materials
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
 from experiments.words import few

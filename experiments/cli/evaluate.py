@@ -19,7 +19,7 @@ from hma_jax.config.json import from_dict, to_strict_json
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
-    from experiments.running.trial import Materials
+    from experiments.running.run_trial import Materials
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.runs import Run
 
@@ -71,7 +71,7 @@ def evaluate_model(
 
 
 def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: bool) -> None:
-    from experiments.running.trial import evaluate_on, open_materials, write_evaluation
+    from experiments.running.run_trial import evaluate_on, open_materials, write_evaluation
     from hma_jax.evaluation.windows import FILE
     from hma_jax.runtime.processes import is_writer
 

@@ -24,7 +24,8 @@ from hma_jax.config.json import diff
 from hma_jax.training.claim import require_plain
 
 if TYPE_CHECKING:
-    from experiments.running.trial import Materials, Trial
+    from experiments.running.run_trial import Materials
+    from experiments.running.trial import Trial
     from hma_jax.training.runs import Run
 
 
@@ -140,7 +141,7 @@ def adapt_model(
 ) -> None:
     """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.running.newcomers import add_robots
-    from experiments.running.trial import open_materials
+    from experiments.running.run_trial import open_materials
     from hma_jax.training.runs import load_run
 
     trained = load_run(source, "auto")
@@ -287,7 +288,7 @@ def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> No
 
 
 def _train(setting: Setting, trial: Trial, run: Path, options: RunOptions, **start: Any) -> None:
-    from experiments.running.trial import open_materials, train_trial
+    from experiments.running.run_trial import open_materials, train_trial
     from hma_jax.runtime.processes import is_writer
 
     materials, steps = open_materials(setting.workspace), trial.train.steps

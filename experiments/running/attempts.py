@@ -2,7 +2,7 @@
 
 The same wherever the attempt runs. Its process holds the trial's claim, a lock with a lease
 (`data_pipelines.publishing.claims`), for as long as it lives; whoever finds the claim free may try again.
-A trial's directory holds, besides what `experiments.running.trial` lists,
+A trial's directory holds, besides what `experiments.running.run_trial` lists,
 
     trial.lock      while an attempt is alive
     started.json    of the latest attempt: its process and host

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
-from experiments.running.trial import Materials, Trial, loader_of
+from experiments.running.run_trial import Materials
+from experiments.running.trial import Trial, loader_of
 from hma_jax.config import ConfigError
 
 if TYPE_CHECKING:

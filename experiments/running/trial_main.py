@@ -48,7 +48,8 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from experiments.running.newcomers import begin_from_trial
     from experiments.running.provenance import inputs_of, record_start
     from experiments.running.shared_runs import begin_shared
-    from experiments.running.trial import run_trial, trial_id
+    from experiments.running.run_trial import run_trial
+    from experiments.running.trial import trial_id
     from experiments.running.workspace import Workspace
     from hma_jax.config import ConfigError
     from hma_jax.runtime.files import write_file

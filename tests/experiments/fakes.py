@@ -15,8 +15,9 @@ from experiments.rows import Row, collect
 from experiments.running.attempts import OUTPUT, read_states
 from experiments.running.ledger import Ledger
 from experiments.running.provenance import Provenance, Start, TrialRecord
+from experiments.running.run_trial import last_loss, write_samples
 from experiments.running.sealed import write_result
-from experiments.running.trial import Trial, last_loss, write_samples
+from experiments.running.trial import Trial
 from experiments.running.workspace import Record, Workspace
 from experiments.study import Study, TransferConfig
 from experiments.sweeps.registry import SCALING, plan_sweeps

@@ -13,7 +13,7 @@ from experiments.override import override
 from experiments.preparing import counterfactual
 from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
-from experiments.running.trial import open_materials
+from experiments.running.run_trial import open_materials
 from experiments.running.workspace import Workspace
 
 

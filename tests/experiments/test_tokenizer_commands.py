@@ -13,7 +13,7 @@ from data_pipelines.windows.evalset import eval_batches
 from experiments.cli.main import main
 from experiments.override import override
 from experiments.presets import get_preset
-from experiments.running.trial import open_materials
+from experiments.running.run_trial import open_materials
 from experiments.running.workspace import Workspace
 from experiments.study import on_tokenizer
 from hma_jax.config import ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig

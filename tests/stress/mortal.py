@@ -18,7 +18,7 @@ import data_pipelines.loading.loader
 import experiments.preparing.pipeline
 import experiments.preparing.suite
 import experiments.preparing.tokenizer
-import experiments.running.trial  # noqa: F401
+import experiments.running.run_trial  # noqa: F401
 import hma_jax.evaluation.evaluate
 import hma_jax.tokenizers.train
 import hma_jax.training.train  # noqa: F401

@@ -39,7 +39,7 @@ def quality(
     from experiments.bench.quality import Judged, decodings, judge, plot_quality, subject_of
     from experiments.cli.evaluate import check_fits, require_prepared
     from experiments.rows import write_csv
-    from experiments.running.trial import open_materials
+    from experiments.running.run_trial import open_materials
     from hma_jax.training.runs import load_model
 
     setting = make_setting(asked)

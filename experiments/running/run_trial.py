@@ -1,0 +1,289 @@
+"""Running a trial to a result.
+
+A trial's directory holds
+    job.json        the trial and its provenance (written by the runner)
+    run/            the training run (`hma_jax.training`): log, checkpoints
+    samples.npz     true and predicted frames of a few windows per dataset
+    windows.parquet every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
+    provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
+    result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from experiments.running.machine import describe_machine
+from experiments.running.provenance import record_end
+from experiments.running.run_options import UNWATCHED, RunOptions
+from experiments.running.trial import Trial, loader_of
+from experiments.running.workspace import Workspace
+from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
+from hma_jax.config.json import to_dict
+from hma_jax.runtime.files import write_file
+
+if TYPE_CHECKING:
+    from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
+    from data_pipelines.windows.truth import OtherTruth
+    from hma_jax.evaluation.evaluate import Evaluation
+    from hma_jax.model.embodiments import EmbodimentTable
+    from hma_jax.model.params import Params
+    from hma_jax.tokenizers.base import Tokenizer
+    from hma_jax.training.loop import FitResult
+
+Progress = Callable[[str, int, int], None]
+"""Called as progress(phase, done, total)."""
+
+LAST = 0.1
+"""The part of a run's steps over which its training loss is averaged."""
+
+
+@dataclass(frozen=True)
+class Materials:
+    """What the pipeline prepared, opened."""
+
+    store: TokenStore
+    tokenizer: Tokenizer
+    manifest: EvalManifest
+    truth: OtherTruth | None = None  # what the frozen windows would be under other actions, where it is simulated
+
+
+def open_materials(workspace: Workspace) -> Materials:
+    """Raises ConfigError or DataError for what is missing or damaged."""
+    from data_pipelines.tokens.store import TokenStore
+    from data_pipelines.windows.evalset import EvalManifest
+    from data_pipelines.windows.truth import OtherTruth
+    from hma_jax.tokenizers.io import load_tokenizer
+
+    return Materials(
+        TokenStore(workspace.store),
+        load_tokenizer(workspace.tokenizer),
+        EvalManifest.load(workspace.manifest),
+        OtherTruth.load(workspace.counterfactual) if workspace.counterfactual.exists() else None,
+    )
+
+
+def train_trial(
+    trial: Trial,
+    materials: Materials,
+    run_dir: Path,
+    *,
+    execution: ExecutionConfig = ExecutionConfig(),
+    options: RunOptions = UNWATCHED,
+    keep: tuple[int, ...] = (),
+    progress: Progress = lambda *_: None,
+    table: EmbodimentTable | None = None,
+    initial: Params | None = None,
+    origin: dict[str, Any] | None = None,
+) -> FitResult:
+    """Trains, or goes on training, in `run_dir`. Raises as `hma_jax.training.train.train_model`.
+
+    A model that is not new has a `table` of its own (of which the trial's datasets are part), its
+    `initial` parameters and an `origin`, which its checkpoints remember.
+    """
+    from data_pipelines.loading.loader import describe_batch, make_loader
+    from data_pipelines.loading.selection import LoaderConfig, training_table
+    from hma_jax.config.json import from_dict
+    from hma_jax.runtime.rows import own_rows
+    from hma_jax.training.loop import LoopOptions
+    from hma_jax.training.train import train_model
+    from hma_jax.training.validation import Validation
+
+    store, loader = materials.store, loader_of(trial)
+    table = table or training_table(store, loader, trial.train.action_scale)
+    checkpoint_every, validate_every = options.steps_between(trial.train.steps)
+    lost = {"lost": {name: store.manifest(name).lost for name in trial.datasets}}  # damaged episodes, left out
+
+    def modernise(provenance: dict[str, Any]) -> dict[str, Any]:
+        before = {"order": 1} | provenance["loader"]  # of versions that did not say in which order they drew
+        return lost | provenance | {"loader": to_dict(from_dict(LoaderConfig, before))}
+
+    def report(step: int, steps: int, values: dict[str, float]) -> None:
+        held_out = f", held-out loss {values['validation/loss']:.4f}" if "validation/loss" in values else ""
+        progress(f"training{held_out}", step, steps)
+
+    return train_model(
+        trial.model,
+        table,
+        trial.train,
+        lambda start: make_loader(
+            store, table, loader, start_step=start, rows=own_rows(execution.mesh, trial.train.batch)
+        ),
+        execution=execution,
+        run_dir=run_dir,
+        provenance={
+            "store": store.hash(trial.datasets),
+            "tokenizer": materials.tokenizer.identity,
+            "loader": to_dict(loader),
+            **lost,
+            **({"origin": origin} if origin else {}),
+        },
+        modernise_provenance=modernise,
+        initial=initial,
+        records=lambda index: describe_batch(store, table, loader, index),
+        options=LoopOptions(
+            checkpoint_every=checkpoint_every,
+            checkpoint_minutes=options.checkpoint_minutes,
+            keep_checkpoints=options.keep_checkpoints,
+            keep_steps=keep,
+            skip_damaged=options.skip_damaged,
+        ),
+        validation=Validation(validate_every, lambda: validation_batches(trial, materials, table, execution))
+        if validate_every
+        else None,
+        progress=report,
+    )
+
+
+def validation_batches(
+    trial: Trial, materials: Materials, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+) -> Iterator[dict[str, Any]]:
+    """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
+    from data_pipelines.windows.evalset import eval_batches
+    from hma_jax.runtime.rows import own_rows
+
+    own = own_rows(execution.mesh, trial.train.batch)
+    for name in trial.evaluated:
+        for whole in eval_batches(materials.store, table, materials.manifest, trial.train.batch, (name,)):
+            yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
+            break  # the next dataset; one without windows has no batch
+
+
+def evaluate_on(
+    names: tuple[str, ...],
+    params: Any,
+    model: ModelConfig,
+    table: EmbodimentTable,
+    materials: Materials,
+    config: EvalConfig,
+    setting: Setting = "forward",
+    *,
+    execution: ExecutionConfig = ExecutionConfig(),
+    first: int | None = None,
+    progress: Progress = lambda *_: None,
+) -> Evaluation:
+    """The protocol over the frozen windows of `names`, or over the `first` ones of each.
+
+    Counterfactual PSNR needs simulated frames for this very prompt, and generated ones.
+    """
+    from data_pipelines.windows.evalset import eval_batches
+    from hma_jax.evaluation.evaluate import evaluate
+
+    manifest = materials.manifest
+    truth = materials.truth if config.context == "generated" and config.other_actions else None
+    truth = truth if truth and truth.prompt == config.prompt_frames else None
+    batches = eval_batches(
+        materials.store, table, manifest, config.batch, names, first=first, others=config.other_actions, truth=truth
+    )
+    windows = sum(len(d.windows[:first]) for d in manifest.datasets if d.dataset in names)
+    progress("evaluating", 0, windows)
+    return evaluate(
+        params,
+        model,
+        table,
+        materials.tokenizer,
+        batches,
+        config,
+        setting=setting,
+        execution=execution,
+        progress=lambda done: progress("evaluating", done, windows),
+    )
+
+
+def run_trial(
+    trial: Trial,
+    workspace: Workspace,
+    directory: Path,
+    *,
+    execution: ExecutionConfig = ExecutionConfig(),
+    keep: tuple[int, ...] = (),
+    begin: Callable[[Materials], Mapping[str, Any]] | None = None,
+    progress: Progress = lambda *_: None,
+) -> dict[str, Any]:
+    """Trains and evaluates `trial`, resuming in `directory` what a killed run left there.
+
+    `keep`: steps after which its checkpoint stays, for trials that go on from there. `begin` gives what
+    a trial with a source goes on from (`newcomers`). Returns what it writes to result.json. Raises ConfigError,
+    DataError, DivergedError or Interrupted.
+    """
+    import jax
+
+    from data_pipelines.loading.selection import training_table
+    from experiments.running.sealed import write_result
+    from hma_jax.model.flops import train_flops_per_step
+    from hma_jax.model.hma import declare_model
+    from hma_jax.runtime.processes import is_writer
+
+    started = time.perf_counter()
+    materials = open_materials(workspace)
+    if begin is None:
+        beginning = {"table": training_table(materials.store, loader_of(trial), trial.train.action_scale)}
+    else:
+        beginning = begin(materials)
+    table = beginning["table"]
+    declared = declare_model(trial.model, table)
+    trained = train_trial(
+        trial, materials, directory / "run", execution=execution, keep=keep, progress=progress, **beginning
+    )
+
+    subject = (trial.model, table, materials, trial.eval, trial.train.masking.setting)
+    evaluation = evaluate_on(trial.evaluated, trained.state.weights, *subject, execution=execution, progress=progress)
+    untrained = None
+    if trial.measure_untrained:  # what it says of a few windows it says of all: it has learnt nothing
+        fresh = declared.init(trial.train.seed, jax.tree.map(lambda x: x.sharding, trained.state.params))
+        untrained = evaluate_on(
+            trial.evaluated, fresh, *subject, execution=execution, first=trial.eval.batch
+        ).summary.to_dict()
+
+    result = {
+        "evaluation": evaluation.summary.to_dict(),
+        "untrained": untrained,
+        "training_loss": last_loss(trained.losses),
+        "parameters": declared.count(),
+        "train_flops": train_flops_per_step(trial.model, table, trial.train) * trial.train.steps,
+        "run": {
+            "seconds": time.perf_counter() - started,
+            "train_seconds": trained.seconds,
+            "compile_seconds": trained.compile_seconds,
+            "machine": describe_machine(jax.devices()),
+            "finished": time.strftime("%Y-%m-%d %H:%M:%S %z"),
+        },
+    }
+    if is_writer():
+        write_evaluation(directory, evaluation)
+        record_end(directory)
+        write_result(directory, result)
+    return result
+
+
+def last_loss(losses: Sequence[float]) -> dict[str, Any]:
+    """The mean of a run's last steps, as a `Stat`'s fields; the log has the loss of each."""
+    from hma_jax.evaluation.statistics import mean_and_sem
+
+    return dataclasses.asdict(mean_and_sem(losses[-max(round(LAST * len(losses)), 1) :]))
+
+
+def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
+    """Writes windows.parquet and samples.npz into `directory`."""
+    from hma_jax.evaluation.windows import FILE
+
+    evaluation.windows.save(directory / FILE, directory.name)
+    write_samples(directory / "samples.npz", evaluation.samples)
+
+
+def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:
+    """Stores {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}} as '<dataset>/<kind>'."""
+    import numpy as np
+
+    content = io.BytesIO()
+    np.savez_compressed(
+        content, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
+    )
+    write_file(path, content.getvalue())
