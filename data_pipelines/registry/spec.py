@@ -141,12 +141,10 @@ class DatasetSpec:
         `robot` of a model has them."""
         name = self.name
         again = "in a file for --registry (`hma data inspect --entry` writes one), and tokenise into another --out"
-        dims = zip(self.action_keys, self.action_dims, strict=True)
-        takes = ", ".join(f"{key} ({dim})" for key, dim in dims) or "no actions"
         if self.action_dim != robot.action_dim:
             raise ConfigError(
                 f"{name}: the model was made for {robot.action_dim} action values, the registry's entry gives "
-                f"{self.action_dim}: {takes}. Name those of the model in the entry of {name}, {again}."
+                f"{self.action_dim}: {self._takes()}. Name those of the model in the entry of {name}, {again}."
             )
         stride = self.stride_at(rate)
         if stride != robot.stride:
@@ -156,11 +154,20 @@ class DatasetSpec:
                 f"{self.hz:g} Hz. Put `rate = {right}` into the entry of {name}, {again}; --set rate={right} does the "
                 "same to all datasets that have no rate of their own."
             )
+        self.check_layout(robot, f", {again}")
+
+    def check_layout(self, robot: Embodiment, again: str = "") -> None:
+        """Raises ConfigError unless an action's values are those that this `robot` of a model has, in their order;
+        `again`: what is to be done besides."""
         if robot.layout and self.action_layout() != robot.layout:  # tables of earlier versions do not say
             raise ConfigError(
-                f"{name}: the values of an action are others, or stand in another order, than when the model was made: "
-                f"the registry's entry gives {takes}. Restore the entry of {name}, {again}."
+                f"{self.name}: the values of an action are others, or stand in another order, than when the model was "
+                f"made: the registry's entry gives {self._takes()}. Restore the entry of {self.name}{again}."
             )
+
+    def _takes(self) -> str:
+        dims = zip(self.action_keys, self.action_dims, strict=True)
+        return ", ".join(f"{key} ({dim})" for key, dim in dims) or "no actions"
 
     def action_layout(self) -> str:
         """A hash of what the values of an action mean and where they stand; of equal layouts it is equal.

@@ -61,7 +61,7 @@ from experiments.applications.generating.lessons import (
     others_actions,
 )
 from experiments.applications.generating.source import replay
-from experiments.applications.generating.trajectories import open_trajectories
+from experiments.applications.generating.trajectories import open_trajectories, require_layout
 from experiments.applications.made_with import claim, write_settings
 from experiments.applications.policies.acting import STILL, Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
@@ -223,6 +223,7 @@ def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
     place = robot, dict(simulator.robots), simulator.tokenizer, Workspace.of_run(asked.run).store
     trained_on, driven = open_trajectories(asked.actions, asked.split or "train", *place)
     held_out, _ = open_trajectories(asked.actions, asked.held_out or "val", *place)
+    require_layout(trained_on, driven, simulator.model.table)
     return RecordedLessons(training, driven, trained_on, held_out)
 
 

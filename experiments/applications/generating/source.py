@@ -12,7 +12,7 @@ import numpy as np
 
 from data_pipelines.sources.rlds.writer import encode_jpeg, image_field
 from data_pipelines.sources.units import Episode, Layout, LeftOut
-from experiments.applications.generating.trajectories import Trajectories, Trajectory, describe
+from experiments.applications.generating.trajectories import Trajectories, Trajectory, describe, require_layout
 from hma_jax.config.json import to_dict
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
@@ -44,13 +44,14 @@ class GeneratedSource:
         checkpoint: str,
     ):
         """`given` first frames are the recording's; the first `count` recordings are replayed; `checkpoint` is the
-        model's hash."""
+        model's hash. Raises ConfigError for recordings of the robot with other actions."""
+        require_layout(recorded, robot, simulator.model.table)
         self._simulator, self._robot, self._recorded = simulator, robot, recorded
         self._given, self._count, self._seed, self._checkpoint = given, count, seed, checkpoint
         height, width = simulator.tokenizer.image_shape
         chunk = robot.stride * robot.action_dim
         self.layout = Layout({IMAGE: image_field(height, width)}, {ACTION: chunk}, knows_success=False)
-        self.hz = recorded.hz / robot.stride  # a run alone may not know how often its robot acts
+        self.hz = recorded.spec.hz / robot.stride  # a run alone may not know how often its robot acts
         self.description = f"{recorded.name} ({recorded.split}) as a model sees it under the recorded actions."
         self.batches = [range(i, min(i + len(simulator), count)) for i in range(0, count, len(simulator))]
         self.units = [f"episodes {b.start} to {b.stop - 1}" for b in self.batches]

@@ -20,6 +20,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 
 if TYPE_CHECKING:
+    from hma_jax.model.embodiments import EmbodimentTable
     from hma_jax.tokenizers.shared import BaseTokenizer
 
 
@@ -42,7 +43,7 @@ class Trajectories(ABC):
     name: str  # of the dataset
     split: str
     fingerprint: str  # of its contents
-    hz: float  # recorded actions per second
+    spec: DatasetSpec  # which camera and actions of it, at which rate
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -60,9 +61,8 @@ class RldsTrajectories(Trajectories):
 
     def __init__(self, directory: str, split: str, spec: DatasetSpec, robot: Robot, size: int):
         """Raises ConfigError for a dataset whose actions are not this robot's."""
-        self._source, self._spec, self._robot, self._size = open_source(directory, split), spec, robot, size
+        self._source, self.spec, self._robot, self._size = open_source(directory, split), spec, robot, size
         self.name, self.split, self.fingerprint = spec.name, split, self._source.fingerprint()
-        self.hz = spec.hz
         _require_fit(spec, robot)
         self._source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
 
@@ -70,7 +70,7 @@ class RldsTrajectories(Trajectories):
         return len(self._source)
 
     def __getitem__(self, i: int) -> Trajectory:
-        spec = self._spec
+        spec = self.spec
         episode = self._source.episode(i, spec.image_key, spec.action_keys, self._robot.stride)
         images = fit_images(episode.images, self._size)
         said: Sequence[bytes] = ()
@@ -100,7 +100,7 @@ class StoredTrajectories(Trajectories):
         )
         self._store, self._tokenizer, self._robot = store, tokenizer, robot
         self._every = robot.stride // manifest.frame_step
-        self.name, self.split, self.fingerprint, self.hz = name, split, manifest.hash(), manifest.spec.hz
+        self.name, self.split, self.fingerprint, self.spec = name, split, manifest.hash(), manifest.spec
         self._count = len(manifest.split(split).episodes)
 
     def __len__(self) -> int:
@@ -151,6 +151,12 @@ def _require_fit(spec: DatasetSpec, robot: Robot) -> None:
     )
 
 
+def require_layout(recorded: Trajectories, robot: Robot, table: EmbodimentTable) -> None:
+    """Raises ConfigError where recordings that are called after a robot have other actions than its model learnt."""
+    if recorded.name == robot.name:
+        recorded.spec.check_layout(table.entries[table.index(robot.name)])
+
+
 def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Robot, instruction: str) -> Trajectory:
     """Frames every `stride` native steps, and all actions between them; of a last chunk that is not whole, the last
     action is held."""
@@ -161,5 +167,7 @@ def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Rob
 
 
 def describe(trajectories: Trajectories) -> dict[str, Any]:
-    """What tells these recordings from others."""
-    return {"dataset": trajectories.name, "split": trajectories.split, "contents": trajectories.fingerprint}
+    """What tells these recordings, and what is taken of them, from others."""
+    spec = trajectories.spec
+    taken = {"image_key": spec.image_key, "action_layout": spec.action_layout()}
+    return {"dataset": trajectories.name, "split": trajectories.split, "contents": trajectories.fingerprint, **taken}

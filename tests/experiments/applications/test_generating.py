@@ -15,7 +15,8 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.suite.generate import generate_suite
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.applications.generating import source as source_module
-from experiments.applications.generating.trajectories import open_trajectories
+from experiments.applications.generating import trajectories as trajectories_module
+from experiments.applications.generating.trajectories import describe, open_trajectories
 from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
 from hma_jax.config import ConfigError
@@ -113,6 +114,27 @@ def test_the_rate_is_the_recordings_where_the_run_does_not_know_it(tmp_path):
     recorded, _ = open_trajectories(str(rlds), "train", robot, {}, simulator.tokenizer, tmp_path)
     source = source_module.GeneratedSource(simulator, robot, recorded, given=1, count=2, seed=0, checkpoint="")
     assert robot.hz == 0 and source.hz == spec.hz / 2 == 2.5
+
+
+def test_actions_that_stand_in_another_order_than_the_model_learnt_are_not_replayed(tmp_path, monkeypatch):
+    spec = get_spec("berkeley_gnm_cory_hall")
+    entry = Embodiment(spec.name, 2, 2, (0.0,) * 2, (1.0,) * 2, layout=spec.action_layout())
+    simulator = load_simulator(make_run(tmp_path / "study", table=EmbodimentTable((*TABLE.entries, entry))))
+    robot, rlds = simulator.robot(spec.name), str(write_rlds(tmp_path, spec, [9, 9]))
+
+    def opened():
+        recorded, _ = open_trajectories(rlds, "train", robot, {}, simulator.tokenizer, tmp_path)
+        source_module.GeneratedSource(simulator, robot, recorded, given=1, count=2, seed=0, checkpoint="")
+        return recorded
+
+    recorded, (key,) = opened(), spec.action_keys
+    known = describe(recorded)
+    recorded.spec = replace(spec, image_key="observation/wrist")
+    assert describe(recorded) != known, "what another camera gives is not taken for the same"
+    swapped = replace(spec, action_keys=(f"{key}[1:]", f"{key}[:1]"), action_dims=(1, 1))
+    monkeypatch.setattr(trajectories_module, "get_spec", lambda _: swapped)
+    with pytest.raises(ConfigError, match="stand in another order, than when the model was made"):
+        opened()
 
 
 def episode_seed(i: int) -> int:
