@@ -82,8 +82,8 @@ def run_study(
 
 
 def require_trainable(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
-    """Raises ConfigError for a trial that would fail once all is prepared (`cost.check_trials`)."""
-    from experiments.cost import check_trials
+    """Raises ConfigError for a trial that would fail once all is prepared (`trainable.check_trials`)."""
+    from experiments.trainable import check_trials
 
     share = launching.share()
     if share is None and launching.name == "local":  # trials have what JAX finds, as it does here

@@ -76,8 +76,9 @@ def _run(
         raise ConfigError(f"--workers must be at least 1, got {running.workers}")
     launching = Launching(running.launcher, running.workers, running.launcher_set)
     if running.dry_run:
-        from experiments.cost import Devices, check_trials, plan_table
         from experiments.done import find_done
+        from experiments.plan_table import Devices, plan_table
+        from experiments.trainable import check_trials
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
         devices = Devices(check_trials(setting.study, sweeps, launching.share()), launching.at_once)

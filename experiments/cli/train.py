@@ -177,7 +177,7 @@ def _check(
 ) -> dict[str, Any] | None:
     """What the run begins with (`_taken`). Raises ConfigError, before any work, for options that cannot be and for a
     run that was not trained here, or began otherwise."""
-    from experiments.cost import require_only
+    from experiments.trainable import require_only
     from hma_jax.training.optimizer import check_schedule
 
     options.check()
@@ -270,11 +270,12 @@ def _single_trial(setting: Setting, trajectories: int | None) -> Trial:
 def _print_cost(setting: Setting, trial: Trial, run: Path, processes: int) -> None:
     """The dry run of a study with nothing but this trial, as far as it is not in `run` already, on the devices of so
     many `processes` as this one."""
-    from experiments.cost import Devices, check_trials, plan_table
     from experiments.done import UNKNOWN, find_prepared, newest_step
+    from experiments.plan_table import Devices, plan_table
     from experiments.running.launchers.registry import Launching
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import Point, Sweep
+    from experiments.trainable import check_trials
 
     mesh, own = setting.study.execution.mesh, Launching().share()
     share = own * processes if own else float(max(processes, mesh.least))

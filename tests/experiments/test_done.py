@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.cost import plan_table, plan_trials
+from experiments.cost import plan_trials
 from experiments.done import NOTHING, find_done
+from experiments.plan_table import plan_table
 from experiments.running.attempts import RESULT
 from experiments.running.workspace import save_record
 from experiments.setting import Setting, StudyArguments

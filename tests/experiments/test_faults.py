@@ -16,7 +16,7 @@ import pytest
 from data_pipelines.tokens import part_maker
 from experiments.analysis.tables import read_side
 from experiments.cli.main import main
-from experiments.running import trial as trials
+from experiments.running import run_trial as trials
 from experiments.running import trial_main
 from experiments.running.shared_runs import ALONE
 from experiments.running.workspace import Workspace

@@ -14,7 +14,7 @@ from data_pipelines.registry import DatasetSpec
 from experiments.cli.begin import setting_of, strangers
 from experiments.cli.main import main
 from experiments.presets import get_preset
-from experiments.running import trial as trials
+from experiments.running import run_trial as trials
 from experiments.running.launchers import local
 from experiments.running.run_options import RunOptions
 from experiments.running.slots import Accelerators

@@ -1,0 +1,155 @@
+"""The table of a dry run: every trial of a study once, with what it costs, and what all of them come to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rich.markup import escape
+from rich.table import Table
+
+from experiments.cost import TrialPlan, checkpoint_bytes, plan_trials
+from experiments.done import NOTHING, Done
+from experiments.preparing_cost import PreparingCost, describe, estimate_preparing
+from experiments.progress import tidy_table
+from experiments.running.provenance import Provenance
+from experiments.running.trial import trial_id
+from experiments.study import Study
+from experiments.sweeps.sweep import CONTROL, Sweep, all_steps, reference_trial
+
+
+@dataclass(frozen=True)
+class Devices:
+    """What trials are computed on."""
+
+    each: float = 1.0  # of a trial; below 1: several trials share one
+    at_once: int | None = 1  # trials at a time; None: the cluster says
+
+
+def plan_table(
+    study: Study,
+    sweeps: Sequence[Sweep],
+    devices: Devices = Devices(),
+    *,
+    given: bool = False,
+    trained: bool = True,
+    evaluated: bool = True,
+    done: Done = NOTHING,
+) -> Table:
+    """Every trial once, with the axes it belongs to, its size and its cost. `given`: the user has the data, `trained`:
+    the tokenizer is trained here, `evaluated`: trials are judged, not only trained; `done` is not counted again."""
+    plans = plan_trials(study, sweeps, devices.each, evaluated, done)
+    several = len({plan.trial.train.steps for plan in plans.values()}) > 1
+    budget = f"{all_steps(sweeps)} steps x batch {study.train.batch}"
+    table = tidy_table(
+        f"Study '{study.name}': {len(plans)} trial{'s' * (len(plans) != 1)} of {budget}",
+        "trial", "sets", "videos", "width", *["steps"] * several, "params", "one robot", "FLOPs", "time",
+    )  # fmt: skip
+    table.columns[0].no_wrap, table.columns[0].overflow = False, "fold"
+    before = estimate_preparing(
+        study, simulated=not (given or done.suite), trained=trained and not done.tokenizer, tokenised=not done.tokens
+    )
+    left = [plan for id, plan in plans.items() if id not in done.finished]
+    table.caption = _say_done(done, len(plans))
+    if left:
+        table.caption += _caption(study, left, devices, before, evaluated)
+    elif before.seconds or before.unknown:  # it is made before trials are looked at
+        table.caption += f"About {_duration(before.seconds)} to prepare: {describe(before, _duration)}."
+    seeds = {p.trial.train.seed for p in plans.values()}
+    shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
+    axes = _axes(sweeps, done.provenance)
+    for id, plan in plans.items():
+        trial, cost, over = plan.trial, plan.cost, id in done.finished
+        seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
+        table.add_row(
+            escape(("reference" if id in shared else axes.get(id, "source")) + seed),
+            f"{len(trial.datasets)}",
+            "all" if trial.max_trajectories is None else _short_count(trial.max_trajectories),
+            f"{trial.model.width}",
+            *[f"{trial.train.steps:,}"] * several,
+            _count(cost.parameters),
+            _count(cost.parameters_one_robot),
+            "" if over else _flops(plan.flops).removesuffix("FLOP"),
+            "finished" if over else _duration(plan.seconds),
+        )
+    return table
+
+
+def _say_done(done: Done, trials: int) -> str:
+    """What is not counted, since it is there."""
+    before = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
+    parts = [name for name, there in before.items() if there]
+    parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
+    parts += [f"{sum(done.steps.values()):,} steps of unfinished training"] if done.steps else []
+    return f"There already, and not counted: {', '.join(parts)}. " if parts else ""
+
+
+def _caption(
+    study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool
+) -> str:
+    """What it all comes to, and of what."""
+    from hma_jax.runtime.audit import size_of
+
+    trials, flops, alone = sum(p.seconds for p in plans), sum(p.flops for p in plans), max(p.seconds for p in plans)
+    workers = devices.at_once or 1
+    spent = max(trials / workers, alone)
+    if len(plans) == 1:
+        what = "to train" if not evaluated else "for the trial"
+    elif devices.at_once is None:
+        what = f"for the trials, one after the other; {_duration(alone)} if the cluster runs all at a time"
+    else:
+        what = f"for the trials, {'one after the other' if workers == 1 else f'{workers} at a time'}"
+    if not before.seconds and not before.unknown:
+        whole = f"About {_duration(spent)} {what}"
+    elif before.unknown:
+        whole = f"About {_duration(spent)} {what}, and what it takes to prepare: {describe(before, _duration)}"
+    else:
+        whole = (
+            f"About {_duration(before.seconds + spent)} in all: {_duration(before.seconds)} to prepare "
+            f"({describe(before, _duration)}) and {_duration(spent)} {what}"
+        )
+    number = devices.each * workers
+    each = f", {devices.each:g} for each trial," if workers > 1 else ""
+    hours = devices.each * trials / 3600
+    held = f"{hours:,.{0 if hours >= 100 else 1}f} device-hours"
+    judged = "to train and to evaluate, sampler steps included" if evaluated else "to train"
+    shared = "" if len(plans) == 1 else " What trials have in common is counted once."
+    return (
+        f"{whole}. {_flops(flops)} {judged}, priced for {number:g} device{'s' * (number != 1)}{each} at "
+        f"{_flops(study.flops_per_second)}/s each (flops_per_second); {held} "
+        f"with {study.trial_seconds:g} s for each to start, compile, decode and write (trial_seconds). "
+        f"Checkpoints: {size_of(sum(map(checkpoint_bytes, plans)))}.{shared} 'One robot': parameters with a single "
+        "embodiment of 2 action dimensions. 'Videos' are per dataset. 'Control': trained on shuffled actions."
+    )
+
+
+def _axes(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
+    """What every trial is, by id: the control, a variant, or a point of one axis or several."""
+    names: dict[str, dict[str, str]] = {}
+    for sweep in sweeps:
+        for point in sweep.points:
+            own = "control" if point.role == CONTROL else sweep.remark(point) or sweep.name
+            names.setdefault(trial_id(point.trial, provenance), {}).setdefault(sweep.name, own)
+    return {id: " + ".join(dict.fromkeys(own.values())) for id, own in names.items()}
+
+
+def _count(parameters: int) -> str:
+    return f"{parameters / 1e6:,.1f} M" if parameters >= 1e6 else f"{parameters / 1e3:,.1f} k"
+
+
+def _short_count(n: int) -> str:
+    return f"{n // 1_000_000:,} M" if n >= 1_000_000 and n % 1_000_000 == 0 else f"{n:,}"
+
+
+def _flops(value: float) -> str:
+    for unit, size in (("E", 1e18), ("P", 1e15), ("T", 1e12), ("G", 1e9)):
+        if value >= size:
+            return f"{value / size:,.1f} {unit}FLOP"
+    return f"{value / 1e6:,.1f} MFLOP"
+
+
+def _duration(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:,.1f} {unit}"
+    return f"{seconds:.0f} s"

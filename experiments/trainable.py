@@ -1,0 +1,46 @@
+"""What is refused before anything is made, since every trial would fail or come out otherwise than it says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from experiments.done import UNKNOWN
+from experiments.study import Study
+from experiments.sweeps.sweep import Sweep, unique_trials
+from experiments.words import few
+from hma_jax.config import MeshConfig, TrainConfig, require
+
+
+def devices_of(mesh: MeshConfig, share: float | None) -> float:
+    """The devices that a program uses of its `share`; where nobody says that, as many as the mesh takes at least.
+
+    Raises ConfigError for a mesh that does not fit them, as training would.
+    """
+    from hma_jax.runtime.mesh import mesh_sizes
+
+    share = share or float(mesh.least)
+    mesh_sizes(mesh, math.ceil(share))
+    return share
+
+
+def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
+    """`devices_of` each trial. Raises ConfigError also for one whose batch or model does not divide over them, whose
+    learning rate would not do what is said of it, or that is to train robots alone that it does not have."""
+    from hma_jax.runtime.mesh import check_sizes, mesh_sizes
+    from hma_jax.training.optimizer import check_schedule
+
+    execution = study.execution
+    devices = devices_of(execution.mesh, share)
+    sizes = mesh_sizes(execution.mesh, math.ceil(devices))
+    for trial in unique_trials(sweeps, UNKNOWN).values():
+        check_sizes(sizes, trial.model, trial.train.batch, execution.accumulate)
+        check_schedule(trial.train.optimizer, trial.train.steps)
+        require_only(trial.train, [name for one in trial.with_source() for name in one.datasets])
+    return devices
+
+
+def require_only(train: TrainConfig, robots: Sequence[str]) -> None:
+    """Raises ConfigError where `train.only` names others than the `robots` that a model is trained on."""
+    without = [name for name in train.only if name not in robots]
+    require(not without, f"train.only: there is no robot {few(without)} to train, but {few(robots)}")
