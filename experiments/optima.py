@@ -55,9 +55,7 @@ def find_optima(rows: Sequence[Row], sweeps: Iterable[Sweep]) -> list[Optimum]:
         for metric, scope in LOSSES.items():
             for role, series in all_series(own, sweep.name).items():
                 curves = {s: curve(own, sweep.name, metric, role, scope, s) for s in series}
-                best = {
-                    s: lowest(points, diverged(own, sweep.name, role, s)) for s, points in curves.items()
-                }
+                best = {s: lowest(points, diverged(own, sweep.name, role, s)) for s, points in curves.items()}
                 base = best.get(sweep.base)
                 of_base = curves.get(sweep.base, [])
                 found += [

@@ -84,9 +84,7 @@ def _say_done(done: Done, trials: int) -> str:
     return f"There already, and not counted: {', '.join(parts)}. " if parts else ""
 
 
-def _caption(
-    study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool
-) -> str:
+def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool) -> str:
     """What it all comes to, and of what."""
     from hma_jax.runtime.audit import size_of
 

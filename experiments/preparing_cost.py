@@ -128,5 +128,3 @@ def describe(cost: PreparingCost, duration: Callable[[float], str]) -> str:
     known = cost.datasets - len(cost.unknown)
     without = f"unknown for {len(cost.unknown)} of {cost.datasets} datasets, whose frames the registry does not say"
     return f"{without}; {duration(cost.seconds)} with the other {known} alone ({said})" if known else without
-
-

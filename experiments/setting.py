@@ -26,7 +26,15 @@ from hma_jax.config import ConfigError, ModelConfig
 from hma_jax.training.claim import is_address
 
 Preset = Literal[
-    "smoke", "cpu", "cpu-full", "accelerator", "paper", "smoke-continuous", "cpu-continuous", "cpu-full-continuous", "play",
+    "smoke",
+    "cpu",
+    "cpu-full",
+    "accelerator",
+    "paper",
+    "smoke-continuous",
+    "cpu-continuous",
+    "cpu-full-continuous",
+    "play",
     "play-gpu",
 ]
 

@@ -15,7 +15,6 @@ from typing import Literal
 from data_pipelines.sampling.splits import MAX_VAL, MAX_VAL_FRACTION, MIN_VAL, VAL_FRACTION, check_bounds
 from hma_jax.config import (
     AnyTokenizerConfig,
-    ConfigError,
     EvalConfig,
     ExecutionConfig,
     Latents,

@@ -87,7 +87,10 @@ def test_the_speed_on_a_gpu_beside_the_release():
         record.stage(THEIRS + RELEASED[stage], rows).timing.median / record.stage(OURS + stage, rows).timing.median
         for record, stage, rows in ((frames, "fill", 1), (frames, "slide", 1), (steps, "step", 8))
     )
-    assert f"frames are {fill:.1f} and {slide:.1f} times faster (float32, batch 1), a training step {train:.1f} times" in text
+    assert (
+        f"frames are {fill:.1f} and {slide:.1f} times faster (float32, batch 1), a training step {train:.1f} times"
+        in text
+    )
     assert all(f"| {ratio:.2f} |" in page for ratio in (fill, slide, train))
     rollouts = read_record(next(gpu.glob("rollout-base-*.json")))
     one, many = (rollouts.stage("rollout", rows).frames_per_second for rows in (1, 64))
@@ -192,7 +195,9 @@ def test_plans_from_further_starts_are_as_their_page_says():
     away = ~begins_there(settings.make_task(), settings.start_seeds())
     less = crossed(plans - policies, away)
     assert f"Of these starts {120 - away.sum()} begin on the mark (of the thirty {begun_of_thirty()})" in page
-    assert f"From the other {away.sum()} MPPI has {plans[away].mean():.2f}, cloning {policies[:, away].mean():.2f}" in page
+    assert (
+        f"From the other {away.sum()} MPPI has {plans[away].mean():.2f}, cloning {policies[:, away].mean():.2f}" in page
+    )
     assert f"the difference is {less.mean:.2f} ({less.low:.2f} to {less.high:.2f})" in page
     rates = policies.mean(1)
     first = f"the first, the one in the table of thirty, has {rates[0]:.2f}"

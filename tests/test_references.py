@@ -31,9 +31,7 @@ def _listed(number: str) -> str:
     return rf"({number}(?:(?:,|{GAP}and|{GAP}to){GAP}{number})*)\b"
 
 
-CITATION = re.compile(
-    rf"\b(?:[Ss]ections?{GAP}{_listed(SECTION)}|[Aa]ppendi(?:x|ces){GAP}{_listed(APPENDIX)})"
-)
+CITATION = re.compile(rf"\b(?:[Ss]ections?{GAP}{_listed(SECTION)}|[Aa]ppendi(?:x|ces){GAP}{_listed(APPENDIX)})")
 SHORT = re.compile(rf"\breference,?{GAP}[0-9A-Z]\.[0-9]", re.IGNORECASE)
 
 

@@ -52,9 +52,7 @@ SMALLER = dict(width=8, layers=1, heads=2, frames=3, tokens=4, action_tokens=1, 
 
 
 def train_config(**changes) -> TrainConfig:
-    settings = dict(
-        steps=6, batch=8, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=2)
-    )
+    settings = dict(steps=6, batch=8, optimizer=OptimizerConfig(learning_rate=1e-3, warmup_steps=2))
     return TrainConfig(**(settings | changes))
 
 

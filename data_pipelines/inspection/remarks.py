@@ -92,9 +92,7 @@ def _windows(facts: Facts, windows: WindowFacts | None) -> list[Remark]:
     needs = f"the shortest window at stride {windows.stride} takes {windows.needed} steps"
     if not windows.long_enough:
         return [
-            Remark(
-                "bad", "no window", f"{needs}; the longest of {facts.sampled} episodes has {facts.lengths.longest}"
-            )
+            Remark("bad", "no window", f"{needs}; the longest of {facts.sampled} episodes has {facts.lengths.longest}")
         ]
     kind = "doubt" if short > 0.1 * facts.sampled else None
     text = f"{needs}; {short} of {facts.sampled} episodes are shorter"
@@ -139,9 +137,7 @@ def _actions(field: ActionFacts, entry: DatasetSpec | None) -> list[Remark]:
         remarks.append(Remark("bad", "not finite", text))
     start = _first_value(field.key, entry)
     handled = set(entry.angles) if entry is not None and entry.angle_form != "as_recorded" else set()
-    wraps = [
-        i for i, d in enumerate(field.dimensions) if d.hint in WRAPPING.values() and start + i not in handled
-    ]
+    wraps = [i for i, d in enumerate(field.dimensions) if d.hint in WRAPPING.values() and start + i not in handled]
     if wraps:
         numbers = ", ".join(str(start + i) for i in wraps)
         text = (

@@ -74,7 +74,7 @@ class Suggestion:
             lines.append(f"        version={_text(self.version)},")
         if self.angles:
             lines.append(f"        angles={_tuple(map(str, self.angles))},  # they wrap")
-            lines.append(f"        angle_form={_text(self.angle_form)},  # or \"unwrapped\"")
+            lines.append(f'        angle_form={_text(self.angle_form)},  # or "unwrapped"')
             if self.angle_unit != "radian":
                 lines.append(f"        angle_unit={_text(self.angle_unit)},")
         lines += [f"        episodes={self.episodes},", f"        mean_steps={self.mean_steps},"]
@@ -161,9 +161,7 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
     return tuple(names), tuple(dims), about
 
 
-def _choose_angles(
-    facts: Facts, keys: Sequence[str], dims: Sequence[int]
-) -> tuple[tuple[int, ...], AngleUnit]:
+def _choose_angles(facts: Facts, keys: Sequence[str], dims: Sequence[int]) -> tuple[tuple[int, ...], AngleUnit]:
     """Which of the chosen values wrap, counted over all keys, and in what unit: that of most of them."""
     by_key = {a.key: a for a in facts.actions}
     hints = [

@@ -70,9 +70,7 @@ def select_windows(store: TokenStore, config: LoaderConfig) -> TrainingWindows:
     return TrainingWindows(sets, make_mixture(counts, config.tau, {n: s.shortage() for n, s in sets.items()}))
 
 
-def training_table(
-    store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation"
-) -> EmbodimentTable:
+def training_table(store: TokenStore, config: LoaderConfig, scale: ActionScale = "deviation") -> EmbodimentTable:
     """The table of the datasets of `config`, in their order, with statistics of exactly the trajectories used."""
     names = config.datasets or store.names
     return EmbodimentTable(tuple(training_embodiment(store, name, config, scale) for name in names))

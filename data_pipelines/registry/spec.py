@@ -109,9 +109,7 @@ class DatasetSpec:
             part = field_slice(key)[1]
             if part.stop is not None:
                 taken = part.stop - part.start
-                require(
-                    taken == dim, f"dataset {name!r}: {key!r} takes {taken} values, action_dims says {dim}"
-                )
+                require(taken == dim, f"dataset {name!r}: {key!r} takes {taken} values, action_dims says {dim}")
         width = sum(self.action_dims)
         require(
             list(self.angles) == sorted(set(self.angles)) and all(0 <= d < width for d in self.angles),

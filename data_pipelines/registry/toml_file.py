@@ -5,6 +5,8 @@
     action_keys = ["action[:7]"]
     action_dims = [7]
     hz = 10
+
+`hma data inspect --entry FILE` writes one.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ def load_entries(path: str | Path) -> tuple[DatasetSpec, ...]:
                 raise ConfigError(f"{name}: leave out name = {fields['name']!r}: the heading is an entry's name")
             entry = from_dict(DatasetSpec, {"name": name} | fields, name)
             if entry.angles and "angle_form" not in fields:  # by default they would stay as they are
-                raise ConfigError(f'{name}: angles say which values wrap; add angle_form = "sine_cosine" or "unwrapped"')
+                raise ConfigError(
+                    f'{name}: angles say which values wrap; add angle_form = "sine_cosine" or "unwrapped"'
+                )
             entries.append(entry)
         except ConfigError as error:
             raise ConfigError(f"{path}: {error}") from error

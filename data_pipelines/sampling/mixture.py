@@ -37,9 +37,7 @@ def mixture_weights(counts: Sequence[int] | np.ndarray, tau: float = 3.0) -> np.
     return powers / powers.sum()
 
 
-def make_mixture(
-    counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] | None = None
-) -> Mixture:
+def make_mixture(counts: Mapping[str, int], tau: float = 3.0, reasons: Mapping[str, str] | None = None) -> Mixture:
     """The mixture of the datasets in `counts` (name -> examples).
 
     Those with none are left out; `reasons` may say why. If none remains: DataError with all

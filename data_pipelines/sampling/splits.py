@@ -69,9 +69,7 @@ def count_held_out(episodes: int, fraction: float, min_val: int, max_val: int, m
 def check_bounds(fraction: float, min_val: int, max_val: int, max_fraction: float, group: str = "") -> None:
     """Raises ConfigError, which names the setting and its `group`, for bounds that `count_held_out` cannot take."""
     require(0 <= fraction < 1, f"{group}val_fraction must lie in [0, 1), got {fraction:g}")
-    require(
-        0 <= min_val <= max_val, f"{group}min_val must lie between 0 and {group}max_val, {max_val}, got {min_val}"
-    )
+    require(0 <= min_val <= max_val, f"{group}min_val must lie between 0 and {group}max_val, {max_val}, got {min_val}")
     require(0 < max_fraction <= 0.5, f"{group}max_val_fraction must lie in (0, 0.5], got {max_fraction:g}")
 
 

@@ -91,9 +91,7 @@ def generate_sim(
 class _Run:
     """One call of `generate_sim`: what is there, and the processes under way."""
 
-    def __init__(
-        self, root: Path, marks: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack
-    ):
+    def __init__(self, root: Path, marks: dict[str, str], episodes, size, seed, total, progress, stack: ExitStack):
         self.root, self.marks, self.episodes, self.size, self.seed = root, marks, episodes, size, seed
         self.done, self.total, self.progress = 0, total, progress
         self.lock, self.finishing = threading.Lock(), threading.Lock()
@@ -177,9 +175,7 @@ class _Run:
         with self.lock:
             if self.stopped:
                 raise KeyboardInterrupt
-            child = subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=messages, env=environment, text=True
-            )
+            child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=messages, env=environment, text=True)
             self.children.add(child)
         return child
 

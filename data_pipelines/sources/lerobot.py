@@ -44,17 +44,14 @@ class LeRobotSource:
         _check_names(features, self.root / "meta" / "info.json")
         there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
         if not there:
-            raise DataError(
-                f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels."
-            )
+            raise DataError(f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels.")
         wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(there), "camera", str(self.root))
         self.cameras = {f"observation/{name}": there[name] for name in names}
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self.vectors}:
             raise DataError(
-                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among "
-                f"{', '.join(features)}."
+                f"{self.root / 'meta' / 'info.json'}: no numeric feature 'action' among {', '.join(features)}."
             )
         sizes = {key: int(np.prod(features[name]["shape"])) for key, name in self.vectors.items()}
         self.layout = Layout({k: image_field(None, None) for k in self.cameras}, sizes, SUCCESS in features)
@@ -64,9 +61,7 @@ class LeRobotSource:
         self._tables = ParquetRows(EPISODE)
 
     def identity(self) -> dict[str, Any]:
-        files = {e.data for e in self.meta.episodes} | {
-            f for e in self.meta.episodes for f, _ in e.videos.values()
-        }
+        files = {e.data for e in self.meta.episodes} | {f for e in self.meta.episodes for f, _ in e.videos.values()}
         sizes = {str(f.relative_to(self.root)): f.stat().st_size if f.exists() else -1 for f in sorted(files)}
         return {
             "format": self.meta.version,
@@ -126,9 +121,7 @@ class LeRobotSource:
             raise UnitError(f"{entry.data}: no column {shown(missing[0])}. {ADVICE}")
         place = self._tables.find(entry.data, entry.index)
         if place is None:
-            raise UnitError(
-                f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}"
-            )
+            raise UnitError(f"{entry.data}: the rows of episode {entry.index} are missing or scattered. {ADVICE}")
         return place
 
     def _check_camera(self, entry: EpisodeEntry, name: str, where: str) -> None:
@@ -199,9 +192,7 @@ class LeRobotSource:
         unknown = [(row, i) for row, i in enumerate(indices) if type(i) is not int or i not in self.meta.tasks]
         if unknown:
             row, index = unknown[0]
-            raise UnitError(
-                f"{where}: task_index {shown(index)} at row {row} is not among the tasks of meta. {ADVICE}"
-            )
+            raise UnitError(f"{where}: task_index {shown(index)} at row {row} is not among the tasks of meta. {ADVICE}")
         return [self.meta.tasks[i] for i in indices]
 
 

@@ -203,9 +203,7 @@ def _decode(data: Fetched, where: str) -> np.ndarray:
 def _runs(numbers: np.ndarray) -> tuple[EpisodeRun, ...]:
     starts = np.flatnonzero(np.diff(numbers, prepend=numbers[0] - 2) != 1)
     ends = [*starts[1:].tolist(), len(numbers)]
-    return tuple(
-        EpisodeRun("episodes", int(numbers[a]), b - a) for a, b in zip(starts.tolist(), ends, strict=True)
-    )
+    return tuple(EpisodeRun("episodes", int(numbers[a]), b - a) for a, b in zip(starts.tolist(), ends, strict=True))
 
 
 def _size(path: Path) -> int:

@@ -82,12 +82,7 @@ class RobomimicSource:
             images = {}
             for camera in self.cameras:
                 frames = self.array(demo, f"obs/{camera}_image", where)
-                if (
-                    frames.dtype != np.uint8
-                    or frames.ndim != 4
-                    or frames.shape[3] != 3
-                    or len(frames) != steps
-                ):
+                if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] != 3 or len(frames) != steps:
                     raise UnitError(
                         f"{where}/obs/{camera}_image is {frames.dtype} {list(frames.shape)}; {steps} actions "
                         f"need uint8 images [{steps}, H, W, 3]. {ADVICE}"

@@ -139,9 +139,7 @@ class EpisodeSource(ABC):
         """int32 [episodes]: native frames of each; -1 where it is not known before it is read."""
 
     @abstractmethod
-    def open_episode(
-        self, i: int, image_key: str, action_keys: Sequence[str]
-    ) -> AbstractContextManager[OpenEpisode]:
+    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> AbstractContextManager[OpenEpisode]:
         """Episode `i` in bounded memory, however long: see `OpenEpisode`.
 
         Keys are relative to a step: `observation/image_0`, `action`, `action/arm`, `action[:7]`.
@@ -166,9 +164,7 @@ class EpisodeSource(ABC):
     def remember(self) -> None:
         """Keeps what reading has shown, as the steps of episodes, for later starts."""
 
-    def episode(
-        self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1
-    ) -> RawEpisode:
+    def episode(self, i: int, image_key: str, action_keys: Sequence[str], frame_step: int = 1) -> RawEpisode:
         """Episode `i`, whole: one camera, the actions of `action_keys` concatenated, the success flag.
 
         Raises what `open_episode` raises.
@@ -189,9 +185,7 @@ class EpisodeSource(ABC):
             seen = {t: episode.image(t) for t in sorted(set(chosen))}
             return [seen[t] for t in chosen]
 
-    def check_keys(
-        self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None
-    ) -> None:
+    def check_keys(self, image_key: str, action_keys: Sequence[str], action_dims: Sequence[int] | None = None) -> None:
         """Raises ConfigError unless the camera and the action fields exist, with these sizes."""
         cameras = [k for k, f in self.features.items() if f.image]
         numbers = [k for k, f in self.features.items() if f.size and "action" in k]

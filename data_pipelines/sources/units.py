@@ -99,7 +99,5 @@ def choose(wanted: Sequence[str], there: Sequence[str], what: str, where: str) -
     """`wanted`, or all that are there; ConfigError for one that is not."""
     missing = [name for name in wanted if name not in there]
     if missing:
-        raise ConfigError(
-            f"{where}: no {what} {', '.join(map(repr, missing))}; it has {', '.join(there) or 'none'}."
-        )
+        raise ConfigError(f"{where}: no {what} {', '.join(map(repr, missing))}; it has {', '.join(there) or 'none'}.")
     return tuple(wanted) or tuple(there)

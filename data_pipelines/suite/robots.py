@@ -142,9 +142,7 @@ def rover(
         links.append(Link(parent=2, radius=length, touches=True))
     else:
         for side in (1, -1):  # wheels
-            links.append(
-                Link(parent=2, mount=(-0.8 * length, side * width), length=1.6 * length, radius=0.07, paint=2)
-            )
+            links.append(Link(parent=2, mount=(-0.8 * length, side * width), length=1.6 * length, radius=0.07, paint=2))
         links.append(
             Link(
                 parent=2,

@@ -41,6 +41,7 @@ PIXELS = {"magvit": 16, "temporalvae": 8}
 IMAGE_SIZE = 256
 """Pixels of the release's images, where the encoder is unknown."""
 
+
 def import_tokens(
     train: str | Path,
     val: str | Path,
@@ -138,9 +139,7 @@ def _facts(folder: ReleaseFolder, patch: int) -> TokenizerFacts:
     pixels = PIXELS.get(str(folder.metadata.get("encoder_type")))
     image_size = side * pixels if pixels else IMAGE_SIZE
     if folder.channels:
-        require(
-            patch >= 1 and side % patch == 0, f"{folder.path}: patch {patch} does not divide the grid {side}"
-        )
+        require(patch >= 1 and side % patch == 0, f"{folder.path}: patch {patch} does not divide the grid {side}")
         grid = side // patch
         return TokenizerFacts(folder.encoder, image_size, grid, grid**2, 0, 0, 0, patch**2 * folder.channels)
     factors = round(np.log(vocab) / np.log(FACTOR_VOCAB))
@@ -165,9 +164,7 @@ def _episode(
     actions = np.asarray(folder.actions[start:stop])
     if not np.isfinite(actions).all():
         frame = int(start + np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
-        raise DataError(
-            f"{folder.path}/actions: not finite at frame {frame}: {folder.actions[frame].tolist()}."
-        )
+        raise DataError(f"{folder.path}/actions: not finite at frame {frame}: {folder.actions[frame].tolist()}.")
     wide = tokens.astype(np.float32 if folder.channels else np.int32)
     return StoredEpisode(number, None, tokens, actions, None if decode is None else decode(wide))
 
@@ -184,9 +181,7 @@ def _tokens(folder: ReleaseFolder, start: int, stop: int, step: int, patch: int)
             )
         return part.reshape(len(part), -1).astype(token_dtype(folder.vocab_size))
     if not np.isfinite(part).all():
-        raise DataError(
-            f"{folder.path / 'video.bin'}: latents of frames {start} to {stop - 1} are not finite."
-        )
+        raise DataError(f"{folder.path / 'video.bin'}: latents of frames {start} to {stop - 1} are not finite.")
     frames, channels, side, _ = part.shape
     grid = side // patch
     # As the models read a patch: cells row by row, channels of a cell together.
@@ -200,9 +195,7 @@ def _fingerprint(folders: dict[str, ReleaseFolder]) -> str:
     digest = hashlib.sha256()
     for folder in folders.values():
         digest.update(repr(sorted(folder.metadata.items())).encode())
-        digest.update(
-            folder.bounds.astype("<i8").tobytes() + np.ascontiguousarray(folder.actions, "<f4").tobytes()
-        )
+        digest.update(folder.bounds.astype("<i8").tobytes() + np.ascontiguousarray(folder.actions, "<f4").tobytes())
         digest.update(np.ascontiguousarray(folder.video[:: max(len(folder.video) // 64, 1)]).tobytes())
     return digest.hexdigest()[:16]
 
@@ -219,9 +212,7 @@ def pair_folders(folders: Sequence[Path]) -> list[tuple[str, Path, Path]]:
         stems.setdefault(folder.with_name(stem), {})[split] = folder
     pairs = []
     for stem, found in stems.items():
-        mates = {
-            split: found.get(split, stem.with_name(f"{stem.name}_{split}")) for split in ("train", "val")
-        }
+        mates = {split: found.get(split, stem.with_name(f"{stem.name}_{split}")) for split in ("train", "val")}
         missing = [str(mate) for mate in mates.values() if not mate.is_dir()]
         require(not missing, f"{', '.join(missing)}: no such folder; a dataset is a pair of _train and _val")
         pairs.append((stem.name, mates["train"], mates["val"]))

@@ -28,8 +28,7 @@ def load_manifest(path: Path) -> Manifest:
         values = json.loads(path.read_text())
         if values.get("format") not in READ:
             raise DataError(
-                f"{path}: manifest format {values.get('format')!r}; this reads "
-                f"{' and '.join(map(str, READ))}. {advice}"
+                f"{path}: manifest format {values.get('format')!r}; this reads {' and '.join(map(str, READ))}. {advice}"
             )
         take = _from_json if values["format"] == 2 else _from_file
         lists = take(path, values)

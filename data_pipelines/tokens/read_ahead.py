@@ -82,9 +82,7 @@ class _Budget:
     def take(self, count: int) -> None:
         """Waits until there is room, or nothing is taken at all. Raises _Closed."""
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._closed or not self._used or self._used + count <= self._limit
-            )
+            self._changed.wait_for(lambda: self._closed or not self._used or self._used + count <= self._limit)
             if self._closed:
                 raise _Closed
             self._used += count

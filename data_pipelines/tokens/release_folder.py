@@ -101,9 +101,7 @@ def _metadata(path: Path) -> dict[str, Any]:
         if type(value) is not int or not 1 <= value <= MOST:
             raise DataError(f"{path}: {field} is {shown(value)}, not a positive number. {ADVICE}")
     if meta.get("token_dtype", "uint32") not in DTYPES:
-        raise DataError(
-            f"{path}: token_dtype is {shown(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}"
-        )
+        raise DataError(f"{path}: token_dtype is {shown(meta['token_dtype'])}, none of {', '.join(DTYPES)}. {ADVICE}")
     return meta
 
 
@@ -112,15 +110,11 @@ def _video_shape(path: Path, meta: dict[str, Any]) -> tuple[int, tuple[int, ...]
     frames, grid, channels = meta["num_images"], (meta["h"], meta["w"]), meta.get("latent_channels")
     dtype = np.dtype(meta.get("token_dtype", "float16" if channels else "uint32"))
     if grid[0] != grid[1]:
-        raise DataError(
-            f"{path / 'metadata.json'}: a grid of {grid[0]} x {grid[1]}; only square ones can be read."
-        )
+        raise DataError(f"{path / 'metadata.json'}: a grid of {grid[0]} x {grid[1]}; only square ones can be read.")
     if dtype.kind == "f":
         return frames, (frames, channels or 4, *grid), dtype
     if dtype == np.uint8:
-        raise ConfigError(
-            f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents."
-        )
+        raise ConfigError(f"{path}: raw images (token_dtype uint8), not tokens; give the folder of ids or latents.")
     vocab_size = meta.get("vocab_size")
     if type(vocab_size) is not int or not 2 <= vocab_size <= 2**32:
         raise DataError(f"{path / 'metadata.json'}: vocab_size is {shown(vocab_size)}. {ADVICE}")
@@ -133,8 +127,7 @@ def _map(path: Path, dtype: Any, shape: tuple[int, ...], because: str) -> np.nda
         found = path.stat().st_size
         if found != expected:
             raise DataError(
-                f"{path}: {found} bytes, but {because} make {expected} "
-                f"({np.dtype(dtype)} {list(shape)}). {ADVICE}"
+                f"{path}: {found} bytes, but {because} make {expected} ({np.dtype(dtype)} {list(shape)}). {ADVICE}"
             )
         return np.memmap(path, dtype, "r", shape=shape)
     except OSError as error:
@@ -145,7 +138,6 @@ def _actions(path: Path, frames: int) -> np.ndarray:
     size = path.stat().st_size if path.is_file() else 0
     if not size or size % (4 * frames):
         raise DataError(
-            f"{path}: {size} bytes are no float32 [{frames}, A], for the num_images "
-            f"of metadata.json. {ADVICE}"
+            f"{path}: {size} bytes are no float32 [{frames}, A], for the num_images of metadata.json. {ADVICE}"
         )
     return np.memmap(path, np.float32, "r", shape=(frames, size // (4 * frames)))

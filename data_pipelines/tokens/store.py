@@ -92,8 +92,7 @@ class TokenStore:
         except (RuntimeError, ValueError) as error:
             path = self._path(name, split, part)
             raise DataError(
-                f"{path}: episode {at} cannot be read: {error}. "
-                f"Remove {path.parent} and tokenise the dataset again."
+                f"{path}: episode {at} cannot be read: {error}. Remove {path.parent} and tokenise the dataset again."
             ) from error
 
     def action_spread(self, name: str, episodes: Sequence[int]) -> Spread:
@@ -130,9 +129,7 @@ class TokenStore:
                 rows.append(kept[own - (ends[part - 1] if part else 0)])
         return merge_exactly(np.concatenate([np.atleast_2d(x) for x in rows]), self.manifest(name).spec.action_dim)
 
-    def check_table(
-        self, table: EmbodimentTable, names: Sequence[str], rate: float | None = FRAME_RATE
-    ) -> None:
+    def check_table(self, table: EmbodimentTable, names: Sequence[str], rate: float | None = FRAME_RATE) -> None:
         """Raises ConfigError unless `table` has each of `names` with the action layout stored here, at `rate`."""
         for name in names:
             manifest = self.manifest(name)

@@ -93,8 +93,7 @@ def tokenize_dataset(
     )  # fmt: skip
     work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
     lost = [
-        LostEpisodes(_without_place(reason, source), episodes=count)
-        for reason, count in sorted(source.skipped.items())
+        LostEpisodes(_without_place(reason, source), episodes=count) for reason, count in sorted(source.skipped.items())
     ]
     manifest = write_dataset(
         store_root,
@@ -186,9 +185,7 @@ class _Pending:
 class _Work:
     """How the parts of one dataset are made."""
 
-    def __init__(
-        self, source: EpisodeSource, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int
-    ):
+    def __init__(self, source: EpisodeSource, plan: Manifest, tokenizer: Tokenizer, batch: int, threads: int):
         s = plan.settings
         self._source, self._plan, self._threads = source, plan, threads
         self._tokenizer, self._batch = tokenizer, batch
@@ -243,12 +240,15 @@ class _Work:
             begin = episode.begin
             frames = np.stack(episode.frames) if episode.keep else None
             episode.frames.clear()
-            yield self._split(begin.index), StoredEpisode(
-                int(self._numbers[begin.index]),
-                begin.success,
-                tokens.astype(self._dtype),
-                self._plan.spec.convert(begin.actions),
-                frames,
+            yield (
+                self._split(begin.index),
+                StoredEpisode(
+                    int(self._numbers[begin.index]),
+                    begin.success,
+                    tokens.astype(self._dtype),
+                    self._plan.spec.convert(begin.actions),
+                    frames,
+                ),
             )
 
     def _lose(self, error: EpisodeError) -> LostEpisodes:

@@ -129,16 +129,12 @@ def train_windows(
     return _windows(store, name, "train", cut, min(least, frames), max_trajectories, subset_seed)
 
 
-def val_windows(
-    store: TokenStore, name: str, frames: int, least: int, *, rate: float | None = FRAME_RATE
-) -> WindowSet:
+def val_windows(store: TokenStore, name: str, frames: int, least: int, *, rate: float | None = FRAME_RATE) -> WindowSet:
     """Windows of the held-out split with at least `least` real frames."""
     return _windows(store, name, "val", make_cut(store, name, frames, rate), least, None, 0)
 
 
-def _windows(
-    store: TokenStore, name: str, split: str, cut: Cut, least: int, limit: int | None, seed: int
-) -> WindowSet:
+def _windows(store: TokenStore, name: str, split: str, cut: Cut, least: int, limit: int | None, seed: int) -> WindowSet:
     require(1 <= least <= cut.frames, f"windows of {cut.frames} frames cannot have {least} real ones")
     manifest = store.manifest(name)
     steps = np.asarray(manifest.split(split).steps, np.int64)

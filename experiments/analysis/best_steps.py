@@ -56,7 +56,9 @@ def judge_at_best(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapp
             if point.role == POINT and not point.scope and table is not None and LOSS in table.metrics:
                 there[point.x][point.trial.train.seed][point.trial.train.steps] = table
         for x, seeds in sorted(there.items()):
-            several = {s: tables for s, tables in sorted(seeds.items()) if len(tables) > 1 and _halved(tables, sweep.scope)}
+            several = {
+                s: tables for s, tables in sorted(seeds.items()) if len(tables) > 1 and _halved(tables, sweep.scope)
+            }
             if several:
                 found += _judge(sweep, x, several)
     return found

@@ -42,9 +42,7 @@ class Change:
     episodes: int
 
 
-def find_changes(
-    sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]
-) -> list[Change]:
+def find_changes(sweeps: Sequence[Sweep], provenance: Provenance, windows: Mapping[str, WindowTable]) -> list[Change]:
     """Of every curve over a number, between its outermost points that are finished. Raises NotComparable."""
     found = []
     for sweep in (s for s in sweeps if s.measured):

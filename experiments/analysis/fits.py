@@ -110,9 +110,7 @@ def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: b
     if not refused:
         doubts += tuple(f"{c.name} may be anything between {c.low:.2g} and {c.high:.2g}" for c in wide)
         doubts += _inferred(measured) + _misfit(measured, residuals) + _first_position(measured, found, weight)
-    return PowerFit(
-        measured.axes, measured.trial, refused, doubts, found, residuals, noise, theta, thetas, centre
-    )
+    return PowerFit(measured.axes, measured.trial, refused, doubts, found, residuals, noise, theta, thetas, centre)
 
 
 def weight_of(noise: np.ndarray) -> np.ndarray:
@@ -132,7 +130,9 @@ def _unfit(measured: Measured) -> str:
             return f"{name} has to be positive, got {distinct.min():g}"
     positions, least = len(np.unique(measured.points)), LEAST + 2 * (len(measured.axes) - 1)
     if positions < least:
-        return f"{positions} positions; the form over {' and '.join(measured.axes)} has to be told from at least {least}"
+        return (
+            f"{positions} positions; the form over {' and '.join(measured.axes)} has to be told from at least {least}"
+        )
     if not any(_lines(measured, k) for k in range(len(measured.axes))):
         return f"no two trials differ in {' or in '.join(measured.axes)} alone: what each does cannot be told apart"
     if not (measured.value > 0).all():
@@ -172,11 +172,14 @@ def _rising(measured: Measured) -> str:
 def _inferred(measured: Measured) -> tuple[str, ...]:
     """Axes along which no trials were compared: that the loss falls there follows from the form."""
     alone = [name for k, name in enumerate(measured.axes) if not _lines(measured, k)]
-    return tuple(f"no two trials differ in {name} alone: what it does is told by the form, not compared" for name in alone)
+    return tuple(
+        f"no two trials differ in {name} alone: what it does is told by the form, not compared" for name in alone
+    )
 
 
 def _coefficients(theta: np.ndarray, thetas: np.ndarray, centre: np.ndarray) -> tuple[Coefficient, ...]:
     """In units of x: A = A at the centre times exp(alpha centre)."""
+
     def named(t: np.ndarray) -> dict[str, np.ndarray]:
         found = {"E": np.exp(t[..., 0])}
         for k, (scale, exponent) in enumerate(NAMES[: len(centre)]):

@@ -55,9 +55,7 @@ class IsoFlop:
     refused: str = ""
 
 
-def fit_isoflop(
-    measured: Measured, budgets: np.ndarray | None = None, draws: int = DRAWS, seed: int = 0
-) -> IsoFlop:
+def fit_isoflop(measured: Measured, budgets: np.ndarray | None = None, draws: int = DRAWS, seed: int = 0) -> IsoFlop:
     """Of losses over (size N, training FLOPs C). Without `budgets`, BUDGETS of them, evenly spread in log C over
     where at least LEAST_SIZES sizes were measured."""
     sizes = np.unique(measured.x[:, 0])

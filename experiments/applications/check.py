@@ -57,7 +57,10 @@ def choose_robots(
     there = [r.name for r in find_robots(run, model.table) if r.name in frozen]
     names = list(robots) or there
     unknown = [name for name in names if name not in there]
-    require(bool(names) and not unknown, f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}")
+    require(
+        bool(names) and not unknown,
+        f"no windows of {', '.join(unknown) or 'any robot'} here; there are {', '.join(there)}",
+    )
     why = {name: short for name in names if (short := shortage(store, manifest, name, windows, out))}
     left = [name for name in names if name not in why]
     others = f". Nor are there enough of {few(names[1:])}" if len(names) > 1 else ""
@@ -76,7 +79,9 @@ def check_run(
     """Effects of each robot's dimensions, on so many held-out windows of each."""
     known = {r.name: r for r in find_robots(run, model.table)}
     loss = jax.jit(make_loss(model.config, model.table, model.execution))
-    return {name: _check(model, loss, materials.store, materials.manifest, known[name], windows, spoil) for name in robots}
+    return {
+        name: _check(model, loss, materials.store, materials.manifest, known[name], windows, spoil) for name in robots
+    }
 
 
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
@@ -137,7 +142,13 @@ def _hold_out_more(settings: JobSettings, episodes: int) -> str:
 
 
 def _check(
-    model: Model, loss: Callable[..., jax.Array], store: TokenStore, manifest: EvalManifest, robot: Robot, windows: int, spoil: Spoil
+    model: Model,
+    loss: Callable[..., jax.Array],
+    store: TokenStore,
+    manifest: EvalManifest,
+    robot: Robot,
+    windows: int,
+    spoil: Spoil,
 ) -> list[Effect]:
     chosen = [replace(d, windows=spread(d.windows, windows)) for d in manifest.datasets]
     batches = list(eval_batches(store, model.table, replace(manifest, datasets=tuple(chosen)), BATCH, (robot.name,)))
@@ -174,7 +185,10 @@ def verdict(effect: Effect, names: Sequence[str]) -> str:
 def write_effects(path: Path, found: dict[str, list[Effect]], names: dict[str, Sequence[str]]) -> None:
     """As JSON: per robot and dimension the verdict and the numbers behind it."""
     rows: dict[str, list[dict[str, Any]]] = {
-        robot: [{"name": names[robot][e.dimension], "verdict": verdict(e, names[robot]), **dataclasses.asdict(e)} for e in effects]
+        robot: [
+            {"name": names[robot][e.dimension], "verdict": verdict(e, names[robot]), **dataclasses.asdict(e)}
+            for e in effects
+        ]
         for robot, effects in found.items()
     }
     write_file(path, json.dumps(rows, indent=1))

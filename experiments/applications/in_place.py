@@ -21,7 +21,15 @@ import numpy as np
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.detector import (
-    CLOSE, SURE, WEIGHTS, Detector, chosen, enlarged, known_robots, make_detector, shown_by,
+    CLOSE,
+    SURE,
+    WEIGHTS,
+    Detector,
+    chosen,
+    enlarged,
+    known_robots,
+    make_detector,
+    shown_by,
 )  # fmt: skip
 from experiments.applications.endurance.tables import Row, over_robots
 from experiments.applications.made_with import claim

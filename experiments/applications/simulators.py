@@ -69,9 +69,7 @@ def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | No
         save_decode(decode, directory / DECODE)
 
 
-def make_simulator(
-    run: Path | str, world: World = "learned", *, episodes: int = 1, **options: Any
-) -> AnySimulator:
+def make_simulator(run: Path | str, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
     """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
 
     Raises ConfigError; for "true" if a robot has no true simulator, or robots are of different ones.
@@ -92,7 +90,10 @@ def true_worlds(robots: Sequence[Robot], **options: Any) -> TrueSimulator:
     """Of robots that are all of the suite, or all of physics simulators. Raises ConfigError for others."""
     physics = bool(robots) and all(robot.name in PHYSICS for robot in robots)
     mixed = not physics and any(robot.name in PHYSICS for robot in robots)
-    require(not mixed, f"robots of the suite and of physics simulators have no common one: {', '.join(r.name for r in robots)}")
+    require(
+        not mixed,
+        f"robots of the suite and of physics simulators have no common one: {', '.join(r.name for r in robots)}",
+    )
     return (PhysicsSimulator if physics else SuiteSimulator)(robots, **options)
 
 
@@ -173,9 +174,7 @@ def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Sta
     `frames` after each: chunks [n, frames, stride, A]. Fewer where the robot's episodes are too short."""
     whole = suite_starts(robot.name, 16 * count, START_FRAMES + frames, stride=robot.stride, seed=1, most=count)
     given = (START_FRAMES - 1) * robot.stride
-    starts = [
-        Start(s.robot, fit_images(s.images[:START_FRAMES], size), s.actions[:given], s.seed) for s in whole
-    ]
+    starts = [Start(s.robot, fit_images(s.images[:START_FRAMES], size), s.actions[:given], s.seed) for s in whole]
     chunks = [s.actions[given : given + frames * robot.stride] for s in whole]
     return starts, np.array(chunks, np.float32).reshape(len(starts), frames, robot.stride, robot.action_dim)
 
@@ -190,7 +189,9 @@ def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int], coun
         frames = None if episode.frames is None else episode.frames[: START_FRAMES * every : every]
         if frames is None or len(frames) < START_FRAMES or frames.shape[1:3] != shape:
             continue
-        starts.append(Start(robot.name, np.array(frames), np.array(episode.actions[: (START_FRAMES - 1) * robot.stride])))
+        starts.append(
+            Start(robot.name, np.array(frames), np.array(episode.actions[: (START_FRAMES - 1) * robot.stride]))
+        )
         if len(starts) == count:
             break
     return starts

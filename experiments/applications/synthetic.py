@@ -109,7 +109,7 @@ def make_data(
         with step(f"record {lessons.settings.trajectories} trajectories"):
             save_demonstrations(lessons.record(), sets["recorded"])
     recorded = load_demonstrations(sets["recorded"])
-    acted = {kind: recorded.actions for kind in kinds} | {"shuffled": others_actions(recorded)}
+    acted = dict.fromkeys(kinds, recorded.actions) | {"shuffled": others_actions(recorded)}
     for kind in kinds[1:]:
         if not sets[kind].exists():
             made_by = blind if kind == BLIND_KIND else simulator
@@ -231,7 +231,9 @@ def find_blind(run: Path, robot: Robot) -> Simulator:
     """The simulator of a model that was trained without actions. Raises ConfigError for another one."""
     blind = load_simulator(run, episodes=BATCH, history=1)
     setting = blind.model.run.train.masking.setting
-    require(setting == "passive", f"{run} was trained with train.masking.setting={setting}, not without actions (passive)")
+    require(
+        setting == "passive", f"{run} was trained with train.masking.setting={setting}, not without actions (passive)"
+    )
     blind.describe([robot])
     return blind
 

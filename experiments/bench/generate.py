@@ -33,6 +33,7 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
     size, batch, weights = config.frames, subject.batch(rows), subject.inference_params
     keys = jax.random.split(jax.random.key(subject.seed), rows)
     past, newest = batch["tokens"][:, :-1], batch["tokens"][:, -2]
+
     def window(model: HMA) -> Window:
         return Window.over(model, batch["actions"], None, batch["embodiment"])
 
@@ -50,9 +51,7 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
         return window_pass(model)
 
     def recompute(params: Any) -> jax.Array:
-        return rollout_naive(
-            declared.merge(params), past, batch["actions"], batch["embodiment"], keys, decode
-        )
+        return rollout_naive(declared.merge(params), past, batch["actions"], batch["embodiment"], keys, decode)
 
     def slide(params: Any) -> jax.Array:
         return steps.slide(window(declared.merge(params)), past, keys, decode)
@@ -64,9 +63,7 @@ def time_frames(subject: Subject, rows: int, decode: DecodeConfig, repeats: int)
         return steps.stream(window(declared.merge(params)), cache, newest, jnp.int32(size), keys, decode)
 
     compiled = {f.__name__: compile_call(f, weights) for f in (whole, plain, recompute, slide)}
-    calls: dict[str, Callable[[], Any]] = {
-        name: lambda c=call: c(weights) for name, call in compiled.items()
-    }
+    calls: dict[str, Callable[[], Any]] = {name: lambda c=call: c(weights) for name, call in compiled.items()}
     for function in (fill, stream):
         call = compile_call(function, weights, cache, donate=(1,))
         compiled[function.__name__] = call

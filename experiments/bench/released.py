@@ -137,9 +137,7 @@ class Released:
         inputs[self.torch.rand(inputs.shape) < 0.5] = model.mask_token_id
         inputs[:, :FRAME] = labels[:, :FRAME]
         side = self.torch.tensor([16] * self.rows)
-        loss = model(
-            input_ids=inputs, labels=labels, action_ids=self.actions, domain=self.robots, h=side, w=side
-        ).loss
+        loss = model(input_ids=inputs, labels=labels, action_ids=self.actions, domain=self.robots, h=side, w=side).loss
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

@@ -22,9 +22,7 @@ def time_rollouts(
     to `frames` frames."""
     weights = subject.inference_params
     ways = {"rollout": False} | ({"recompute": True} if naive else {})
-    compiled = {
-        name: compile_rollout(subject, rows, frames, prompt, decode, naive=way) for name, way in ways.items()
-    }
+    compiled = {name: compile_rollout(subject, rows, frames, prompt, decode, naive=way) for name, way in ways.items()}
     timings = time_by_turns({n: lambda c=c: c(weights) for n, c in compiled.items()}, repeats)
     flops = {
         name: rows * rollout_flops(subject.config, subject.table, decode, frames, prompt, naive=way)

@@ -54,9 +54,7 @@ def time_once(call: Callable[[], Any]) -> tuple[Any, float]:
     return result, time.perf_counter() - began
 
 
-def time_by_turns(
-    calls: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = WARM_UP
-) -> dict[str, Timing]:
+def time_by_turns(calls: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = WARM_UP) -> dict[str, Timing]:
     """Every call once per round, so that a slow spell of the machine hits all of them."""
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(warm_up):
@@ -69,9 +67,7 @@ def time_by_turns(
 
 
 def summarise(seconds: list[float]) -> Timing:
-    return Timing(
-        float(np.median(seconds)), float(np.percentile(seconds, 90)), float(np.min(seconds)), len(seconds)
-    )
+    return Timing(float(np.median(seconds)), float(np.percentile(seconds, 90)), float(np.min(seconds)), len(seconds))
 
 
 def matmul_rate(dtype: str, size: int = 2048) -> float:

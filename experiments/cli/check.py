@@ -16,7 +16,9 @@ from hma_jax.config import require
 
 def check(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
-    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: the directory that RUN is in)")] = None,
+    out: Annotated[
+        Path | None, arg(metavar="DIR", help_behavior_hint="(default: the directory that RUN is in)")
+    ] = None,
     robots: Annotated[tuple[str, ...], arg(metavar="[NAME ...]"), UNSET] = (),
     windows: int = 64,
 ) -> None:
@@ -56,5 +58,7 @@ def check(
         console.print(table)
     write_effects(run / "check.json", found, names)
     if left_out:
-        console.print(f"not checked, for want of episodes: {', '.join(left_out)}; what to do stands above", soft_wrap=True)
+        console.print(
+            f"not checked, for want of episodes: {', '.join(left_out)}; what to do stands above", soft_wrap=True
+        )
     console.print(f"wrote {run / 'check.json'}", soft_wrap=True)

@@ -194,7 +194,10 @@ def _rates(run: Run) -> tuple[str, list[str]]:
             entries.append(to_toml(replace(spec, rate=spec.rate_for(robot.stride))))
     return "\n".join(entries), [
         f"note: not in {RATES}: {', '.join(names)}, {why}; to use one write an entry (docs/own_data.md)"
-        for names, why in ((unknown, "which the registry does not know"), (other, "of other actions than the registry's"))
+        for names, why in (
+            (unknown, "which the registry does not know"),
+            (other, "of other actions than the registry's"),
+        )
         if names
     ]
 

@@ -161,8 +161,7 @@ def check_fits(trained: Run, materials: Materials) -> None:
         )
     if not set(trained.table.names) & {d.dataset for d in manifest.datasets}:
         raise ConfigError(
-            f"the model was trained on {', '.join(trained.table.names)}, of which the study here has no "
-            f"windows{data}"
+            f"the model was trained on {', '.join(trained.table.names)}, of which the study here has no windows{data}"
         )
 
 

@@ -121,9 +121,7 @@ def read_memory(size: str | None) -> float | None:
     return float(found[1]) * {"GiB": 2**30, "GB": 10**9}[found[2]]
 
 
-def _asked(
-    asked: Planned, shape: Shape
-) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
+def _asked(asked: Planned, shape: Shape) -> tuple[str, ModelConfig, EmbodimentTable, TrainConfig, ExecutionConfig]:
     """The model in words, then what its training step is made of: of a study's reference trial, or of a fixed model."""
     if asked.preset is None:
         from experiments.bench.models import make_shape
@@ -153,7 +151,9 @@ def _print_layouts(name: str, made: Plan) -> None:
     from hma_jax.runtime.audit import describe_sharding
 
     sizes = " x ".join(f"{axis} {size}" for axis, size in made.mesh.items())
-    _print_lines(f"{name}: parameters on a mesh of {sizes}, and what one device stores", describe_sharding(made.decisions))
+    _print_lines(
+        f"{name}: parameters on a mesh of {sizes}, and what one device stores", describe_sharding(made.decisions)
+    )
 
 
 def _print_sent(name: str, made: Plan) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from data_pipelines.true_simulator import TrueSimulator
     from hma_jax.simulator.robots import Robot
 
+
 def play(
     run: Annotated[Positional[Path], arg(metavar="RUN")] = DRIVEN,
     host: str = "127.0.0.1",

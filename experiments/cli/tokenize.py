@@ -21,9 +21,7 @@ def tokenize(
     asked: OmitArgPrefixes[StudyArguments],
     remake: OmitArgPrefixes[Remake],
     batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
-    threads: Annotated[
-        int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")
-    ] = None,
+    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")] = None,
 ) -> None:
     """Prepare everything up to training: suite, tokenizer, token store, evaluation windows.
 
@@ -60,9 +58,7 @@ def prepare_together(
     _finish(setting)
 
 
-def _take_part(
-    setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None
-) -> None:
+def _take_part(setting: Setting, busy: Busy, batch: int | None, threads: int | None, replace: Step | None) -> None:
     """Makes no tokenizer and replaces nothing: the process that holds the directory relies on what is there."""
     from experiments.preparing.sources import find_sources, find_suite
     from experiments.preparing.store import make_store

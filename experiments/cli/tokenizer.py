@@ -61,9 +61,7 @@ def import_(
 
 
 @tokenizer_app.command(name="pixels")
-def pixels(
-    out: Path, image_size: Annotated[int, arg(name="image-size")] = 64, patch: int = 8
-) -> None:
+def pixels(out: Path, image_size: Annotated[int, arg(name="image-size")] = 64, patch: int = 8) -> None:
     """Make the tokenizer that is none: a token is a patch of pixels. For -continuous presets.
 
     Args:

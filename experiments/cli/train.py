@@ -206,9 +206,9 @@ def _newest(run: Path) -> tuple[int, dict[str, Any]]:
     from hma_jax.training.reading import CheckpointError, list_steps, read_description
 
     checkpoints = run.absolute() / "checkpoints"
-    for step in reversed(list_steps(checkpoints)):
+    for newest in reversed(list_steps(checkpoints)):
         with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
-            return step, read_description(checkpoints / str(step))
+            return newest, read_description(checkpoints / str(newest))
     return 0, {}
 
 

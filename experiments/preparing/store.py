@@ -57,9 +57,7 @@ def make_store(
             make(i, wait=True)
 
 
-def _differences(
-    study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer
-) -> list[str]:
+def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:
     """How the datasets that are in the store were made otherwise; a line that holds for several is said once."""
     from data_pipelines.errors import DataError
     from data_pipelines.tokens.dataset_writer import differences

@@ -86,9 +86,7 @@ def tokenizer_made_from(study: Study, sources: Sequence[Source]) -> MadeFrom:
     return MadeFrom(inputs, {"code": closure_hash(trace(SOURCES))}, describe_machine())
 
 
-def make_tokenizer(
-    study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None
-) -> None:
+def make_tokenizer(study: Study, workspace: Workspace, sources: Sequence[Source], replace: Step | None = None) -> None:
     """A tokenizer trained on frames of all sources; nothing is done if it is there.
 
     Beside it lies quality.json: its reconstruction PSNR on held-out frames. Raises ConfigError if one is there

@@ -132,9 +132,7 @@ def _differences(there: EvalManifest, wanted: EvalManifest) -> list[str]:
     ]
 
 
-def summarise(
-    store: TokenStore, names: Sequence[str], frames: int, rate: float | None
-) -> dict[str, dict[str, int]]:
+def summarise(store: TokenStore, names: Sequence[str], frames: int, rate: float | None) -> dict[str, dict[str, int]]:
     """Per dataset: training episodes, those too short for a window or for a whole one, windows, episodes held out
     and skipped."""
     from data_pipelines.windows.windows import train_windows

@@ -45,7 +45,7 @@ def describe_clips(path: Path, prompt: int, order: Sequence[str]) -> str:
         f"<p>The first validation window of each robot. Of its frames the first {prompt} are given (grey bar); the "
         "rest is predicted from actions alone: once from those that were recorded, once from others, drawn at random. "
         "Where the model listens, the right clip leaves the left one and the middle one stays with it.</p>"
-        f'<div class=trios>{"".join(figures[:SHOWN])}</div>{more if rest else ""}<div class=paper>{paper}</div>'
+        f"<div class=trios>{''.join(figures[:SHOWN])}</div>{more if rest else ''}<div class=paper>{paper}</div>"
     )
 
 

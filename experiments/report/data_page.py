@@ -118,9 +118,9 @@ def _dataset(i: int, d: Viewed, frames: int) -> list[str]:
     f = d.facts
     sampled = "all" if f.sampled == f.episodes else f"{f.sampled} of {f.episodes:,}"
     where = f"{f.version} · split {f.split} · {sampled} episodes read ({f.bytes_read / 1e6:,.1f} MB) · {f.directory}"
-    remarks = [
-        f"<p class={r.kind}><b>{html.escape(r.title)}</b>: {html.escape(r.text)}.</p>" for r in d.remarks
-    ] or ["<p class=fine>Nothing stands out.</p>"]
+    remarks = [f"<p class={r.kind}><b>{html.escape(r.title)}</b>: {html.escape(r.text)}.</p>" for r in d.remarks] or [
+        "<p class=fine>Nothing stands out.</p>"
+    ]
     return [
         f'<section id="d{i}"><h2>{html.escape(f.name)}</h2><p class=meta>{html.escape(where)}</p>{"".join(remarks)}',
         _read_as(d),

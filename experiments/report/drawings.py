@@ -51,8 +51,7 @@ def curves(rows: np.ndarray, lows: Sequence[float], highs: Sequence[float], name
                 points.append(f"{px:.1f},{py:.1f}")
             elif points:  # a gap where there is no number
                 pieces, points = [*pieces, points], []
-        for points in (*pieces, points):
-            parts.append(f'<polyline points="{" ".join(points)}" />')
+        parts += [f'<polyline points="{" ".join(piece)}" />' for piece in (*pieces, points)]
     return _svg(len(names) * line, parts, "curves")
 
 

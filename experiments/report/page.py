@@ -152,9 +152,7 @@ def _headline(
             card("ΔPSNR, shuffled actions", _at_default(rows, shown.by, "delta_psnr", CONTROL),
                  "dB, must vanish within its error"),
         ]  # fmt: skip
-    cards.append(
-        card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames")
-    )
+    cards.append(card("tokenizer PSNR", _tokenizer_quality(workspace), "dB, reconstruction of held-out frames"))
     when = result["run"]["finished"] if result else "no trial finished"
     unfinished = sum(state.event != FINISHED for state in states.values())
     warning = f'<p class="warning">{unfinished} trial(s) have no result; see the table of trials.</p>'
@@ -285,9 +283,7 @@ def _origin(
         "software": _each([", ".join(f"{k} {v}" for k, v in m.get("packages", {}).items()) for m in machines]),
         "numbers": workspace.results.name,
     }
-    items = "".join(
-        f"<dt>{html.escape(k)}</dt><dd><code>{html.escape(v)}</code></dd>" for k, v in facts.items()
-    )
+    items = "".join(f"<dt>{html.escape(k)}</dt><dd><code>{html.escape(v)}</code></dd>" for k, v in facts.items())
     config = html.escape(to_json(record.study))
     return f"<dl>{items}</dl><details><summary>Configuration</summary><pre>{config}</pre></details>"
 

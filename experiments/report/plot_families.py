@@ -54,9 +54,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     return figure
 
 
-def _draw(
-    panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]
-) -> None:
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str, series: Sequence[str]) -> None:
     scope, label = (DRAWN if sweep.base else CURVES)[metric]
     xs = sorted({r.x for r in rows if r.sweep == sweep.name})
     for i, name in enumerate(series):

@@ -45,10 +45,7 @@ def describe(sweep: Sweep, rows: Sequence[Row], optima: Sequence[Optimum], along
     else:
         numbers = _curve(sweep, rows, along.changes) + _growth(sweep, along.growth)
     heading = f"<h3>{html.escape(sweep.name.capitalize())}</h3>" if sweep.scaling else ""
-    return (
-        f"{heading}<p>{html.escape(sweep.question)} "
-        f"Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
-    )
+    return f"{heading}<p>{html.escape(sweep.question)} Averaged over {len(sweep.scope)} dataset(s).</p>{numbers}"
 
 
 def _at_best(sweep: Sweep, rows: Sequence[AtBest]) -> str:
@@ -67,11 +64,15 @@ def _at_best(sweep: Sweep, rows: Sequence[AtBest]) -> str:
         chosen = any_of.chosen + (" (an end of what was tried)" if any_of.edge else "")
         lines.append([f"{x:,}", *cells, str(any_of.seeds), chosen])
     head = [sweep.axis, *(CHANGED[m] for m in metrics), "seeds", "steps chosen, and how often"]
-    return "<h4>At the number of steps that suits each point</h4>" + table(head, lines) + (
-        "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other, both ways: the "
-        "lowest of several losses on the windows that judge it would flatter a point. Where an end of what was tried "
-        "was chosen, other steps may suit the point better still. Intervals of 95 % are over seeds "
-        "and episodes.</p>"
+    return (
+        "<h4>At the number of steps that suits each point</h4>"
+        + table(head, lines)
+        + (
+            "<p>Steps are chosen by the loss on one half of every robot's episodes and judged on the other, both ways: the "
+            "lowest of several losses on the windows that judge it would flatter a point. Where an end of what was tried "
+            "was chosen, other steps may suit the point better still. Intervals of 95 % are over seeds "
+            "and episodes.</p>"
+        )
     )
 
 
@@ -91,9 +92,13 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
         whose = f"{any_of.robots} with more" if data == GROWS else f"{any_of.robots} without"
         lines.append([html.escape(series), f"{first:,} to {last:,}", whose, *cells, str(any_of.seeds)])
     head = ["curve", sweep.axis, "robots", *(CHANGED[m] for m in metrics), "seeds"]
-    return "<h4>Robots whose data grows, and others</h4>" + table(head, lines, text=3) + (
-        "<p>From each point to the next, window by window, of robots that get more trajectories there and of those "
-        "that have no more to give. Intervals of 95 % are over episodes, and over seeds where there are several.</p>"
+    return (
+        "<h4>Robots whose data grows, and others</h4>"
+        + table(head, lines, text=3)
+        + (
+            "<p>From each point to the next, window by window, of robots that get more trajectories there and of those "
+            "that have no more to give. Intervals of 95 % are over episodes, and over seeds where there are several.</p>"
+        )
     )
 
 
@@ -199,14 +204,18 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
     ]
     kind = "width" if sweep.name == "lr" else "curve"
     head = ["", "curve", "loss", "best rate", "as good", "steps moved", "lowest", f"base {kind}'s best rate", "penalty"]
-    return f"<p>{_transfer(optima, kind)}</p>" + table(head, lines, text=3) + (
-        f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the "
-        f"loss is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the "
-        "held-out loss is in nats per token; where there are several seeds, both rates are chosen by the others and "
-        "judged on the one left out. Errors are over seeds; the grid is not interpolated. <em>As good</em>: rates that "
-        "seeds do not tell from the best (95 %, paired). "
-        "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
-        "beyond.</p>"
+    return (
+        f"<p>{_transfer(optima, kind)}</p>"
+        + table(head, lines, text=3)
+        + (
+            f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the "
+            f"loss is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the "
+            "held-out loss is in nats per token; where there are several seeds, both rates are chosen by the others and "
+            "judged on the one left out. Errors are over seeds; the grid is not interpolated. <em>As good</em>: rates that "
+            "seeds do not tell from the best (95 %, paired). "
+            "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
+            "beyond.</p>"
+        )
     )
 
 

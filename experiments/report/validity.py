@@ -56,7 +56,7 @@ def draw_box(checks: Sequence[Check]) -> str:
     counted += [f"{bad} {'does' if bad == 1 else 'do'} not"] * bool(bad)
     counted += [f"{unknown} cannot be checked"] * bool(unknown)
     lines = "".join(
-        f'<li class={c.verdict}><span class=mark>{MARKS[c.verdict]}</span><div><b>{html.escape(c.name)}</b> '
+        f"<li class={c.verdict}><span class=mark>{MARKS[c.verdict]}</span><div><b>{html.escape(c.name)}</b> "
         f"{html.escape(c.text)}</div></li>"
         for c in checks
     )
@@ -132,7 +132,9 @@ def _follows(result: Mapping[str, Any], windows: WindowTable, group: int) -> boo
     """Whether the means of a result, and their errors, are those of the windows."""
     said, found = Summary.from_dict(result["evaluation"]).datasets, summarise(windows, group).datasets
     return said.keys() == found.keys() and all(
-        metric in found[robot] and _close(stat.mean, found[robot][metric].mean) and _close(stat.sem, found[robot][metric].sem)
+        metric in found[robot]
+        and _close(stat.mean, found[robot][metric].mean)
+        and _close(stat.sem, found[robot][metric].sem)
         for robot, stats in said.items()
         for metric, stat in stats.items()
     )
@@ -202,7 +204,9 @@ def _controls(rows: Sequence[Row], metric: str) -> Check:
     known = [r for id, r in controls.items() if id not in unknown]
     far = max((abs(_errors(r.mean, r.sem)) for r in known), default=0.0)
     if unknown and far <= EACH:
-        text = f"Of {len(unknown)} of {len(controls)} controls nobody knows the error: one episode per robot tells none."
+        text = (
+            f"Of {len(unknown)} of {len(controls)} controls nobody knows the error: one episode per robot tells none."
+        )
         return Check(name, "open", text)
     mean = sum(r.mean for r in known) / len(known)
     sem = math.sqrt(sum(r.sem**2 for r in known)) / len(known)

@@ -141,15 +141,15 @@ class _Run:
         self.waiting = [entry for entry in self.waiting if entry not in chosen]
         directories = [self._make_ready(job, state) for job, state in chosen]
         now = time.monotonic()
-        for (job, state), directory, handle in zip(
-            chosen, directories, self.launcher.launch(directories), strict=True
-        ):
+        for (job, state), directory, handle in zip(chosen, directories, self.launcher.launch(directories), strict=True):
             self.running.append(_Attempt(job, directory, handle, now))
             self.monitor.launched(job, resumed=state in (LOST, PREEMPTED))
 
     def _ready(self) -> list[tuple[Job, str]]:
         """Those of `waiting` that wait for no other trial."""
-        pending = {job.id for job, _ in self.waiting} | {a.job.id for a in self.running} | {j.id for j in self.elsewhere}
+        pending = (
+            {job.id for job, _ in self.waiting} | {a.job.id for a in self.running} | {j.id for j in self.elsewhere}
+        )
         return [(job, state) for job, state in self.waiting if not job.after & pending]
 
     def _make_ready(self, job: Job, state: str) -> Path:

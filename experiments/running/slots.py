@@ -130,6 +130,4 @@ def cut(slots: int, accelerators: Accelerators | None, cores: Sequence[int]) -> 
     each = len(names) // slots
     if kind == "tpu":
         each = max(n for n in CHIP_BOUNDS if n <= each)
-    return [
-        Slot(share, Accelerators(kind, names[i * each : (i + 1) * each])) for i, share in enumerate(shares)
-    ]
+    return [Slot(share, Accelerators(kind, names[i * each : (i + 1) * each])) for i, share in enumerate(shares)]

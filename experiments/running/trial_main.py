@@ -47,8 +47,8 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
     from experiments.running.ledger import DIVERGED, FAILED
     from experiments.running.newcomers import begin_from_trial
     from experiments.running.provenance import inputs_of, record_start
-    from experiments.running.shared_runs import begin_shared
     from experiments.running.run_trial import run_trial
+    from experiments.running.shared_runs import begin_shared
     from experiments.running.trial import trial_id
     from experiments.running.workspace import Workspace
     from hma_jax.config import ConfigError

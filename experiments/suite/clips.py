@@ -71,7 +71,9 @@ def main() -> None:
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     shares, page = read_table(), [HEAD]
-    families = {s.family: [t for t in EMBODIMENTS if t.family == s.family] for s in sorted(EMBODIMENTS, key=lambda s: s in NEW)}
+    families = {
+        s.family: [t for t in EMBODIMENTS if t.family == s.family] for s in sorted(EMBODIMENTS, key=lambda s: s in NEW)
+    }
     cell = 64 * ZOOM + 2
     sheet = Image.new("RGB", (5 * (STILLS * cell + GAP), len(families) * (cell + TITLE + GAP)), "white")
     pen = ImageDraw.Draw(sheet)

@@ -66,7 +66,9 @@ def main() -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["robot", "psnr", "psnr_changed", "changed"])
         writer.writerows([name, *(f"{value:.3f}" for value in values)] for name, *values in rows)
-    print(f"{rows[-1][1]:.2f} dB on held-out frames, {rows[-1][2]:.2f} dB on the {rows[-1][3]:.0%} of pixels that change")
+    print(
+        f"{rows[-1][1]:.2f} dB on held-out frames, {rows[-1][2]:.2f} dB on the {rows[-1][3]:.0%} of pixels that change"
+    )
 
 
 if __name__ == "__main__":

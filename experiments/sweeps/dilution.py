@@ -23,7 +23,7 @@ def plan(study: Study) -> Sweep:
         study,
         name="dilution",
         axis="robots in the mixture, total windows fixed",
-        steps={count: steps for count in study.designs.counts},
+        steps=dict.fromkeys(study.designs.counts, steps),
         question="What do robots lose when others share their training? Judged are "
         f"{study.designs.judged} robots, drawn anew for every seed; every point sees the same number of windows in all, "
         "so that they see fewer as others join.",

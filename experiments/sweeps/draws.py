@@ -25,7 +25,9 @@ def draw_judged(study: Study, seed: int, count: int | None = None) -> tuple[str,
             continue
         found.append(name)
     wanted = study.designs.judged if count is None else count
-    require(len(found) >= wanted, f"{wanted} robots are to be judged, each of another family; {len(found)} can be drawn")
+    require(
+        len(found) >= wanted, f"{wanted} robots are to be judged, each of another family; {len(found)} can be drawn"
+    )
     return _in_order(names, found[:wanted])
 
 

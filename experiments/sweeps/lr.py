@@ -52,9 +52,7 @@ def plan(study: Study) -> Sweep:
         model = replace(whole.model, width=width, mup=mup[POINT if width == base else role])
         optimizer = replace(whole.train.optimizer, learning_rate=rate)
         train = replace(whole.train, steps=grid.steps or whole.train.steps, optimizer=optimizer)
-        return replace(
-            whole, datasets=names, evaluated=names, model=model, train=train, measure_untrained=False
-        )
+        return replace(whole, datasets=names, evaluated=names, model=model, train=train, measure_untrained=False)
 
     points = tuple(
         Point(rate, trial(role, width, rate, seed), role, f"width {width}")

@@ -49,9 +49,7 @@ def join_axes(study: Study, root: Path, before: Sequence[str], axes: Sequence[st
     an axis takes the place of another one only if it has its name, whatever their files are called."""
     had = [str(root / axis) if is_file(axis) else axis for axis in before]
     return {
-        sweep.name: axis
-        for some in (had, axes)
-        for axis, sweep in zip(some, plan_sweeps(study, some), strict=True)
+        sweep.name: axis for some in (had, axes) for axis, sweep in zip(some, plan_sweeps(study, some), strict=True)
     }
 
 

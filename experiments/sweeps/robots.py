@@ -35,9 +35,7 @@ def robots_trial(study: Study, seed: int, count: int, steps: int, kinship: Kinsh
     return replace(reference, datasets=mixture, evaluated=draw_judged(study, seed))
 
 
-def plan_robots(
-    study: Study, name: str, axis: str, steps: dict[int, int], *, question: str, gain: str
-) -> Sweep:
+def plan_robots(study: Study, name: str, axis: str, steps: dict[int, int], *, question: str, gain: str) -> Sweep:
     """The sweep over numbers of robots, each trained for its `steps`, with controls at both ends."""
     counts = tuple(steps)
     require(

@@ -38,8 +38,7 @@ def plan(study: Study) -> Sweep:
     default = study.train.masking.setting
     require(
         default in NAMES,
-        f"train.masking.setting is {default!r}, which predicts no frames to judge; use one of "
-        f"{', '.join(NAMES)}",
+        f"train.masking.setting is {default!r}, which predicts no frames to judge; use one of {', '.join(NAMES)}",
     )
     released = replace(study.train, masking=replace(study.train.masking, teacher_forcing=False))
     return make_ablation(

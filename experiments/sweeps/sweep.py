@@ -225,9 +225,7 @@ def titles(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
                 add(source, "")
     # An axis may vary what no trial's own title says.
     alike = {line for line, count in Counter(lines.values()).items() if count > 1}
-    return {
-        id: f"{line} · {places[id]}" if line in alike and id in places else line for id, line in lines.items()
-    }
+    return {id: f"{line} · {places[id]}" if line in alike and id in places else line for id, line in lines.items()}
 
 
 def all_steps(sweeps: Sequence[Sweep]) -> str:

@@ -45,9 +45,7 @@ def from_dict(cls: type, values: dict[str, Any], where: str = "") -> Any:
     missing = [
         n
         for n, f in known.items()
-        if n not in values
-        and f.default is dataclasses.MISSING
-        and f.default_factory is dataclasses.MISSING
+        if n not in values and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
     ]
     require(not missing, f"{where}: missing field(s) {', '.join(missing)}")
     return cls(**{n: _decode(hints[n], v, f"{where}.{n}") for n, v in values.items()})
@@ -139,7 +137,9 @@ def diff(old: Any, new: Any, path: str = "") -> list[str]:
 
 def _by_name(value: Any) -> dict[str, Any]:
     """A list of objects that all have names of their own, by these; nothing for anything else."""
-    if not isinstance(value, list) or not all(isinstance(one, dict) and isinstance(one.get("name"), str) for one in value):
+    if not isinstance(value, list) or not all(
+        isinstance(one, dict) and isinstance(one.get("name"), str) for one in value
+    ):
         return {}
     named = {one["name"]: one for one in value}
     return named if len(named) == len(value) else {}

@@ -117,7 +117,9 @@ class TokenizerTrainConfig:
         )
         require(self.warmup_steps >= 0, "tokenizer training: warmup_steps must not be negative")
         require(self.clip_norm > 0, "tokenizer training: clip_norm must be positive")
-        require(self.weight_decay >= 0, f"tokenizer training: weight_decay must not be negative, got {self.weight_decay}")
+        require(
+            self.weight_decay >= 0, f"tokenizer training: weight_decay must not be negative, got {self.weight_decay}"
+        )
         require(
             0 <= self.final_fraction <= 1,
             f"tokenizer training: final_fraction must lie in [0, 1], got {self.final_fraction}",

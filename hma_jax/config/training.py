@@ -186,6 +186,4 @@ def check_objective(model: ModelConfig, masking: MaskingConfig) -> None:
 
 def check_micro_batches(batch: int, accumulate: int) -> None:
     """Raises ConfigError for a batch that does not split into so many micro-batches."""
-    require(
-        batch % accumulate == 0, f"train.batch {batch} is not a multiple of execution.accumulate {accumulate}"
-    )
+    require(batch % accumulate == 0, f"train.batch {batch} is not a multiple of execution.accumulate {accumulate}")

@@ -30,8 +30,7 @@ DESCRIPTION, WEIGHTS = "model.json", "model.safetensors"
 
 def describe_tensors(leaves: Mapping[str, ParamSpec]) -> dict[str, dict[str, Any]]:
     return {
-        path: {"shape": list(spec.shape), "axes": list(spec.axes), "role": spec.role}
-        for path, spec in leaves.items()
+        path: {"shape": list(spec.shape), "axes": list(spec.axes), "role": spec.role} for path, spec in leaves.items()
     }
 
 
@@ -57,9 +56,7 @@ def read_neutral(directory: Path) -> Run:
     try:
         description = json.loads(path.read_text())
     except OSError as error:
-        raise ConfigError(
-            f"no {path} ({error.strerror}); give a directory with {DESCRIPTION} and {WEIGHTS}"
-        ) from error
+        raise ConfigError(f"no {path} ({error.strerror}); give a directory with {DESCRIPTION} and {WEIGHTS}") from error
     except ValueError as error:
         raise ConfigError(f"{path} is not JSON: {error}") from error
     fields = {"format", "version", "step", "model", "train", "table", "provenance", "tensors"}

@@ -51,7 +51,7 @@ def official_shapes(model: ModelConfig, table: EmbodimentTable) -> dict[str, tup
     parts = official_parts(model, table, declare_model(model, table).leaves())
     shapes = {part.name: part.shape for own in parts.values() for part in own}
     for entry in table.entries:
-        shapes |= {name: (entry.action_dim,) for name in _statistics(entry.name)}
+        shapes |= dict.fromkeys(_statistics(entry.name), (entry.action_dim,))
     return shapes
 
 
@@ -103,9 +103,7 @@ def read_config(directory: Path) -> dict[str, Any]:
     try:
         config = json.loads(path.read_text())
     except OSError as error:
-        raise ConfigError(
-            f"no {path} ({error.strerror}); give a directory with {CONFIG} and {WEIGHTS}"
-        ) from error
+        raise ConfigError(f"no {path} ({error.strerror}); give a directory with {CONFIG} and {WEIGHTS}") from error
     except ValueError as error:
         raise ConfigError(f"{path} is not JSON: {error}") from error
     require(isinstance(config, dict), f"{path}: expected named fields, got {type(config).__name__}")
@@ -171,9 +169,7 @@ def official_tensors(run: Run) -> tuple[dict[str, np.ndarray], list[str]]:
     leaves = declare_model(form, run.table).leaves()
     arrays = flat(run.params)
     if not run.model.action_heads:
-        arrays |= {
-            path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays
-        }
+        arrays |= {path: np.zeros(spec.shape, np.float32) for path, spec in leaves.items() if path not in arrays}
         remarks.append("the release has action heads, this model has none: they are written as zeros")
     if not _untouched(run):
         arrays |= _without_constants(arrays, run.table)

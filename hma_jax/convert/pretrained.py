@@ -119,9 +119,7 @@ def tokenizer_shapes(source: Source, declared: Declared) -> dict[str, tuple[int,
     return {source.official_name(path): official_shape(spec) for path, spec in declared.leaves().items()}
 
 
-def tokenizer_params(
-    source: Source, declared: Declared, tensors: Mapping[str, Stored], where: str
-) -> Params:
+def tokenizer_params(source: Source, declared: Declared, tensors: Mapping[str, Stored], where: str) -> Params:
     """Our parameters, float32. Raises ConfigError naming tensors that are missing, too many, of another
     shape or no floats."""
     check_names(tokenizer_shapes(source, declared), {n: t.shape for n, t in tensors.items()}, where)
@@ -139,9 +137,7 @@ def tokenizer_params(
 # --- Files -----------------------------------------------------------------------------------
 
 
-def read_magvit2(
-    path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtype = "float32"
-) -> Magvit2Tokenizer:
+def read_magvit2(path: Path, *, image_size: ImageSize = 256, compute_dtype: Dtype = "float32") -> Magvit2Tokenizer:
     """From `magvit2.ckpt`, a safetensors file, or a directory of either with config.json.
 
     `image_size` has to suit the number of levels: any multiple of 2^(levels - 1), 16 for the published one.

@@ -41,9 +41,7 @@ def require_official(model: ModelConfig, table: EmbodimentTable) -> None:
     """Raises ConfigError for a model that the release cannot compute."""
     reasons = []
     if model.action_alignment != "released":
-        reasons.append(
-            f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only"
-        )
+        reasons.append(f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only")
     if model.conditioning == "cross_attention":
         reasons.append("model.conditioning is 'cross_attention', which the release computes otherwise")
     if model.recall:

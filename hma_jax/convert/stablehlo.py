@@ -58,9 +58,7 @@ class ProgramConfig:
         )
 
 
-def generate_function(
-    model: ModelConfig, table: EmbodimentTable, config: ProgramConfig
-) -> Callable[..., jax.Array]:
+def generate_function(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> Callable[..., jax.Array]:
     """generate(weights, prompt, actions, embodiment, key) -> frames prompt .. frames - 1.
 
     weights: path -> array. prompt int32 [B, T', S] or float32 [B, T', S, C]; actions float32
@@ -79,9 +77,7 @@ def generate_function(
     return generate
 
 
-def input_shapes(
-    model: ModelConfig, table: EmbodimentTable, config: ProgramConfig
-) -> dict[str, jax.ShapeDtypeStruct]:
+def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> dict[str, jax.ShapeDtypeStruct]:
     """The inputs after the weights, in order."""
     b, channels = config.batch, (model.diffusion.token_channels,) if model.diffusion else ()
     kind = jnp.float32 if model.diffusion else jnp.int32
@@ -129,8 +125,7 @@ def _describe(
         return {"shape": list(x.shape), "dtype": x.dtype.name}
 
     order = [
-        {"name": f"weights/{name}", "shape": t["shape"], "dtype": "float32"}
-        for name, t in sorted(tensors.items())
+        {"name": f"weights/{name}", "shape": t["shape"], "dtype": "float32"} for name, t in sorted(tensors.items())
     ]
     order += [{"name": name, **of_array(x), "meaning": MEANINGS[name]} for name, x in inputs.items()]
     if [tuple(i["shape"]) for i in order] != [a.shape for a in exported.in_avals]:

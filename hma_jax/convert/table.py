@@ -174,9 +174,7 @@ def parts_of(entry: Entry, spec: ParamSpec, table: EmbodimentTable) -> Iterator[
         where = dict(zip(stacked, index, strict=True))
         robot = table.entries[where[EMBODIMENT_AXIS]] if EMBODIMENT_AXIS in where else None
         own = [robot.chunk if axis == "U" else size for axis, size in zip(axes, shape, strict=True)]
-        name = entry.official.format(
-            layer=where.get(LAYER_AXIS), factor=where.get("Q"), robot=robot and robot.name
-        )
+        name = entry.official.format(layer=where.get(LAYER_AXIS), factor=where.get("Q"), robot=robot and robot.name)
         names = entry.pattern.split(" -> ")[0].split()
         sizes = dict(zip(names, own, strict=True))
         yield Part(name, (*index, *(slice(size) for size in own)), sizes, entry.pattern)
@@ -231,9 +229,7 @@ def check_names(
         if names
     ]
     if lines:
-        raise ConfigError(
-            f"{where}: the tensors are not those that the description asks for:" + "".join(lines)
-        )
+        raise ConfigError(f"{where}: the tensors are not those that the description asks for:" + "".join(lines))
 
 
 def flat(params: Params) -> dict[str, np.ndarray]:

@@ -55,9 +55,7 @@ def read_safetensors(path: Path) -> dict[str, Stored]:
         raise ConfigError(f"{path}: no readable safetensors file ({error}); fetch it again") from error
 
 
-def write_safetensors(
-    path: Path, tensors: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None
-) -> None:
+def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None) -> None:
     """Writes contiguous copies where needed; the values' bytes are kept."""
     dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
     # safetensors puts a file in the place of ours that its owner alone may read: it gets the mode that the umask gave.

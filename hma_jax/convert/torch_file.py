@@ -146,9 +146,7 @@ def read_torch(path: Path, within: str | None = None) -> dict[str, Stored]:
             require(len(pickles) == 1, f"{path} is a zip file without a torch state dict{advice}")
             root = pickles[0].removesuffix("data.pkl")
             if f"{root}byteorder" in archive.namelist():
-                require(
-                    archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little"
-                )
+                require(archive.read(f"{root}byteorder") == b"little", f"{path}: its byte order is not little")
             state = _Reader(path, archive, root, whole=within is not None).load()
     except _Refused:
         raise

@@ -95,9 +95,7 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     model.trunk = _WatchedTrunk(model, note)
     hidden = model.align_hidden(masked.hidden_T, masked.hidden_T.shape)
     embodiment_B = batch["embodiment"]
-    out = model(
-        masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden
-    )
+    out = model(masked.inputs, masked.masked, model.align(batch["actions"]), embodiment_B, hidden_BT=hidden)
     diffusion = model.config.diffusion
     if diffusion:
         note("conditions", out.said)
@@ -129,9 +127,7 @@ def measure(
     the order width, seed, step. `compiler_options` are `jax.jit`'s: for tiny models compiling takes
     nearly all the time.
     """
-    mask = jax.jit(
-        lambda key: mask_batch(key, batch["tokens"], batch["embodiment"], model, train.masking, table)
-    )
+    mask = jax.jit(lambda key: mask_batch(key, batch["tokens"], batch["embodiment"], model, train.masking, table))
     masked = mask(jax.random.key(train.seed))
     rows = []
     for width in widths:

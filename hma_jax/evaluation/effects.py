@@ -136,7 +136,7 @@ def find_effects(judge: Judge, actions: np.ndarray, mean: np.ndarray, episode: S
             break
         best = min(tried, key=lambda change: float(tried[change].mean()))
         gain = _clustered(tried[best] - losses, episode)
-        found |= {d: (best, gain) for d in best.concerns}
+        found |= dict.fromkeys(best.concerns, (best, gain))
         actions, losses = best(actions, mean), tried[best]
     worth = [_clustered(judge(Change(d, "still")(actions, mean)) - losses, episode) for d in range(count)]
     return [Effect(d, worth[d], *found.get(d, (None, None))) for d in range(count)]

@@ -103,8 +103,7 @@ def make_predictor(
     """
     require(
         config.first_predicted < model.frames,
-        f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of "
-        f"{model.frames} frames",
+        f"eval.prompt_frames {config.prompt_frames} leaves nothing to predict in a window of {model.frames} frames",
     )
     declared = declare_model(model, table, execution)
 

@@ -48,9 +48,7 @@ class Window(NamedTuple):
     embodiment_B: jax.Array
 
     @classmethod
-    def over(
-        cls, model: HMA, chunks_BTU: jax.Array, hidden_BT: jax.Array | None, embodiment_B: jax.Array
-    ) -> Window:
+    def over(cls, model: HMA, chunks_BTU: jax.Array, hidden_BT: jax.Array | None, embodiment_B: jax.Array) -> Window:
         """From recorded chunks and which of them the model is not shown (None: it sees all)."""
         shape = chunks_BTU.shape[:2]
         return cls(model, model.align(chunks_BTU), model.align_hidden(hidden_BT, shape), embodiment_B)

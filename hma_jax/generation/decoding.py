@@ -153,6 +153,4 @@ def denoise(model: HMA, z: jax.Array, key_B: jax.Array, decode: DecodeConfig) ->
 def commit(frame: Frame, chosen_Bn: jax.Array, values_BnC: jax.Array) -> Frame:
     """`values` written into the chosen tokens, which are known from now on."""
     row = jnp.arange(len(chosen_Bn))[:, None]
-    return Frame(
-        frame.values.at[row, chosen_Bn].set(values_BnC), frame.masked.at[row, chosen_Bn].set(False)
-    )
+    return Frame(frame.values.at[row, chosen_Bn].set(values_BnC), frame.masked.at[row, chosen_Bn].set(False))

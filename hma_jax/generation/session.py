@@ -99,9 +99,7 @@ def advance(
     else:
         cache, frame = within_the_window() if phase == "filling" else past_the_window()
     full = t >= room  # then the oldest frame makes place
-    frames, chunks, hidden = (
-        jnp.where(full, jnp.roll(x, -1, axis=1), x) for x in (session.frames, chunks, hidden)
-    )
+    frames, chunks, hidden = (jnp.where(full, jnp.roll(x, -1, axis=1), x) for x in (session.frames, chunks, hidden))
     frames = _written(frames, frame[:, None], jnp.minimum(t, room - 1))
     return Session(cache, frames, chunks, hidden, session.embodiment_B, t + 1), frame
 

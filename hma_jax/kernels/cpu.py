@@ -83,9 +83,7 @@ def _attend(scale: float, qkv: jax.Array) -> tuple[jax.Array, jax.Array]:
     return y.astype(v.dtype), (highest + jnp.log(total))[..., 0]
 
 
-def _attend_backward(
-    scale: float, qkv: jax.Array, dy: jax.Array, log_sum: jax.Array, delta: jax.Array
-) -> jax.Array:
+def _attend_backward(scale: float, qkv: jax.Array, dy: jax.Array, log_sum: jax.Array, delta: jax.Array) -> jax.Array:
     """dqkv [H, 3, P, I]. Rows of the weights are keys here: then one product of three is of a transposed
     matrix, not two."""
     q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
@@ -104,9 +102,7 @@ def over_cache(qkv: jax.Array, keys: jax.Array, values: jax.Array, visible: jax.
     if qkv.shape[1] > FEW:
         return plain.over_cache(qkv, keys, values, visible, scale)
     q, k, v = plain.split(qkv)
-    each = [
-        _one_frame(q[:, t], (keys, k), (values, v), visible[t], scale) for t in range(qkv.shape[1])
-    ]
+    each = [_one_frame(q[:, t], (keys, k), (values, v), visible[t], scale) for t in range(qkv.shape[1])]
     return jnp.stack(each, axis=1)
 
 

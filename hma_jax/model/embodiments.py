@@ -59,7 +59,7 @@ class Embodiment:
         )
         require(
             bool(np.isfinite((*self.low, *self.high)).all())
-            and all(b > a or std <= DEAD_STD for a, b, std in zip(self.low, self.high, self.std)),
+            and all(b > a or std <= DEAD_STD for a, b, std in zip(self.low, self.high, self.std, strict=False)),
             f"embodiment {self.name!r}: low must lie below high where actions vary, got {self.low} and {self.high}",
         )
 

@@ -23,9 +23,7 @@ def forward_flops_per_window(config: ModelConfig, table: EmbodimentTable, teache
     return pass_flops(config, table, 2 * said if teacher_forcing else t, t / 2, said) + denoiser
 
 
-def pass_flops(
-    config: ModelConfig, table: EmbodimentTable, frames: int, seen: float, said: int | None = None
-) -> float:
+def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: float, said: int | None = None) -> float:
     """One pass over `frames` frames of one window, up to logits or, with latents, conditions of `said` of them (None:
     all).
 

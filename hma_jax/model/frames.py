@@ -46,9 +46,7 @@ def unpatchify(tokens: jax.Array, patch: int, columns: int) -> jax.Array:
     return x.reshape(*batch, s // columns * patch, columns * patch, c // patch**2)
 
 
-def mask_cells(
-    tokens: jax.Array, masked: jax.Array, vector: jax.Array, config: DiffusionConfig
-) -> jax.Array:
+def mask_cells(tokens: jax.Array, masked: jax.Array, vector: jax.Array, config: DiffusionConfig) -> jax.Array:
     """Tokens [..., S, C] with the learned `vector` [channels] in place of masked cells.
 
     `masked` is bool [..., S] for whole tokens or [..., S, cells].

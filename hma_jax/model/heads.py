@@ -136,9 +136,7 @@ class ActionDenoiser(nnx.Module):
         return jax.vmap(lambda p, *args: nnx.merge(graphdef, p)(*args))(own, x_BTU, time_BT, z_BTD)
 
 
-def make_action_head(
-    config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig
-) -> nnx.Module | None:
+def make_action_head(config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig) -> nnx.Module | None:
     if not config.action_heads:
         return None
     if config.diffusion:

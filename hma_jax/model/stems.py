@@ -35,9 +35,7 @@ class Stem(nnx.Module):
             bound = config.stem_gain * np.sqrt(6 / (chunk_E + input_fan_out(config)))
             return uniform(rng, shape, np.where(own, bound, 0.0))
 
-        self.into = EmbodimentLinear(
-            size, (table.action_width, width), ("U", "D"), init=first_layer, role="input"
-        )
+        self.into = EmbodimentLinear(size, (table.action_width, width), ("U", "D"), init=first_layer, role="input")
         self.gain = param((size, width), ("E", "D"), ones, role="vector")
         self.bias = bias((size, width), ("E", "D"))
         init = hidden_init(config, width, width, config.stem_gain)

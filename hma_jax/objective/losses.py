@@ -71,9 +71,7 @@ def count_targets(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> 
     return TargetCounts(*(jnp.maximum(n, 1) for n in (tokens_counted, jnp.sum(masked.action_targets_T))))
 
 
-def smoothed_cross_entropy(
-    logits: jax.Array, labels: jax.Array, smoothing: float
-) -> tuple[jax.Array, jax.Array]:
+def smoothed_cross_entropy(logits: jax.Array, labels: jax.Array, smoothing: float) -> tuple[jax.Array, jax.Array]:
     """Logits [..., Q, V], labels [..., Q] -> (the loss per position, summed over factors; bool, whether every
     factor's label has its highest logit), both [...].
 

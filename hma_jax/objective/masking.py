@@ -96,9 +96,7 @@ def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> Masking
     return u._replace(noise_TSQ=jnp.floor(u.noise_TSQ * config.factor_vocab).astype(jnp.int32))
 
 
-def corrupt(
-    tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig
-) -> jax.Array:
+def corrupt(tokens_TS: jax.Array, draws: MaskingDraws, config: ModelConfig, masking: MaskingConfig) -> jax.Array:
     """Random-token corruption, and degradation of late frames in prompt mode (reference section 1.9).
 
     In prompt mode (first_masked > 1) frames from there on are degraded, later ones more.
@@ -124,9 +122,7 @@ def min_mask_ratio(frames: int, masking: MaskingConfig) -> np.ndarray:
     return masking.min_ratio + (1.0 - masking.min_ratio) * masking.horizon_gain * rise
 
 
-def mask_tokens(
-    u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array, masking: MaskingConfig
-) -> jax.Array:
+def mask_tokens(u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array, masking: MaskingConfig) -> jax.Array:
     """bool like `u_mask` [T, ...]: a frame's rate is cos(pi/2 u), its mean 2 / pi for u over [0, 1).
 
     Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3). A minimum m

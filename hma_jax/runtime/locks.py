@@ -99,9 +99,7 @@ def exclusive(path: Path, *, lease: bool = False, remove: bool = False) -> Itera
         if not locked and not lease:
             log.warning("%s cannot be locked there; see that no other process works beside it", path)
         since = time.strftime("%Y-%m-%d %H:%M:%S")
-        lock = Lock(
-            path, Holder(os.getpid(), socket.gethostname(), since, machine(), secrets.token_hex(8), locked)
-        )
+        lock = Lock(path, Holder(os.getpid(), socket.gethostname(), since, machine(), secrets.token_hex(8), locked))
         os.ftruncate(fd, 0)
         os.pwrite(fd, json.dumps(asdict(lock.holder)).encode(), 0)
         if lease:

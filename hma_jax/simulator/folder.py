@@ -2,9 +2,11 @@
 
     RUN/checkpoints   the model (`hma_jax.training.runs`)
     RUN/tokenizer     or RUN/../tokenizer, where a study has it
-    RUN/robots.json   optional: ranges and names of the robots' commands, as recorded
-    RUN/starts.npz    optional: beginnings of recorded episodes
-    RUN/decode.json   optional: how its frames are best filled
+    RUN/robots.json   ranges and names of the robots' commands, as recorded
+    RUN/starts.npz    beginnings of recorded episodes
+    RUN/decode.json   how its frames are best filled
+
+The last three may be absent.
 """
 
 from __future__ import annotations

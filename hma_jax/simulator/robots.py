@@ -107,7 +107,9 @@ class Robot:
         low, high = np.asarray(self.low, np.float32), np.asarray(self.high, np.float32)
         beyond = ((actions < low) | (actions > high)).reshape(-1, self.action_dim).any(0)
         if outside == "refuse" and beyond.any():
-            raise ConfigError(f"{self.name}: {self.describe(beyond, actions)}; give actions in range, or have them clipped")
+            raise ConfigError(
+                f"{self.name}: {self.describe(beyond, actions)}; give actions in range, or have them clipped"
+            )
         return np.clip(actions, low, high), beyond
 
     def describe(self, beyond: np.ndarray, actions: np.ndarray) -> str:

@@ -269,7 +269,10 @@ class Simulator:
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
         """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same frames."""
-        require(len(snapshot.episodes) == len(self), f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}")
+        require(
+            len(snapshot.episodes) == len(self),
+            f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}",
+        )
         self._state, self._images = self._copied(snapshot.state), snapshot.images
         self._episodes = list(copy.deepcopy(snapshot.episodes))
         return self.images

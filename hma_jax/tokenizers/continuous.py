@@ -55,9 +55,7 @@ class ContinuousTokenizer(AutoencoderTokenizer):
         return jnp.clip(tokens * self.latent_std, -1.0, 1.0)
 
 
-def make_continuous(
-    config: TokenizerConfig, params: Params, batches: Iterator[np.ndarray]
-) -> ContinuousTokenizer:
+def make_continuous(config: TokenizerConfig, params: Params, batches: Iterator[np.ndarray]) -> ContinuousTokenizer:
     """The tokenizer with its scale measured on uint8 images [B, H, W, 3] from `batches`."""
     unscaled = ContinuousTokenizer(config, params, latent_std=1.0)
     latents = np.concatenate([unscaled.encode(images) for images in islice(batches, SCALE_BATCHES)])

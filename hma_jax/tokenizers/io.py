@@ -30,8 +30,7 @@ from hma_jax.tokenizers.shared import BaseTokenizer
 DESCRIPTION = "tokenizer.json"
 WEIGHTS = "weights.npz"
 KINDS: dict[str, type[BaseTokenizer]] = {
-    cls.kind: cls
-    for cls in (LfqTokenizer, ContinuousTokenizer, Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)
+    cls.kind: cls for cls in (LfqTokenizer, ContinuousTokenizer, Magvit2Tokenizer, SvdVaeTokenizer, PixelTokenizer)
 }
 AGAIN = "train, import or copy the tokenizer again"
 

@@ -98,10 +98,7 @@ class Decoder(nnx.Module):
         self.mid_block = _blocks(config, widths[-1], widths[-1])
         # As the encoder's, levels count from the image inwards; they are passed from the last on.
         self.up = nnx.List(
-            [
-                Up(config, c_in, c_out, last=i == 0)
-                for i, (c_in, c_out) in enumerate(zip(inputs, widths, strict=True))
-            ]
+            [Up(config, c_in, c_out, last=i == 0) for i, (c_in, c_out) in enumerate(zip(inputs, widths, strict=True))]
         )
         self.norm_out = GroupNorm(widths[0], config.groups)
         self.conv_out = Conv(widths[0], 3)

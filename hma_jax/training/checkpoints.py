@@ -112,9 +112,7 @@ class Checkpoints:
         try:
             _require_writable(self.directory)
             # Without `force` Orbax may decide that this step need not be saved.
-            response = self._writer().save_checkpointables_async(
-                step, items, custom_metadata=self.meta, force=True
-            )
+            response = self._writer().save_checkpointables_async(step, items, custom_metadata=self.meta, force=True)
         except Exception as error:
             raise self._failed(step, error) from error
         self._pending = step, self._background.submit(self._finish, step, response)
@@ -219,8 +217,7 @@ class Checkpoints:
         if changes:
             raise CheckpointError(
                 f"the checkpoint at {self.directory} (step {step}) was made by another "
-                "configuration; use a new output directory or restore these fields:\n  "
-                + "\n  ".join(changes)
+                "configuration; use a new output directory or restore these fields:\n  " + "\n  ".join(changes)
             )
         wanted = {name: item for name, item in shapes._asdict().items() if item is not None}
         return step, type(shapes)(**load_items(checkpoint, wanted))

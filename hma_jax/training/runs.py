@@ -127,9 +127,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     )
 
 
-def load_model(
-    run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig(), weights: Weights = "auto"
-) -> Model:
+def load_model(run_dir: str | Path, execution: ExecutionConfig = ExecutionConfig(), weights: Weights = "auto") -> Model:
     """The model of a run's latest checkpoint, to be computed as `execution` says; its parameters are cast once,
     here.
 

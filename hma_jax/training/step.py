@@ -48,9 +48,7 @@ def make_train_step(
     schedule = make_schedule(config.optimizer, config.steps)
     masking = config.masking
     check_objective(model, masking)
-    multipliers = jax.tree.map(
-        lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec
-    )
+    multipliers = jax.tree.map(lambda spec: learning_rate_multiplier(spec, model), declared.specs, is_leaf=is_spec)
     specs = declared.specs
     trained_E = np.array([name in (config.only or table.names) for name in table.names])
     require(
@@ -145,8 +143,5 @@ def find_presence(
     }
     return Presence(
         {use: here.any() & everything for use, here in rows.items()},
-        {
-            use: jnp.zeros(len(trained_E), bool).at[embodiment_B].max(here) & trained_E
-            for use, here in rows.items()
-        },
+        {use: jnp.zeros(len(trained_E), bool).at[embodiment_B].max(here) & trained_E for use, here in rows.items()},
     )

@@ -13,7 +13,22 @@ from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import make_spec
 
 GOOD = ["toy", "bridge_dataset", "fractal20220817_data", "_x", "0", "A.b-c", "x" * LONGEST_NAME]
-BAD = ["", ".", "..", ".hidden", "../x", "/x", "a/b", "a\\b", "a b", "a\n", "-rf", "ä", "\x00", "x" * (LONGEST_NAME + 1)]
+BAD = [
+    "",
+    ".",
+    "..",
+    ".hidden",
+    "../x",
+    "/x",
+    "a/b",
+    "a\\b",
+    "a b",
+    "a\n",
+    "-rf",
+    "ä",
+    "\x00",
+    "x" * (LONGEST_NAME + 1),
+]
 
 
 def test_every_name_of_the_registry_is_one():

@@ -99,9 +99,7 @@ def test_titles_tell_trials_apart():
 def drawn(tmp_path_factory):
     """Both ablations, in which one seed of the passive model failed."""
     axes = ("settings", "conditioning")
-    workspace = finished_study(
-        tmp_path_factory.mktemp("study"), axes=axes, broken={"seed 1 · passive": "failed"}
-    )
+    workspace = finished_study(tmp_path_factory.mktemp("study"), axes=axes, broken={"seed 1 · passive": "failed"})
     draw(workspace, record_of(axes=axes))
     return workspace
 

@@ -158,7 +158,9 @@ def test_two_programs_take_turns_and_the_faster_one_is_said_by_how_much(tmp_path
             super().__init__(["sh", "-c", echo])
 
     monkeypatch.setattr(beside, "Worker", Told)
-    stages, ratios = beside.time_beside(tmp_path, Path("python"), ("fill", "slide"), 2, lambda *_: None, rows=3, dtype="bfloat16")
+    stages, ratios = beside.time_beside(
+        tmp_path, Path("python"), ("fill", "slide"), 2, lambda *_: None, rows=3, dtype="bfloat16"
+    )
     assert ratios == {"fill, times faster": 1.5, "slide, times faster": 1.5}
     assert [(s.name, s.batch) for s in stages] == [("release: frame", 3), ("ours: fill", 3), ("ours: slide", 3)]
     assert (tmp_path / "ours").read_text().split() == ["fill", "slide"] * 3

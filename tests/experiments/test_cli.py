@@ -58,7 +58,11 @@ def test_help_needs_no_jax():
         (["study", "--preset", "smoke", "--dry-run", "--set", "datasets=bridge_datase,b,c"], 2, "bridge_dataset"),
         (["sweep", "width", "--preset", "smoke", "--workers", "0", "--dry-run"], 2, "--workers"),
         (["study", "--preset", "smoke", "--dry-run", "--launcher-set", "bogus=1"], 2, "no such setting, but none"),
-        (["study", "--preset", "smoke", "--dry-run", "--set", "axes="], 2, "axes is empty: the study has nothing to run"),
+        (
+            ["study", "--preset", "smoke", "--dry-run", "--set", "axes="],
+            2,
+            "axes is empty: the study has nothing to run",
+        ),
         (["sweep", "lr_horizon", "--preset", "cpu-full-continuous", "--dry-run"], 2, "designs.budgets is empty"),
         (["study", "--preset", "smoke", "--dry-run", "--set", "suite.fewest=0"], 2, "suite.fewest must be at least 1"),
         (["report", "{empty}"], 2, "no study"),
@@ -86,7 +90,9 @@ def test_a_mistake_is_one_message_and_an_exit_code(arguments, code, message, tmp
     assert message.format(**places) in said.err
 
 
-@pytest.mark.parametrize(("command", "word"), [("convert to-safetensors x --out", "begins anew"), ("adapt x", "goes on")])
+@pytest.mark.parametrize(
+    ("command", "word"), [("convert to-safetensors x --out", "begins anew"), ("adapt x", "goes on")]
+)
 def test_a_command_that_is_stopped_says_what_the_same_will_do(command, word, tmp_path, monkeypatch, capsys):
     def stopped(*_, **__):
         raise KeyboardInterrupt

@@ -421,7 +421,12 @@ def test_evaluation_on_windows_of_another_length(study, tmp_path, refused):
 @pytest.mark.parametrize(
     ("changes", "robot", "why", "advice"),
     [
-        ({"S": 64}, ARM.name, "the model takes 64 tokens", "--tokenizer and the directory of the one that it was trained"),
+        (
+            {"S": 64},
+            ARM.name,
+            "the model takes 64 tokens",
+            "--tokenizer and the directory of the one that it was trained",
+        ),
         ({"T": 3}, ARM.name, "windows of 3 frames, those frozen for evaluation here have 4", "--set model.frames=3"),
         ({}, "push2", "trained on push2, of which the study here has no windows", "--data of one of them"),
     ],

@@ -68,9 +68,13 @@ def computed_again(name: str, at: Path) -> Workspace:
 def test_what_is_kept_is_drawn_again(name, tmp_path):
     """Figures from a table; where trials are kept, tables too, byte for byte, and the page's checks of them hold."""
     workspace = computed_again(name, tmp_path)
-    assert {p.name for p in workspace.figures.iterdir()} >= {p.name for p in Workspace(RESULTS / name).figures.iterdir()}
+    assert {p.name for p in workspace.figures.iterdir()} >= {
+        p.name for p in Workspace(RESULTS / name).figures.iterdir()
+    }
     text = workspace.report.read_text()
-    assert not workspace.trials.exists() or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in text, "see it"
+    assert not workspace.trials.exists() or "<li class=bad><span class=mark>\u2717</span><div><b>Every" not in text, (
+        "see it"
+    )
 
 
 def test_the_tables_of_the_largest_study_are_computed_again(tmp_path, monkeypatch):

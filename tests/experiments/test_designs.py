@@ -112,7 +112,9 @@ def test_newcomers_are_whole_and_of_the_kin_that_is_said():
 def test_rates_come_down_at_every_point_of_equal_compute():
     """The widest model had 512 steps at the smallest of these budgets, 500 of which warm up."""
     found = find_axis("compute")(ACCELERATOR).points
-    assert {point.series for point in found} and len({point.series for point in found}) < len(ACCELERATOR.designs.compute)
+    assert {point.series for point in found} and len({point.series for point in found}) < len(
+        ACCELERATOR.designs.compute
+    )
     for point in found:
         check_schedule(point.trial.train.optimizer, point.trial.train.steps)
 

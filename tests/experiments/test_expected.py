@@ -61,7 +61,9 @@ def test_seeds_are_counted(rows):
 
 
 def test_some_seeds_alone_may_be_meant(rows, tmp_path):
-    (tmp_path / FILE).write_text(f"{COLUMNS},seeds\nwidth,,8,,cross_entropy,5,4,6,abc1234,0 2\nwidth,,8,,cross_entropy,5,4,6,abc1234,\n")
+    (tmp_path / FILE).write_text(
+        f"{COLUMNS},seeds\nwidth,,8,,cross_entropy,5,4,6,abc1234,0 2\nwidth,,8,,cross_entropy,5,4,6,abc1234,\n"
+    )
     some, every = read_expected(tmp_path / FILE)
     assert some == replace(WIDTH, seeds=(0, 2)) and every == WIDTH
     [came] = what_came([some], rows)

@@ -167,7 +167,9 @@ def test_what_knowing_robots_is_worth_to_new_ones_is_as_findings_say():
     _, (worse, error), (level, beside) = behind("5", "new")
     assert f"({level:.2f} ± {beside:.2f} behind) and {worse:.2f} ± {error:.2f} behind it with 16" in page
     first, second, third = (mean for mean, _ in behind("whole", "40"))
-    said = f"training all is {-third:.2f} ahead with 64 trajectories, {second:.2f} behind with 16, and {first:.2f} behind"
+    said = (
+        f"training all is {-third:.2f} ahead with 64 trajectories, {second:.2f} behind with 16, and {first:.2f} behind"
+    )
     assert f"{said} with 4" in page, said
 
 
@@ -305,7 +307,9 @@ def test_the_curve_over_robots_in_the_mixture_is_as_findings_say():
     assert said in " ".join(findings().split()), said
 
 
-OF_ONE_CURVE = [(sweep, "cpu-full") for sweep in ("width", "dilution", "transfer", "newcomers", "settings", "conditioning")]
+OF_ONE_CURVE = [
+    (sweep, "cpu-full") for sweep in ("width", "dilution", "transfer", "newcomers", "settings", "conditioning")
+]
 
 
 @pytest.mark.parametrize(("sweep", "study"), [*OF_ONE_CURVE, ("ladder", "ladder")])
@@ -360,7 +364,9 @@ def test_what_counting_changes_thrice_gives_is_as_findings_of_the_ladder_say():
         assert len(points["changes thrice, 4,000 steps"].seeds) == 3
         early[metric] = f"{mean:.3f} ± {error:.3f}"
         late[metric], _ = difference(points["changes thrice, 32,000 steps"], points["32,000 steps"])
-        tenfold[metric] = [difference(points[f"changes {n}, 4,000 steps"], points["4,000 steps"])[0] for n in ("thrice", "tenfold")]
+        tenfold[metric] = [
+            difference(points[f"changes {n}, 4,000 steps"], points["4,000 steps"])[0] for n in ("thrice", "tenfold")
+        ]
     said = "{cross_entropy} nats are lost; {psnr} dB of PSNR, {action_nats} action-nats and {delta_psnr} dB of ΔPSNR are gained"
     assert said.format(**early) in page
     said = "{psnr:+.2f} dB of PSNR, {action_nats:+.2f} action-nats, {delta_psnr:+.2f} dB of ΔPSNR, and of what moved"
@@ -413,7 +419,9 @@ SIXTEEN_BITS = {0: "87031510e024dba4", 1: "e0ed9450a3926807", 2: "5be8301a53ed7f
 @pytest.mark.parametrize("bits", [8, 24])
 def test_what_tokens_of_other_bits_give_is_as_findings_of_the_ladder_say(bits):
     folder = RESULTS / "tokenizers" / f"bits{bits}"
-    other = Side(folder.name, {s: WindowTable.load(folder / f"seed{s}" / WINDOWS) for s in SIXTEEN_BITS}, f"{bits} bits")
+    other = Side(
+        folder.name, {s: WindowTable.load(folder / f"seed{s}" / WINDOWS) for s in SIXTEEN_BITS}, f"{bits} bits"
+    )
     trials = RESULTS / "ladder" / "trials"
     usual = Side("bits16", {s: WindowTable.load(trials / id / WINDOWS) for s, id in SIXTEEN_BITS.items()}, "16 bits")
     found = {(d.scope, d.metric): d for d in compare(other, usual)}
@@ -438,12 +446,17 @@ def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
         return f"{100 * mean:.1f} ± {100 * half:.1f} %"
 
     tools, objects = ([r for r in longest if r["what"].startswith(kind)] for kind in ("tool", "colour"))
-    said = f"of what moved, {share(longest)} stands within 2 pixels of 32 of its place in the last frame of a window after"
+    said = (
+        f"of what moved, {share(longest)} stands within 2 pixels of 32 of its place in the last frame of a window after"
+    )
     assert f"{said} 64,000 steps, {share(before)} after 32,000" in page
     assert f"{share(of_others)} on the same twelve robots" in page
     assert share(longest, "true") == share(before, "true") and f"true frames {share(longest, 'true')}" in page
     as_tokens = f"in true frames as the tokenizer shows them it is {share(longest, 'tokens')}"
-    assert f"Of tools it is {share(tools)}, of objects {share(objects)}. The tokens are not what limits it: {as_tokens}." in page
+    assert (
+        f"Of tools it is {share(tools)}, of objects {share(objects)}. The tokens are not what limits it: {as_tokens}."
+        in page
+    )
 
 
 def test_where_things_stand_in_models_of_eight_robots_is_as_the_page_on_designs_says():

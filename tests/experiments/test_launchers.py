@@ -101,7 +101,9 @@ def places(tmp_path, monkeypatch):
         if name == "local":
             return fake_trial.launcher(root, 2)
         if name == "slurm":
-            place = SlurmLauncher(root, None, command=fake_trial.command, executor=FakeSlurm(root / "slurm", monkeypatch))
+            place = SlurmLauncher(
+                root, None, command=fake_trial.command, executor=FakeSlurm(root / "slurm", monkeypatch)
+            )
         else:
             place = RayLauncher(root, 2, command=fake_trial.command, engine=FakeRay())
         place.pause = 0.01
@@ -325,9 +327,7 @@ def test_the_command_line_refuses_a_launcher_that_is_not_there(capsys):
 def test_settings_are_read_as_what_they_are():
     said = ("partition=123", "gpus=2", "memory_gb=1.5", "sbatch=gres=gpu:h100:1", "sbatch=exclusive")
     _, settings = Launching("slurm", None, said)._parsed()
-    assert settings == SlurmSettings(
-        partition="123", gpus=2, memory_gb=1.5, sbatch=("gres=gpu:h100:1", "exclusive")
-    )
+    assert settings == SlurmSettings(partition="123", gpus=2, memory_gb=1.5, sbatch=("gres=gpu:h100:1", "exclusive"))
 
 
 def test_without_the_engine_the_message_says_what_to_install(tmp_path, monkeypatch):

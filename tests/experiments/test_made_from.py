@@ -141,7 +141,11 @@ def test_the_command_of_the_issue(hma, out):
 def test_other_data_is_refused(hma, out, made, tmp_path):
     before, (_, arm, pusher) = contents(out), made[1]
     code, said = hma("tokenize", data=["--data", arm])
-    assert code == 2 and "datasets: 2 -> 1, without dlr_edan_shared_control_converted_externally_to_rlds" in said and "--replace windows" in said
+    assert (
+        code == 2
+        and "datasets: 2 -> 1, without dlr_edan_shared_control_converted_externally_to_rlds" in said
+        and "--replace windows" in said
+    )
     other = str(write_rlds(tmp_path, ARM, [20] * 6))
     code, said = hma("tokenize", data=["--data", other, pusher])
     assert code == 2 and f"data of {ARM.name}.shards: " in said and "--replace tokenizer" in said
@@ -196,8 +200,11 @@ def test_changed_sources_of_the_tokenizer_keep_it_and_say_so(hma, out, monkeypat
 def test_sources_of_the_tokenizer_are_its_own():
     names = trace(tokenizer_step.SOURCES)
     assert {
-        "hma_jax.tokenizers.lfq", "data_pipelines.sources.rlds.images", "data_pipelines.sources.rlds.dataset",
-        "data_pipelines.sources.lerobot_dataset", "hma_jax.training.loop",
+        "hma_jax.tokenizers.lfq",
+        "data_pipelines.sources.rlds.images",
+        "data_pipelines.sources.rlds.dataset",
+        "data_pipelines.sources.lerobot_dataset",
+        "hma_jax.training.loop",
     } <= names.keys()
     assert not [name for name in names if name.startswith(("experiments", "hma_jax.model.trunk"))]
 
@@ -255,7 +262,9 @@ def test_tokens_that_earlier_code_would_make_otherwise_are_refused_and_stay(hma,
     before = contents(out)
     monkeypatch.setattr(tokenize_job, "RECIPE", tokenize_job.RECIPE + 1)
     code, said = hma("tokenize")
-    assert code == 2 and f"recipe: {tokenize_job.RECIPE - 1} -> {tokenize_job.RECIPE} ({ARM.name}" in " ".join(said.split())
+    assert code == 2 and f"recipe: {tokenize_job.RECIPE - 1} -> {tokenize_job.RECIPE} ({ARM.name}" in " ".join(
+        said.split()
+    )
     assert "--replace tokens" in said and contents(out) == before
     assert hma("tokenize", "--replace", "tokens")[0] == 0 and hma("tokenize")[0] == 0
     assert contents(out) != before
@@ -300,7 +309,11 @@ def test_the_suite_is_not_made_with_another_seed_or_size_in_its_place(suite, tmp
     before, command = contents(out), ["data", "suite", *SMOKE, "--out", str(out), "--set", "datasets=pusher_sand"]
     assert main([*command, "--set", "suite.seed=3", "--set", "suite.scale=0.1", "--set", "suite.validation=5"]) == 2
     said = capsys.readouterr().err
-    assert "suite.seed: 0 -> 3" in said and "suite.scale or suite.fewest: 10 -> 50 episodes" in said and "--replace suite" in said
+    assert (
+        "suite.seed: 0 -> 3" in said
+        and "suite.scale or suite.fewest: 10 -> 50 episodes" in said
+        and "--replace suite" in said
+    )
     assert "suite.validation: 4 -> 5 episodes" in said
     assert contents(out) == before
     assert main([*command, "--set", "suite.seed=3", "--replace", "suite"]) == 0

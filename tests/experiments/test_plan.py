@@ -36,9 +36,7 @@ def test_the_abstract_state_has_the_shapes_of_a_real_one():
     )
     real = init_state(declared, TABLE, 0)
     assert jax.tree.structure(state) == jax.tree.structure(real)
-    assert [(x.shape, x.dtype) for x in jax.tree.leaves(state)] == [
-        (x.shape, x.dtype) for x in jax.tree.leaves(real)
-    ]
+    assert [(x.shape, x.dtype) for x in jax.tree.leaves(state)] == [(x.shape, x.dtype) for x in jax.tree.leaves(real)]
     assert batch["tokens"].shape == (train.batch, config.frames, config.tokens)
 
 
@@ -71,8 +69,16 @@ TEXT = """
 
 def test_collectives_are_counted_once_with_what_is_sent_over_which_axes():
     found = find_collectives(TEXT, {"data": 2, "fsdp": 2, "tensor": 2})
-    assert count_kinds(found) == {"all-gather": 1, "all-reduce": 1, "reduce-scatter": 1, "all-to-all": 1, "collective-permute": 1}
-    assert found[Collective("all-to-all", "fsdp", False, "robots' parameters, to their examples")] == Sent(1, 8 * 4096 * 4)
+    assert count_kinds(found) == {
+        "all-gather": 1,
+        "all-reduce": 1,
+        "reduce-scatter": 1,
+        "all-to-all": 1,
+        "collective-permute": 1,
+    }
+    assert found[Collective("all-to-all", "fsdp", False, "robots' parameters, to their examples")] == Sent(
+        1, 8 * 4096 * 4
+    )
     gathered = Collective("all-gather", "fsdp+tensor", True, "parameters, from storage to compute")
     assert found[gathered] == Sent(1, 2 * 128)
     by_axes = {c.kind: c.over for c in found}

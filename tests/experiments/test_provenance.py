@@ -169,11 +169,17 @@ def test_a_start_is_recorded_once(tmp_path):
     record_start(tmp_path, PROVENANCE, {"experiments.running.trial": "2"})
     record_end(tmp_path)
     record = provenance.read_record(tmp_path)
-    assert [start.code for start in record.starts] == [closure_hash({"experiments.running.trial": str(i)}) for i in (1, 2)]
+    assert [start.code for start in record.starts] == [
+        closure_hash({"experiments.running.trial": str(i)}) for i in (1, 2)
+    ]
     assert record.code == record.starts[-1].code and len(record.closures) == 2
     assert record.besides["experiments.words"] == trace(["experiments.words"])["experiments.words"]
     machine = record.starts[0].machine
-    assert {"jax", "jaxlib", "numpy"} <= machine["packages"].keys() and {"processor", "system", "commit"} <= machine.keys()
+    assert {"jax", "jaxlib", "numpy"} <= machine["packages"].keys() and {
+        "processor",
+        "system",
+        "commit",
+    } <= machine.keys()
 
 
 # --- Finished trials ------------------------------------------------------------------------------
@@ -263,7 +269,9 @@ def test_trials_are_counted_by_the_sources_they_ran(tmp_path):
     require_one_closure(workspace.trials, ids[1:], OLD | {"hma_jax.b": "1"}, accept=False)  # it has one more, no other
     groups = group_by_sources(workspace.trials, ids)
     assert [len(group.trials) for group in groups] == [1, len(ids)]  # the first ran both
-    with pytest.raises(CodeChanged, match=r"(?s)differs in hma_jax\.a.*Nothing was run.*--accept-code.*RESULTS_VERSION"):
+    with pytest.raises(
+        CodeChanged, match=r"(?s)differs in hma_jax\.a.*Nothing was run.*--accept-code.*RESULTS_VERSION"
+    ):
         require_one_closure(workspace.trials, ids, None, accept=False)
     with pytest.raises(CodeChanged, match="to be run; differs in hma_jax.a"):
         require_one_closure(workspace.trials, ids[1:], NEW, accept=False)

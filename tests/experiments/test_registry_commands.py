@@ -117,7 +117,9 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
     """An entry's own rate of frames counts; another native rate than the entry's is none that a study would take."""
     entry = replace(get_spec("bridge_dataset"), rate=2.5)
     (tmp_path / "my.toml").write_text(to_toml(entry))
-    assert main(["data", "inspect", str(REAL_DATA), "--out", str(tmp_path), "--registry", str(tmp_path / "my.toml")]) == 0
+    assert (
+        main(["data", "inspect", str(REAL_DATA), "--out", str(tmp_path), "--registry", str(tmp_path / "my.toml")]) == 0
+    )
     assert "rate 5 Hz (registry): stride 2, 2.50 Hz" in capsys.readouterr().out
     mine = ["--out", str(tmp_path), "--registry", str(tmp_path / "my.toml")]
     assert main(["data", "inspect", str(REAL_DATA), "--hz", "10", *mine]) == 0
@@ -127,7 +129,9 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
         out = tmp_path / looked[0]
         assert main(["data", *looked, "--hz", "10", "--out", str(out)]) == 0
         said = capsys.readouterr().out
-        assert f"hma data inspect {REAL_DATA}/1.0.0 --hz 10 --entry my_robots.toml" in said and "hma tokenize" not in said
+        assert (
+            f"hma data inspect {REAL_DATA}/1.0.0 --hz 10 --entry my_robots.toml" in said and "hma tokenize" not in said
+        )
 
 
 @pytest.mark.parametrize(
@@ -167,7 +171,9 @@ def test_a_misspelt_heading_of_a_known_dataset_is_told(tmp_path, capsys):
     arguments = [str(REAL_DATA), "--hz", "10", "--out", str(tmp_path)]
     assert main(["data", "inspect", *arguments, "--entry", str(file)]) == 0
     right = file.read_text()
-    told = "note: {} has no entry called bridge_dataset: the project's own is used. Its entries that nothing here uses: "
+    told = (
+        "note: {} has no entry called bridge_dataset: the project's own is used. Its entries that nothing here uses: "
+    )
     for entries, noted in (
         (right, False),
         (right + right.replace("bridge_dataset", "another"), False),

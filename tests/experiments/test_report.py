@@ -204,7 +204,10 @@ def test_a_point_without_one_of_the_metrics_has_a_dash(drawn):
     lost = {(8, "delta_psnr"), (16, "perplexity")}
     rows = [r for r in rows_of(drawn, [sweep]) if (r.x, r.metric) not in lost]
     lines = re.findall(r"<tr><td class=text>(\d+)</td><td>([\d,]+)</td>(.*?)</tr>", describe(sweep, rows, [], Along()))
-    assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [("8", "6,400", 1), ("16", "25,600", 1)]
+    assert [(x, parameters, cells.count("–")) for x, parameters, cells in lines] == [
+        ("8", "6,400", 1),
+        ("16", "25,600", 1),
+    ]
 
 
 def test_one_held_out_episode_per_robot_has_no_interval_on_the_page():

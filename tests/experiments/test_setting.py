@@ -109,8 +109,12 @@ def test_a_printed_command_asks_for_the_same_again(world, monkeypatch, anything_
     "where",
     [
         StudyArguments("smoke"),
-        StudyArguments("smoke", Path("out"), (f"bridge/{ARM.name}",), set=("train.steps=7", "widths=[8, 16]"), mesh=(-1, 1, 1)),
-        StudyArguments("smoke-continuous", None, ("it's data/my_robot",), Path("my entries.toml"), tokenizer=Path("-tok")),
+        StudyArguments(
+            "smoke", Path("out"), (f"bridge/{ARM.name}",), set=("train.steps=7", "widths=[8, 16]"), mesh=(-1, 1, 1)
+        ),
+        StudyArguments(
+            "smoke-continuous", None, ("it's data/my_robot",), Path("my entries.toml"), tokenizer=Path("-tok")
+        ),
         StudyArguments("paper", Path("/tmp/x y"), ("openx",), mixture="dataset5", set=("seeds=0,1",)),
     ],
 )

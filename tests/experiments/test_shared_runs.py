@@ -72,7 +72,12 @@ def test_a_job_waits_for_those_that_it_goes_on_from(tmp_path):
     """Beside others that do not: it is listed first, and its place is given to one that is ready."""
     jobs = [Job("c", "c", job("c").record, after=frozenset("ab")), job("a"), job("b", "crash"), job("d")]
     states = run(tmp_path, jobs, workers=2)
-    assert {id: s.event for id, s in states.items()} == {"a": "finished", "b": "failed", "c": "finished", "d": "finished"}
+    assert {id: s.event for id, s in states.items()} == {
+        "a": "finished",
+        "b": "failed",
+        "c": "finished",
+        "d": "finished",
+    }
     lines = [json.loads(line) for line in (tmp_path / "ledger.jsonl").read_text().splitlines()]
     began = next(i for i, line in enumerate(lines) if line["trial"] == "c")
     ended = [i for i, line in enumerate(lines) if line["trial"] in "ab" and line["event"] != "running"]

@@ -69,7 +69,12 @@ def test_what_the_user_allows_is_what_is_divided(environment, found, monkeypatch
 
 def test_tpu_chips_are_counted_on_the_bus(tmp_path):
     for number, (vendor, device) in enumerate(
-        [("0x1ae0", "0x0063"), ("0x1ae0", "0x0063"), ("0x1ae0", "0x0042"), ("0x10de", "0x0063")]  # a network card, a GPU
+        [
+            ("0x1ae0", "0x0063"),
+            ("0x1ae0", "0x0063"),
+            ("0x1ae0", "0x0042"),
+            ("0x10de", "0x0063"),
+        ]  # a network card, a GPU
     ):
         (tmp_path / str(number)).mkdir()
         (tmp_path / str(number) / "vendor").write_text(f"{vendor}\n")

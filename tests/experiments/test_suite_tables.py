@@ -76,7 +76,9 @@ def test_a_prediction_from_siblings_uses_the_actions():
     samples = {s.name: sample(s, 2, episodes=12) for s in (spec, *siblings(spec))}
     target = samples.pop(spec.name)
     predict = predictor(list(samples.values()))
-    shuffled = Samples(target.features, np.random.default_rng(0).permutation(target.actions), target.moves, target.episode)
+    shuffled = Samples(
+        target.features, np.random.default_rng(0).permutation(target.actions), target.moves, target.episode
+    )
     right, wrong = (((predict(s) - target.moves) ** 2).sum(1).mean() for s in (target, shuffled))
     assert right < 0.4 * wrong
 

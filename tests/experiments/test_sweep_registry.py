@@ -142,9 +142,18 @@ def plan(study):
         (OWN.format("replace(trial, tau=2.0 + x)"), r"does not stand at reference_x 3, .* \(tau: 3.0 -> 5.0\)"),
         (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "trial at 1 has a setting of a wrong kind .*tau"),
         (OWN.format("replace(trial, datasets=list(trial.datasets)) if x == 1 else trial"), "a list where a tuple"),
-        (OWN.format("replace(trial, datasets=trial.datasets[:x])"), "trial at 1 judges rover, pusher and is not trained"),
-        (OWN.format("replace(trial, datasets=trial.datasets[:x], evaluated=trial.datasets[:x])"), "at 1 does not judge"),
-        (OWN.format("replace(trial, datasets=('toto',), evaluated=('toto',)) if x == 1 else trial"), "trained on toto, wh"),
+        (
+            OWN.format("replace(trial, datasets=trial.datasets[:x])"),
+            "trial at 1 judges rover, pusher and is not trained",
+        ),
+        (
+            OWN.format("replace(trial, datasets=trial.datasets[:x], evaluated=trial.datasets[:x])"),
+            "at 1 does not judge",
+        ),
+        (
+            OWN.format("replace(trial, datasets=('toto',), evaluated=('toto',)) if x == 1 else trial"),
+            "trained on toto, wh",
+        ),
         (POINTS.format("reference_trial(study, 0)"), "point 1 has to be a Point with a Trial, and has a Trial"),
         (POINTS.format("Point('wide', reference_trial(study, 0))"), "position 'wide' of point 1 is no number"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),

@@ -98,7 +98,17 @@ def test_a_mesh_that_does_not_fit_is_refused_before_anything_is_prepared(
 ):
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
     monkeypatch.setattr(local, "find_accelerators", lambda: Accelerators("gpu", gpus) if gpus else None)
-    study = [*SMOKE, "--out", str(tmp_path / "out"), "--data", *where[where.index("--data") + 1 :], "--mesh", "3", "1", "1"]
+    study = [
+        *SMOKE,
+        "--out",
+        str(tmp_path / "out"),
+        "--data",
+        *where[where.index("--data") + 1 :],
+        "--mesh",
+        "3",
+        "1",
+        "1",
+    ]
     more = {"train": [], "sweep": ["width"]}
     if command == "adapt":
         more[command] = [str(make_released(tmp_path / "a", as_registered(ARM)))]

@@ -223,7 +223,11 @@ def test_robots_worse_than_copying_are_named(copied):
     workspace.results.unlink()
     draw(workspace, record)
     verdict, text = verdicts(workspace)["copying"]
-    assert verdict == "bad" and "On 2 of 3 robots the reference does, on 2 by more" in text and f"Not on {SMALL.datasets[2]}" in text
+    assert (
+        verdict == "bad"
+        and "On 2 of 3 robots the reference does, on 2 by more" in text
+        and f"Not on {SMALL.datasets[2]}" in text
+    )
 
 
 def test_an_untrained_model_that_knows_something_is_bad(copied):

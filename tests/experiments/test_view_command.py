@@ -95,7 +95,9 @@ def test_a_dataset_without_windows_gets_a_command_that_finds_some(toy, tmp_path,
     said = capsys.readouterr().out
     assert "toy: no window: the shortest window at stride 16 takes 32 steps; the longest of 4 episodes has 31" in said
     assert "hma tokenize" not in said
-    assert re.search(r"next for toy: hma data view \S+ --stride 1 --registry \S+  \(no episode .* has the 32 steps", said)
+    assert re.search(
+        r"next for toy: hma data view \S+ --stride 1 --registry \S+  \(no episode .* has the 32 steps", said
+    )
     assert main([*arguments, "--stride", "1"]) == 0
     (command,) = re.findall(r"next: (hma tokenize .*)", capsys.readouterr().out)
     assert command.endswith("--set rate=4")  # of every frame

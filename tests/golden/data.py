@@ -92,6 +92,7 @@ def _check_latents(case: Case, mode: str, first: int) -> None:
 
 # --- Windows -----------------------------------------------------------------------------------
 
+
 class OnDisk:
     """A data set in the release's format, its episodes numbered from 0."""
 
@@ -125,9 +126,7 @@ def _check_starts(case: Case, data: OnDisk, one: dict[str, Any]) -> None:
     frames, stride = one["window"], one["stride"]
     label = f"starts, window {frames}, stride {stride}"
     if not one["filter_interrupts"] or one["filter_overlaps"]:
-        why = (
-            "we keep overlapping windows" if one["filter_overlaps"] else "our windows never leave an episode"
-        )
+        why = "we keep overlapping windows" if one["filter_overlaps"] else "our windows never leave an episode"
         case.add(Finding(label, None, note=f"not followed: {why}"))
         return
     ours = train_windows(OneDataset((data.ends - data.firsts).tolist(), hz=2 * stride), "toy", frames, least=frames)
@@ -188,9 +187,7 @@ def check_metrics(case: Case) -> None:
     }
     for name, expected in want.items():
         if name in got:
-            case.compare(
-                name, np.asarray(got[name][0], np.float64), np.asarray(expected, np.float64), got[name][1]
-            )
+            case.compare(name, np.asarray(got[name][0], np.float64), np.asarray(expected, np.float64), got[name][1])
         else:
             case.add(Finding(name, False, note="unknown metric"))
 
@@ -221,9 +218,7 @@ def _model_shapes(label: str, content: dict[str, Any]) -> dict[str, tuple[int, .
     return official_shapes(read_model({**content["config"], **names}, label), table)
 
 
-def _compare_shapes(
-    case: Case, label: str, got: dict[str, tuple[int, ...]], content: dict[str, Any]
-) -> None:
+def _compare_shapes(case: Case, label: str, got: dict[str, tuple[int, ...]], content: dict[str, Any]) -> None:
     listed = content["shapes"]
     want = {name: tuple(shape) for name, shape in listed.items()}
     wrong = sorted({n for n in got.keys() | want.keys() if got.get(n) != want.get(n)})

@@ -49,9 +49,7 @@ def applier(case: Case):
     def apply(params, ids, masked, actions, robots, hidden):
         return case.declared.merge(params)(ids, masked, actions, robots, hidden_BT=hidden)
 
-    return lambda ids, masked, actions, robots, hidden=None: apply(
-        case.params, ids, masked, actions, robots, hidden
-    )
+    return lambda ids, masked, actions, robots, hidden=None: apply(case.params, ids, masked, actions, robots, hidden)
 
 
 def check_logits(case: Case) -> None:
@@ -71,9 +69,7 @@ def check_logits(case: Case) -> None:
         check("logits_short_window", case.actions(case.domains[0])[:, :short], case.domains[0], short)
     if "logits_skip_normalization" in case.outputs:
         robot = case.domains[-1]
-        plain = [
-            replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries
-        ]
+        plain = [replace(e, mean=(0.0,) * e.action_dim, std=(1.0,) * e.action_dim) for e in case.table.entries]
         declared = declare_model(case.run.model, EmbodimentTable(tuple(plain)))
         out = jax.jit(lambda p, *args: declared.merge(p)(*args).said)(
             case.params, ids, masked, case.actions(robot), case.robot(robot, batch)

@@ -71,9 +71,7 @@ def _check_training(case: Case) -> None:
             loss, accuracy = loss_and_accuracy(model, recorded, labels, actions, robots, masking)
             out = model(ids, masked, actions, robots, hidden_BT=hidden, leak=masking.action_leak)
             predicted = model.action_head(out.actions, robots)[..., :chunk]
-            action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(
-                hidden.astype(jnp.float32)
-            )
+            action_loss = jnp.mean((actions[..., :chunk] - predicted) ** 2) * jnp.mean(hidden.astype(jnp.float32))
             return loss + weight * action_loss, (loss, accuracy, action_loss, predicted, out.said)
 
         return jax.grad(total, has_aux=True)(params)

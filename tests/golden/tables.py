@@ -57,9 +57,7 @@ def _check_process(case: Case, label: str, process: Process, want: dict[str, Any
         "sqrt_recip_alphas_cumprod": process.clean_from_xt,
         "sqrt_recipm1_alphas_cumprod": process.clean_from_eps,
         "posterior_log_variance_clipped": process.posterior_log_variance_clipped,
-        "posterior_variance": process.betas
-        * (1 - process.alphas_cumprod_prev)
-        / (1 - process.alphas_cumprod),
+        "posterior_variance": process.betas * (1 - process.alphas_cumprod_prev) / (1 - process.alphas_cumprod),
         "timestep_map": process.timestep_map,
     }
     for name in want:
@@ -243,9 +241,7 @@ def _check_initial(case: Case, label: str, variant: str, want: dict[str, dict[st
     declared = declare_model(model, table)
     parts = official_parts(model, table, declared.leaves())
     own = {part.name: (path, part) for path, parts_ in parts.items() for part in parts_}
-    arrays = {
-        path: spec.init(np.random.default_rng(0), spec.shape) for path, spec in declared.leaves().items()
-    }
+    arrays = {path: spec.init(np.random.default_rng(0), spec.shape) for path, spec in declared.leaves().items()}
 
     wrong, differ, followed = [f"{n}: not ours" for n in want if n not in own], 0, 0
     wrong += [f"{n}: not theirs" for n in own if n not in want]

@@ -105,9 +105,7 @@ def check_vae_decoder(case: Case) -> None:
 
 
 def _check_clips(case: Case, network, params) -> None:
-    decode = jax.jit(
-        lambda params, latents, frames: network.merge(params).decode(latents, frames), static_argnums=2
-    )
+    decode = jax.jit(lambda params, latents, frames: network.merge(params).decode(latents, frames), static_argnums=2)
     done = {}
     for output in case.outputs:
         match = re.fullmatch(r"decoded(_uint8)?(_\w+?)?_num_frames(\d+)", output)

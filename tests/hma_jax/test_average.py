@@ -22,9 +22,7 @@ CONFIG = train_config(ema_decay=DECAY, batch=4, steps=4)
 
 
 def run(run_dir: Path, config, steps_of=batches(MODEL, 4), **options):
-    return train_model(
-        MODEL, TABLE, config, steps_of, run_dir=run_dir, provenance={}, options=LoopOptions(**options)
-    )
+    return train_model(MODEL, TABLE, config, steps_of, run_dir=run_dir, provenance={}, options=LoopOptions(**options))
 
 
 def one_robot_at_a_time(start: int):

@@ -45,9 +45,7 @@ def gradients(dtype: str, diffusion: DiffusionConfig | None, rounded: bool = Fal
     return {spec: np.asarray(g) for spec, g in zip(declared.leaves(), jax.tree.leaves(gradient(params)), strict=True)}
 
 
-@pytest.mark.parametrize(
-    "diffusion", [None, pytest.param(LATENTS, marks=pytest.mark.slow)], ids=["ids", "latents"]
-)
+@pytest.mark.parametrize("diffusion", [None, pytest.param(LATENTS, marks=pytest.mark.slow)], ids=["ids", "latents"])
 def test_gradients_in_bfloat16_are_those_in_float32_within_its_rounding(diffusion):
     exact, computed = gradients("float32", diffusion), gradients("bfloat16", diffusion)
     assert all(g.dtype == np.float32 for g in computed.values())

@@ -40,7 +40,9 @@ def test_every_field_with_choices_is_compared_with_them():
     assert {cls for cls, _, _ in fields} >= {MaskingConfig, MupConfig, ModelConfig, Magvit2Config, ExecutionConfig}
     for cls, name, hint in fields:
         wrong = ("misspelt",) if typing.get_origin(hint) is tuple else "misspelt"
-        with pytest.raises(ConfigError, match=rf"^{cls.__name__}\.{name}: 'misspelt' is not a choice; choose one of \w"):
+        with pytest.raises(
+            ConfigError, match=rf"^{cls.__name__}\.{name}: 'misspelt' is not a choice; choose one of \w"
+        ):
             cls(**{name: wrong})
 
 

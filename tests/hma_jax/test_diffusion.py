@@ -36,13 +36,9 @@ def test_numbers_of_the_reference():
     np.testing.assert_allclose(FULL.posterior_log_variance_clipped[:3], want, rtol=1e-7)
     short = respace(FULL, 100)
     assert np.flatnonzero(np.diff(short.timestep_map) == 11).tolist() == [5, 16, 27, 38, 49, 60, 71, 82, 93]
-    np.testing.assert_allclose(
-        short.betas[[0, 1, 50, 99]], [4.12842e-5, 6.79840e-4, 0.0341717, 0.99999], rtol=2e-6
-    )
+    np.testing.assert_allclose(short.betas[[0, 1, 50, 99]], [4.12842e-5, 6.79840e-4, 0.0341717, 0.99999], rtol=2e-6)
     frequencies = np.asarray(timestep_embedding(jnp.array(1)))[128:]  # their sines
-    np.testing.assert_allclose(
-        np.arcsin(frequencies[[0, 1, 2, 127]]), [1, 0.930572, 0.865964, 1.07461e-4], rtol=1e-5
-    )
+    np.testing.assert_allclose(np.arcsin(frequencies[[0, 1, 2, 127]]), [1, 0.930572, 0.865964, 1.07461e-4], rtol=1e-5)
 
 
 def test_respacing_keeps_the_noise_level_of_every_step_it_visits():

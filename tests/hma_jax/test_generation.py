@@ -91,9 +91,7 @@ def compare_with_naive(config, decode: DecodeConfig, prompt: int, hidden=None, f
     ],
     ids=str,
 )
-def test_the_cached_rollout_equals_recomputing_the_window(
-    decode: DecodeConfig, prompt: int, alignment: str
-):
+def test_the_cached_rollout_equals_recomputing_the_window(decode: DecodeConfig, prompt: int, alignment: str):
     config = model_config(action_alignment=alignment)
     got = compare_with_naive(config, decode, prompt)
     assert (got[:, 0] != got[:, 1]).any()
@@ -212,9 +210,9 @@ def test_next_frame_outputs_equal_one_masked_window_per_frame(alignment: str):
     hma = declared.merge(params)
     hidden = hma.align_hidden(None, batch["tokens"].shape[:2])
     look = jax.jit(
-        lambda masked: hma(
-            batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden
-        ).said
+        lambda masked: (
+            hma(batch["tokens"], masked, hma.align(batch["actions"]), batch["embodiment"], hidden_BT=hidden).said
+        )
     )
     fast = jax.jit(lambda: next_frame_outputs(hma, batch["tokens"], batch["actions"], batch["embodiment"]))()
     for t in range(1, config.frames):
@@ -382,9 +380,7 @@ def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignmen
     whole = jitted_rollout(declared, batch, actions[:, None], keys, decode, prompt)(params)[:, 0]
 
     begin = jax.jit(lambda p: start(declared.merge(p), tokens, actions[:, : prompt - 1], batch["embodiment"]))
-    step = jax.jit(
-        lambda p, s, a, b: advance(declared.merge(p), s, a, keys, decode, next_chunk_BU=b), donate_argnums=1
-    )
+    step = jax.jit(lambda p, s, a, b: advance(declared.merge(p), s, a, keys, decode, next_chunk_BU=b), donate_argnums=1)
     session, frames = begin(params), []
     for t in range(prompt, LONG):
         session, frame = step(params, session, actions[:, t - 1], actions[:, t])
@@ -399,5 +395,11 @@ def test_a_rollout_without_chunks_for_new_frames_is_refused():
     batch = random_batch(0, config, 1)
     few = np.zeros((1, 1, 2, TABLE.action_width), np.float32)
     with pytest.raises(ConfigError, match="needs chunks for more than that, got 2"):
-        rollout(declared.merge(params), batch["tokens"][:, :2], few, batch["embodiment"],
-                jax.random.split(jax.random.key(0), 1), DecodeConfig())
+        rollout(
+            declared.merge(params),
+            batch["tokens"][:, :2],
+            few,
+            batch["embodiment"],
+            jax.random.split(jax.random.key(0), 1),
+            DecodeConfig(),
+        )

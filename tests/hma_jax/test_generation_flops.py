@@ -110,9 +110,7 @@ def ways(case: Case, decode: DecodeConfig) -> dict:
     robots = case.batch["embodiment"]
     return {
         "fill": lambda p: steps.fill(case.window(p), case.cache(p), newest, **last),
-        "stream": lambda p: steps.stream(
-            case.window(p), case.cache(p), newest, jnp.int32(size), case.keys, decode
-        ),
+        "stream": lambda p: steps.stream(case.window(p), case.cache(p), newest, jnp.int32(size), case.keys, decode),
         "slide": lambda p: steps.slide(case.window(p), past, case.keys, decode),
         "recompute": lambda p: rollout_naive(
             case.declared.merge(p), past, case.batch["actions"], robots, case.keys, decode

@@ -49,7 +49,9 @@ def test_a_death_inside_a_save_falls_back_to_the_checkpoint_before(options, tmp_
     resumed = fit_toy(run, 8, options=options)
     assert resumed.resumed_from == 4
     kept = options.keep_checkpoints
-    assert sorted(p.name for p in checkpoints.iterdir()) == ["6", "8"][-kept:], "step 6 was skipped, or remains lie about"
+    assert sorted(p.name for p in checkpoints.iterdir()) == ["6", "8"][-kept:], (
+        "step 6 was skipped, or remains lie about"
+    )
     assert resumed.losses == whole.losses
     for a, b in zip(jax.tree.leaves(resumed.state), jax.tree.leaves(whole.state), strict=True):
         assert np.asarray(a).tobytes() == np.asarray(b).tobytes()

@@ -77,7 +77,11 @@ def test_the_records_of_the_batch_that_was_not_finite_are_named(tmp_path: Path):
     with pytest.raises(DivergedError, match="loss is nan at step 4; its batch was record 30; record 31; .* and 2 more"):
         fit_toy(tmp_path, make=make, records=records, options=EVERY_STEP)
     said = json.loads((tmp_path / "diverged.json").read_text())
-    assert said == {"step": 4, "what": "the loss is nan at step 4", "records": [f"record {30 + row}" for row in range(6)]}
+    assert said == {
+        "step": 4,
+        "what": "the loss is nan at step 4",
+        "records": [f"record {30 + row}" for row in range(6)],
+    }
 
 
 def test_checks_are_not_logged(tmp_path: Path):

@@ -35,9 +35,7 @@ def test_the_settings_differ_in_what_is_hidden_and_predicted():
     seen = {}
     for setting in ("forward", "passive", "full", "policy", "inverse"):
         _, masked = masked_batch(config, MaskingConfig(setting=setting))
-        seen[setting] = [
-            float(np.mean(x)) for x in (masked.targets_TS, masked.hidden_T, masked.action_targets_T)
-        ]
+        seen[setting] = [float(np.mean(x)) for x in (masked.targets_TS, masked.hidden_T, masked.action_targets_T)]
     assert seen["forward"][1:] == [0, 0] and seen["passive"][1:] == [1, 0] and seen["inverse"] == [0, 1, 1]
     assert seen["policy"][0] == 0 and seen["policy"][1] == seen["policy"][2]
     assert all(0.3 < seen[s][0] < 0.7 for s in ("forward", "passive", "full"))
@@ -184,7 +182,9 @@ def test_weights_of_change_are_of_ids():
 @pytest.mark.parametrize("setting", ["forward", "passive", "full"])
 def test_a_window_of_one_frame_has_none_to_predict(setting: str):
     config, declared = shallow_config(frames=1), declare_model(shallow_config(frames=1), TABLE)
-    with pytest.raises(ConfigError, match=f"'{setting}' predicts frames from earlier ones, and model.frames 1 leaves none"):
+    with pytest.raises(
+        ConfigError, match=f"'{setting}' predicts frames from earlier ones, and model.frames 1 leaves none"
+    ):
         make_train_step(declared, TABLE, config, train_config(masking=MaskingConfig(setting=setting)))
     make_train_step(declared, TABLE, config, train_config(masking=MaskingConfig(setting="policy")))
 
@@ -238,9 +238,7 @@ def test_hidden_actions_are_predicted_without_being_seen():
 def test_every_setting_learns_a_repeated_batch(setting: str, diffusion):
     config = shallow_config(diffusion=diffusion, action_alignment="causal", trunk_gain=0.5, stem_gain=0.5, frames=4)
     train = train_config(masking=MaskingConfig(setting=setting), batch=8)
-    train = dataclasses.replace(
-        train, steps=80, optimizer=dataclasses.replace(train.optimizer, learning_rate=3e-3)
-    )
+    train = dataclasses.replace(train, steps=80, optimizer=dataclasses.replace(train.optimizer, learning_rate=3e-3))
     declared = declare_model(config, TABLE)
     step = jax.jit(make_train_step(declared, TABLE, config, train))
     state, batch = init_state(declared, TABLE, 0), random_batch(0, config)

@@ -94,9 +94,7 @@ def test_a_robot_that_returns_goes_on_as_if_the_steps_between_had_not_been():
 def test_with_everyone_present_it_is_adamw():
     declared, params = lively_params(shallow_config())
     decayed = jax.tree.map(lambda s: s.decay, declared.specs, is_leaf=is_spec)
-    reference = optax.adamw(
-        1e-2, CONFIG.beta1, CONFIG.beta2, CONFIG.epsilon, weight_decay=0.1, mask=decayed
-    )
+    reference = optax.adamw(1e-2, CONFIG.beta1, CONFIG.beta2, CONFIG.epsilon, weight_decay=0.1, mask=decayed)
 
     @jax.jit
     def step(gradient, opt, theirs):

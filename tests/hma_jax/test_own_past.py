@@ -72,7 +72,9 @@ def test_each_round_gathers_the_errors_of_one_frame_more_until_all_is_a_rollout(
     @partial(jax.jit, static_argnums=0)
     def own_share(rounds: int) -> jax.Array:
         """Of each frame, the share of ids that the model says after the frames before it in what is drawn."""
-        past = draw_own_past(model, before, *given, None, every_frame, rounds, noise_keys(jax.random.key(0), rows), given[1])
+        past = draw_own_past(
+            model, before, *given, None, every_frame, rounds, noise_keys(jax.random.key(0), rows), given[1]
+        )
         whole = jnp.concatenate([past, past[:, -1:]], axis=1)
         digits, _ = model.frame_head.factors_in_turn(next_frame_outputs(model, whole, *given), likeliest)
         said = compose(digits, config.factor_vocab)[:, : frames - 1]

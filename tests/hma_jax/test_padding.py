@@ -76,7 +76,9 @@ def test_a_step_learns_the_same_whatever_the_padding_holds(model, setting):
     step, state = step_of(model, MaskingConfig(setting=setting, prompt_frames=1))
     batch = random_batch(0, model, len(LENGTHS))
     (first, of_first), (second, of_second) = (step(state, spoilt(batch, other)) for other in (7, 8))
-    assert {k: float(v) for k, v in of_first.items()} == pytest.approx({k: float(v) for k, v in of_second.items()}, 1e-5)
+    assert {k: float(v) for k, v in of_first.items()} == pytest.approx(
+        {k: float(v) for k, v in of_second.items()}, 1e-5
+    )
     for a, b in zip(jax.tree.leaves(first.params), jax.tree.leaves(second.params), strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=2e-6)
     _, counted = step(state, {k: v for k, v in spoilt(batch, 7).items() if k != "real"})

@@ -24,9 +24,7 @@ def test_what_padding_holds_does_not_reach_a_robot_s_own_actions():
     @jax.jit
     def read(params):
         out = Outputs(pooled, pooled, None)
-        return read_actions(
-            declared.merge(params), out, pusher, jax.random.split(jax.random.key(1), 2), decode
-        )
+        return read_actions(declared.merge(params), out, pusher, jax.random.split(jax.random.key(1), 2), decode)
 
     into = params["action_head"]["robots"]["into"]
     before = np.asarray(read(params))

@@ -27,9 +27,7 @@ def test_a_policy_rollout_is_what_acting_and_imagining_by_turns_gives(alignment:
     decode = DecodeConfig(1, sampler=SamplerConfig(steps=4, temperature=0.0))
     prompt, robots = 2, batch["embodiment"]
     frames, chunks = jax.jit(
-        lambda p: rollout_policy(
-            declared.merge(p), batch["tokens"][:, :prompt], batch["actions"], robots, keys, decode
-        )
+        lambda p: rollout_policy(declared.merge(p), batch["tokens"][:, :prompt], batch["actions"], robots, keys, decode)
     )(params)
 
     window, actions = jnp.asarray(batch["tokens"][:, :prompt]), jnp.asarray(batch["actions"])

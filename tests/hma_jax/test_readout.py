@@ -121,5 +121,3 @@ def test_more_entries_than_there_are_cannot_be_drawn_among():
 def test_there_must_be_several_factors_to_chain(changes: dict):
     with pytest.raises(ConfigError, match="model.chain_factors needs ids of several factors"):
         model_config(chain_factors=True, **changes)
-
-

@@ -43,10 +43,14 @@ def test_a_step_of_one_window_moves_its_robot_alone():
     step, batch = compiled(1), random_batch(0, MODEL, 1, SIX)
     for robot in (0, 3):
         before = jax.device_get(init_state(DECLARED, SIX, 0))
-        after = jax.device_get(step(init_state(DECLARED, SIX, 0), batch | {"embodiment": np.array([robot], np.int32)})[0])
+        after = jax.device_get(
+            step(init_state(DECLARED, SIX, 0), batch | {"embodiment": np.array([robot], np.int32)})[0]
+        )
         moved_E = np.zeros(SIX.size, bool)
         for old, new in ((before.params, after.params), (before.opt_state.first, after.opt_state.first)):
-            for spec, *pair in zip(*(jax.tree.leaves(x, is_leaf=is_spec) for x in (DECLARED.specs, old, new)), strict=True):
+            for spec, *pair in zip(
+                *(jax.tree.leaves(x, is_leaf=is_spec) for x in (DECLARED.specs, old, new)), strict=True
+            ):
                 if spec.embodiment_axis is not None:
                     a, b = (np.moveaxis(x, spec.embodiment_axis, 0).reshape(SIX.size, -1) for x in pair)
                     moved_E |= (a != b).any(axis=1)

@@ -228,8 +228,7 @@ def test_spread_is_proportional_to_temperature(kind, near):
     network = gaussian_network(process)
     noise = np.random.default_rng(0).normal(size=(21, 8, 3)).astype(np.float32)
     whole, half = (
-        sample(network, noise[0], noise[1:], process, SamplerConfig(kind, 20, temperature=v), CLIP)
-        for v in (1.0, 0.5)
+        sample(network, noise[0], noise[1:], process, SamplerConfig(kind, 20, temperature=v), CLIP) for v in (1.0, 0.5)
     )
     assert np.abs(whole - MEAN).max() > 0.5
     np.testing.assert_allclose(half - MEAN, (whole - MEAN) / 2, atol=near)
@@ -251,9 +250,7 @@ def test_ddim_moves_along_the_noise_that_the_clipped_clean_vector_leaves():
     """By hand, in float64, with a network that always points far outside."""
     process = respace(FULL, 4)
     x = np.array([[0.3, -0.2]])
-    _, visited = sample(
-        lambda x_t, t: jnp.full((1, 4), 3.0), x, None, process, SamplerConfig("ddim", 4), 1.0, True
-    )
+    _, visited = sample(lambda x_t, t: jnp.full((1, 4), 3.0), x, None, process, SamplerConfig("ddim", 4), 1.0, True)
     for step, index in enumerate([3, 2, 1, 0]):
         abar, cleaner = process.alphas_cumprod[index], process.alphas_cumprod_prev[index]
         clean = np.clip((x - np.sqrt(1 - abar) * 3.0) / np.sqrt(abar), -1, 1)
@@ -304,9 +301,9 @@ def test_samples_of_an_example_do_not_depend_on_its_neighbours():
 def test_sampling_does_not_hold_the_noise_of_all_steps():
     process, sampler = respace(FULL, 100), SamplerConfig()
     shape = (1000, 3)
-    program = jax.jit(
-        lambda key: sample_with_key(gaussian_network(process), key, shape, process, sampler, CLIP)
-    ).lower(jax.random.key(0))
+    program = jax.jit(lambda key: sample_with_key(gaussian_network(process), key, shape, process, sampler, CLIP)).lower(
+        jax.random.key(0)
+    )
     assert program.compile().memory_analysis().temp_size_in_bytes < 100 * 4 * math.prod(shape) / 4
 
 

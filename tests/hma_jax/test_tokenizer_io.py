@@ -19,9 +19,7 @@ from hma_jax.tokenizers.io import DESCRIPTION, WEIGHTS, load_tokenizer, save_tok
 from hma_jax.tokenizers.lfq import LfqTokenizer
 
 PAGE = Path(__file__).parents[2] / "docs" / "checkpoints.md"
-CONFIG = TokenizerConfig(
-    image_size=8, downsample=4, bits=4, factors=2, channels=4, encoder_blocks=1, decoder_blocks=1
-)
+CONFIG = TokenizerConfig(image_size=8, downsample=4, bits=4, factors=2, channels=4, encoder_blocks=1, decoder_blocks=1)
 CONTINUOUS = replace(CONFIG, quantise=False)
 BOTH = {"lfq": CONFIG, "continuous": CONTINUOUS}
 

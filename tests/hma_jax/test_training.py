@@ -135,7 +135,9 @@ def test_divergence_stops_the_run_and_spares_the_last_checkpoint(tmp_path: Path)
                 batch["actions"][:] = np.nan
             yield batch
 
-    with pytest.raises(DivergedError, match="loss is nan at step 4; lower the learning rate .* in a new output directory"):
+    with pytest.raises(
+        DivergedError, match="loss is nan at step 4; lower the learning rate .* in a new output directory"
+    ):
         train(tmp_path, make=poisoned)
     assert load_run(tmp_path).step == 2
     with pytest.raises(CheckpointError, match="learning_rate: 0.001 -> 0.0001"):  # as the advice says
@@ -167,9 +169,7 @@ def test_training_lowers_the_loss_on_a_repeated_batch(tmp_path: Path):
         while True:
             yield one
 
-    config = train_config(
-        steps=60, optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=5, clip_norm=10.0)
-    )
+    config = train_config(steps=60, optimizer=OptimizerConfig(learning_rate=1e-2, warmup_steps=5, clip_norm=10.0))
     losses = train(tmp_path, config=config, make=same, options=LoopOptions()).losses
     assert losses[-1] < 0.8 * losses[0]
 

@@ -41,9 +41,7 @@ def kill_after(run_dir: Path, step: int) -> None:
 
 
 @pytest.mark.parametrize("step", [pytest.param(5, marks=pytest.mark.slow), 9])
-def test_a_killed_run_continued_is_byte_equal_to_one_never_killed(
-    tmp_path: Path, whole: Path, step: int
-):
+def test_a_killed_run_continued_is_byte_equal_to_one_never_killed(tmp_path: Path, whole: Path, step: int):
     kill_after(tmp_path, step)
     finish(tmp_path)
     assert (tmp_path / "metrics.jsonl").read_bytes() == (whole / "metrics.jsonl").read_bytes()

@@ -46,9 +46,15 @@ def test_no_large_parameter_of_the_base_model_is_left_whole(diffusion, mesh, con
 
 def test_robots_are_split_by_width_and_by_their_number_only_where_no_width_divides():
     mesh = fake_mesh(1, 8, 1)
-    assert partition(("N", "E", "D", "D_out"), (2, 40, 32, 32), mesh, STORAGE) == PartitionSpec(None, None, "fsdp", None)
-    assert partition(("N", "E", "D", "D_out"), (2, 40, 36, 32), mesh, STORAGE) == PartitionSpec(None, None, None, "fsdp")
-    assert partition(("N", "E", "D", "D_out"), (2, 40, 36, 36), mesh, STORAGE) == PartitionSpec(None, "fsdp", None, None)
+    assert partition(("N", "E", "D", "D_out"), (2, 40, 32, 32), mesh, STORAGE) == PartitionSpec(
+        None, None, "fsdp", None
+    )
+    assert partition(("N", "E", "D", "D_out"), (2, 40, 36, 32), mesh, STORAGE) == PartitionSpec(
+        None, None, None, "fsdp"
+    )
+    assert partition(("N", "E", "D", "D_out"), (2, 40, 36, 36), mesh, STORAGE) == PartitionSpec(
+        None, "fsdp", None, None
+    )
     assert partition(("E", "D"), (41, 36), mesh, STORAGE) == PartitionSpec(None, None)
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec
 
 from hma_jax.config import MeshConfig
+from hma_jax.runtime.mesh import make_mesh
 from hma_jax.runtime.processes import Agreement, Processes, end, from_writer, is_writer, start, tell, writer_first
 from hma_jax.runtime.rows import lay_out, own_rows
-from hma_jax.runtime.mesh import make_mesh
 
 
 def main(path: str) -> None:

@@ -113,7 +113,9 @@ def _work(name: str, inputs: int, seconds: float, state: Path) -> None:
     """One piece of one parser's run, in a process of its own; the record is written as it goes on."""
     home, record = state / name, state / f"{name}.json"
     (home / "kept").mkdir(parents=True, exist_ok=True)
-    done = json.loads(record.read_text()) if record.exists() else {"inputs": 0, "accepted": 0, "seconds": 0, "found": {}}
+    done = (
+        json.loads(record.read_text()) if record.exists() else {"inputs": 0, "accepted": 0, "seconds": 0, "found": {}}
+    )
     scratch = Path(tempfile.mkdtemp(prefix=f"hma-fuzz-{name}-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     target = make_target(name, scratch)
     check = Checker(target, home / "failures")
@@ -194,7 +196,11 @@ def main() -> None:
                 [*command, "--seconds", str(args.seconds), "--state", str(args.state)], stdout=log, stderr=log
             )
         record = args.state / f"{name}.json"
-        done = json.loads(record.read_text()) if record.exists() else {"inputs": 0, "accepted": 0, "seconds": 0, "found": {}}
+        done = (
+            json.loads(record.read_text())
+            if record.exists()
+            else {"inputs": 0, "accepted": 0, "seconds": 0, "found": {}}
+        )
         wrong += len(done["found"]) + (ended.returncode != 0)
         rate = done["inputs"] / max(done["seconds"], 1e-9)
         print(f"{name}: {done['inputs']:,} inputs, {done['accepted']:,} accepted, {rate:,.0f} per second", flush=True)

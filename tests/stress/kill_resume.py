@@ -111,7 +111,9 @@ class Stress:
         ended, terms = min(found.kills + found.left, kills), min(found.left, kills)
         if found.good:
             shutil.rmtree(place)
-        return Round(TOKENISING, number, ended, terms, found.in_saves, found.good, problem="" if found.good else str(found))
+        return Round(
+            TOKENISING, number, ended, terms, found.in_saves, found.good, problem="" if found.good else str(found)
+        )
 
     # --- One command -------------------------------------------------------------------------
 
@@ -123,9 +125,7 @@ class Stress:
             if ended == kills:
                 break
             in_save, how = draw.random() < IN_SAVES, signal.SIGTERM if draw.random() < TERM else signal.SIGKILL
-            process = self._start(
-                subject.command(place), place, draw.randint(1, max(steps, 1)) if in_save else 0, how
-            )
+            process = self._start(subject.command(place), place, draw.randint(1, max(steps, 1)) if in_save else 0, how)
             if not in_save:
                 process.join(draw.uniform(0, seconds))
                 if process.is_alive():
@@ -187,7 +187,9 @@ class Stress:
         process = self._start(command, place)
         process.join()
         if process.exitcode != Exit.DONE:
-            raise SystemExit(f"`hma {' '.join(command)}` ended with exit code {process.exitcode}, see {place}/output.txt")
+            raise SystemExit(
+                f"`hma {' '.join(command)}` ended with exit code {process.exitcode}, see {place}/output.txt"
+            )
         return sum(line["what"] == "counts" and int(line["place"]) for line in read(place / "steps.jsonl"))
 
     def figures(self) -> str:

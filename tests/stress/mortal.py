@@ -13,8 +13,8 @@ from pathlib import Path
 
 import tensorflow_datasets  # noqa: F401  once, in the server that processes are forked from
 
-import data_pipelines.loading.frames
-import data_pipelines.loading.loader
+import data_pipelines.loading.frames  # noqa: F401
+import data_pipelines.loading.loader  # noqa: F401
 import experiments.preparing.pipeline
 import experiments.preparing.suite
 import experiments.preparing.tokenizer

@@ -189,9 +189,7 @@ def _change_rest(rng: random.Random, data: bytes) -> bytes:
 
 
 def _manifest(root: Path) -> Target:
-    sound = replace(
-        OneDataset([5, 6, 7]).manifest("toy"), spec=replace(make_spec(dims=(2, 1)), camera="a")
-    )
+    sound = replace(OneDataset([5, 6, 7]).manifest("toy"), spec=replace(make_spec(dims=(2, 1)), camera="a"))
     sound = replace(sound, train=replace(sound.train, parts=(2, 1)))
     now, before = root / "now", root / "before"
     for home in (now, before):

@@ -26,14 +26,14 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.sources.units import Episode, LeftOut, UnitError
-from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
-from data_pipelines.sources.settings import Ego4dSettings
-from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.names import is_name, shown
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.rlds.writer import encode_jpeg
+from data_pipelines.sources.settings import Ego4dSettings
+from data_pipelines.sources.units import Episode, LeftOut, UnitError
+from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from hma_jax.config.json import to_dict
 
 NAME = "ego4d"

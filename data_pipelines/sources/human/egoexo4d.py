@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.sources.units import Episode, LeftOut, UnitError
-from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
-from data_pipelines.sources.settings import EgoExo4dSettings
-from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from data_pipelines.errors import DataError
 from data_pipelines.names import is_name, shown
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.human.hands import LAYOUT, NONE, cut_episodes, destination
 from data_pipelines.sources.rlds.writer import encode_jpeg
+from data_pipelines.sources.settings import EgoExo4dSettings
+from data_pipelines.sources.units import Episode, LeftOut, UnitError
+from data_pipelines.sources.video import ADVICE, Video, open_video, shrink
 from hma_jax.config.json import to_dict
 
 NAME = "exoego4d"
@@ -94,9 +94,7 @@ class EgoExo4dSource:
                 raise UnitError(f"{path}: {video.rate:g} frames per second, not {HZ:g}. {ADVICE}")
             yield from cut_episodes(
                 rows,
-                lambda at: [
-                    encode_jpeg(shrink(f, self.settings.short_side)) for f in video.frames(at / video.rate)
-                ],
+                lambda at: [encode_jpeg(shrink(f, self.settings.short_side)) for f in video.frames(at / video.rate)],
                 action=destination,
                 min_frames=self.settings.min_frames,
                 max_steps=MAX_STEPS,
@@ -120,9 +118,7 @@ class EgoExo4dSource:
                     xy = [float(joints[wrist][axis]) for wrist in WRISTS for axis in ("x", "y")]
                     found[_frame_number(frame)] = np.array(xy) / size
             except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-                raise UnitError(
-                    f"{path}: frame {frame!r} has no usable annotation2D ({error!r}). {ADVICE}"
-                ) from error
+                raise UnitError(f"{path}: frame {frame!r} has no usable annotation2D ({error!r}). {ADVICE}") from error
         numbers = sorted(found)
         return np.array(numbers, np.int64), np.array([found[n] for n in numbers]).reshape(-1, 4)
 

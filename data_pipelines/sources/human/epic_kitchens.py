@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 
-from data_pipelines.sources.human.detections import ADVICE, read_hands
-from data_pipelines.sources.units import Episode, LeftOut, UnitError
-from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, displacement
-from data_pipelines.sources.settings import EpicKitchensSettings
-from data_pipelines.sources.video import stored_jpeg
 from data_pipelines.errors import DataError
 from data_pipelines.registry import get_spec
+from data_pipelines.sources.human.detections import ADVICE, read_hands
+from data_pipelines.sources.human.hands import LAYOUT, cut_episodes, displacement
+from data_pipelines.sources.settings import EpicKitchensSettings
+from data_pipelines.sources.units import Episode, LeftOut, UnitError
+from data_pipelines.sources.video import stored_jpeg
 from hma_jax.config.json import to_dict
 
 NAME = "epic_kitchen"
@@ -61,9 +61,7 @@ class EpicKitchensSource:
         found = sorted(p.name for p in self.frames.glob("P*/rgb_frames/P*_*") if p.is_dir())
         self.units = [video for video in found if self._pickle(video).is_file()]
         if not self.units:
-            what = (
-                f"{found[0]} has no {self._pickle(found[0])}" if found else "it has no P*/rgb_frames/<video>/"
-            )
+            what = f"{found[0]} has no {self._pickle(found[0])}" if found else "it has no P*/rgb_frames/<video>/"
             raise DataError(
                 f"{frames}: no video with frames and detections ({what}). Extract the tar files of "
                 "rgb_frames, and give the folder hand-objects with --detections."

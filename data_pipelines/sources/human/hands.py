@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from data_pipelines.sources.units import Episode, Layout, LeftOut
 from data_pipelines.sources.rlds.writer import image_field
+from data_pipelines.sources.units import Episode, Layout, LeftOut
 
 IMAGE, STATE, ACTION = "observation/image", "observation/state", "action"
 LAYOUT = Layout({IMAGE: image_field(None, None)}, {ACTION: 4, STATE: 4}, knows_success=False)

@@ -110,9 +110,7 @@ class RldsDataset(EpisodeSource):
     # --- episodes ----------------------------------------------------------------------------
 
     @contextmanager
-    def open_episode(
-        self, i: int, image_key: str, action_keys: Sequence[str]
-    ) -> Iterator[OpenEpisode]:
+    def open_episode(self, i: int, image_key: str, action_keys: Sequence[str]) -> Iterator[OpenEpisode]:
         """As `EpisodeSource.open_episode`. Raises CorruptRecordError, an EpisodeError, for damaged bytes."""
         self.check_keys(image_key, action_keys)
         image_key, action_keys = step_key(image_key), [step_key(k) for k in action_keys]
@@ -164,9 +162,7 @@ class RldsDataset(EpisodeSource):
     # --- inside ------------------------------------------------------------------------------
 
     @contextmanager
-    def _open(
-        self, i: int, keys: Sequence[str] | None, lazy: bool = True
-    ) -> Iterator[dict[str, Feature]]:
+    def _open(self, i: int, keys: Sequence[str] | None, lazy: bool = True) -> Iterator[dict[str, Feature]]:
         path, offset, length = self._place(i)
         opened = array_record.open_record if self._in_array_records else open_record
         with opened(path, offset, length) as payload:
@@ -223,6 +219,5 @@ class RldsDataset(EpisodeSource):
         except ValueError as error:
             raise self._unusable(
                 i,
-                f"step {step} of {key!r} cannot be decoded: {error}. "
-                "Repair the episode, or read with corrupt='skip'.",
+                f"step {step} of {key!r} cannot be decoded: {error}. Repair the episode, or read with corrupt='skip'.",
             ) from error

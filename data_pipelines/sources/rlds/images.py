@@ -28,9 +28,7 @@ def decode_image(data: bytes, at_least: int = 0) -> np.ndarray:
     """
     if data.startswith(JPEG_MAGIC):
         _check_pixels(data, *simplejpeg.decode_jpeg_header(data)[:2])
-        return simplejpeg.decode_jpeg(
-            data, colorspace="RGB", fastdct=True, min_height=at_least, min_width=at_least
-        )
+        return simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=True, min_height=at_least, min_width=at_least)
     try:
         with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
             _check_pixels(data, *image.size)

@@ -203,9 +203,7 @@ def _settled(shard: Location, stamp: str, began: float) -> str:
     return stamp if is_remote(shard) or int(stamp) / 1e9 < began - SETTLED else ""
 
 
-def _check_places(
-    new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Sequence[Location], path: Path
-) -> None:
+def _check_places(new: Mapping[str, Shard], old: Mapping[str, Shard], shards: Sequence[Location], path: Path) -> None:
     """Two shards whose names were exchanged would exchange their episodes' names too."""
     before = {s.digest: s.name for s in old.values() if s.records}
     for shard in shards:
@@ -241,8 +239,7 @@ def _write(
 ) -> RecordIndex:
     known = [made[shard.name] for shard in shards if shard.name in made]
     columns = {
-        name: np.concatenate([rows[name] for _, rows in known] or [np.zeros(0, kind)])
-        for name, kind in COLUMNS.items()
+        name: np.concatenate([rows[name] for _, rows in known] or [np.zeros(0, kind)]) for name, kind in COLUMNS.items()
     }
     index = RecordIndex([shard for shard, _ in known], columns)
     try:

@@ -254,4 +254,3 @@ def write_shard(path: str | Path, records: Iterable[bytes]) -> int:
     finally:
         aside.unlink(missing_ok=True)
     return count
-

@@ -14,8 +14,8 @@ import numpy as np
 
 from experiments.applications.detector import Detector
 from experiments.applications.endurance.drives import Drive
-from hma_jax.evaluation.metrics import psnr
 from hma_jax.config import ConfigError
+from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.simulator.simulator import Simulator
 

@@ -126,7 +126,9 @@ def open_trajectories(
     path = Path(place)
     if not path.exists() and stores.is_dir() and "/" not in place:
         there = TokenStore(stores).names
-        require(place in there, f"{place}: no such directory, and {stores} has tokens of {', '.join(there) or 'nothing'}")
+        require(
+            place in there, f"{place}: no such directory, and {stores} has tokens of {', '.join(there) or 'nothing'}"
+        )
         path = stores / place
     stored = (path / MANIFEST).is_file()
     name = path.name if stored else source_name(place)

@@ -71,9 +71,7 @@ async def serve(app: web.Application, host: str, port: int, ready: Callable[[int
         await runner.cleanup()
 
 
-async def _crowd(
-    app: web.Application, simulator: Simulator, truth: Truth, together: int | None
-) -> AsyncIterator[None]:
+async def _crowd(app: web.Application, simulator: Simulator, truth: Truth, together: int | None) -> AsyncIterator[None]:
     crowd = app[CROWD] = Crowd(simulator, truth, together)
     serving = asyncio.create_task(crowd.serve())
     yield

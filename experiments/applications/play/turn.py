@@ -74,9 +74,7 @@ def answer(simulator: Simulator, truth: Truth, wishes: Mapping[int, tuple[Seat, 
     return replies
 
 
-def _act(
-    simulator: Simulator, wishes: Mapping[int, tuple[Seat, Wish]], acting: Mapping[int, np.ndarray]
-) -> None:
+def _act(simulator: Simulator, wishes: Mapping[int, tuple[Seat, Wish]], acting: Mapping[int, np.ndarray]) -> None:
     actions: list[np.ndarray | None] = [None] * len(simulator)
     for visitor, chunk in acting.items():
         actions[wishes[visitor][0].episode] = chunk

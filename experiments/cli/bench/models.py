@@ -80,9 +80,7 @@ def train(bench: OmitArgPrefixes[Bench], remat: Remat = "products") -> None:
     from experiments.bench.train import time_training
 
     subject = _subject(bench, remat=remat)
-    stages = _over_batches(
-        bench, "training steps", lambda rows: time_training(subject, rows, bench.repeats)
-    )
+    stages = _over_batches(bench, "training steps", lambda rows: time_training(subject, rows, bench.repeats))
     found = _ratios(bench, stages, "step", "forward") | _ratios(bench, stages, "step", "plain")
     _finish("train", bench, subject, stages, found, {})
 
@@ -122,9 +120,7 @@ def evaluate(
     from hma_jax.config import EvalConfig
 
     subject, config = _subject(bench), EvalConfig(context=context, random_actions=draws)
-    stages = _over_batches(
-        bench, "evaluation", lambda rows: time_evaluation(subject, rows, config, bench.repeats)
-    )
+    stages = _over_batches(bench, "evaluation", lambda rows: time_evaluation(subject, rows, config, bench.repeats))
     found = _ratios(bench, stages, "literal", "protocol")
     _finish(f"eval-{context}", bench, subject, stages, found, {"eval": config})
 
@@ -140,9 +136,7 @@ def _over_batches(bench: Bench, what: str, measure: Callable[[int], list[Stage]]
 def _ratios(bench: Bench, stages: Sequence[Stage], above: str, below: str) -> dict[str, float]:
     """How much longer one stage takes than another, at each batch."""
     median = {(s.name, s.batch): s.timing.median for s in stages}
-    return {
-        f"{above} / {below}, batch {rows}": median[above, rows] / median[below, rows] for rows in bench.batch
-    }
+    return {f"{above} / {below}, batch {rows}": median[above, rows] / median[below, rows] for rows in bench.batch}
 
 
 def _subject(bench: Bench, remat: Remat = "products") -> Subject:

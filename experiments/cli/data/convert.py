@@ -158,9 +158,7 @@ def _convert(source: Source, destination: Destination, default_name: str) -> Non
 
 def entry(spec: DatasetSpec) -> str:
     """The registry entry as it is written there."""
-    keys, dims = (
-        f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims)
-    )
+    keys, dims = (f"({', '.join(map(repr, v))},)".replace("'", '"') for v in (spec.action_keys, spec.action_dims))
     return (
         f'DatasetSpec("{spec.name}", image_key="{spec.image_key}", action_keys={keys}, '
         f"action_dims={dims}, hz={spec.hz:g}),"
@@ -223,9 +221,7 @@ def import_tokens(
         )
         wrote(store / spec.name)
     if tokenizer is None:
-        _say(
-            "note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets"
-        )
+        _say("note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets")
 
 
 def _say(line: str) -> None:

@@ -38,7 +38,9 @@ class RaySettings:
         for name in ("cpus", "gpus", "tpus"):
             value = getattr(self, name)
             whole = value <= 1 or float(value).is_integer()  # as Ray asks for it
-            require(value >= 0 and whole, f"--launcher-set {name}={value:g}: it must be 0 or more, above 1 a whole number")
+            require(
+                value >= 0 and whole, f"--launcher-set {name}={value:g}: it must be 0 or more, above 1 a whole number"
+            )
         memory = 1.0 if self.memory_gb is None else self.memory_gb
         require(0 < memory < math.inf, f"--launcher-set memory_gb={memory:g}: it must be positive")
         for resource in self.resources:

@@ -39,9 +39,7 @@ def write_video(path: Path, frames: list[int], fps: int, size=(HEIGHT, WIDTH)) -
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(
-            "libx264", rate=fps, options={"crf": "8", "g": "10", "preset": "ultrafast"}
-        )
+        stream = container.add_stream("libx264", rate=fps, options={"crf": "8", "g": "10", "preset": "ultrafast"})
         stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
         for i in frames:
             frame = av.VideoFrame.from_ndarray(picture(i, *size), format="rgb24")
@@ -131,10 +129,7 @@ def write_lerobot(root: Path, version: str, lengths=(12, 9), camera: str = "vide
         "action": {"dtype": "float32", "shape": [3], "names": None},
         "next.success": {"dtype": "bool", "shape": [1], "names": None},
         "next.reward": {"dtype": "float32", "shape": [1], "names": None},
-        **{
-            k: {"dtype": "int64", "shape": [1]}
-            for k in ("episode_index", "frame_index", "index", "task_index")
-        },
+        **{k: {"dtype": "int64", "shape": [1]} for k in ("episode_index", "frame_index", "index", "task_index")},
         "timestamp": {"dtype": "float32", "shape": [1]},
     }
     old = version != "v3.0"
@@ -279,7 +274,5 @@ def write_epic(root: Path, video: str, frames: list[list[bytes]], shown=lambda n
         (folder / f"frame_{n:010d}.jpg").write_bytes(jpeg)
     path = root / "hand-objects" / participant / f"{video}.pkl"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(
-        pickle.dumps([detections(video, n, hands) for n, hands in enumerate(frames, 1)], protocol=3)
-    )
+    path.write_bytes(pickle.dumps([detections(video, n, hands) for n, hands in enumerate(frames, 1)], protocol=3))
     return root / "EPIC", root / "hand-objects"

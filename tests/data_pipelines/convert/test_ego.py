@@ -7,11 +7,11 @@ import json
 import numpy as np
 import pytest
 
+from data_pipelines.convert.write import convert
+from data_pipelines.errors import DataError
 from data_pipelines.sources.human.ego4d import Ego4dSource
 from data_pipelines.sources.human.egoexo4d import EgoExo4dSource
 from data_pipelines.sources.settings import Ego4dSettings, EgoExo4dSettings
-from data_pipelines.convert.write import convert
-from data_pipelines.errors import DataError
 from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, number, read_back, write_video
 
 # --- Ego4D: a video of 10 frames per second, whose frame n is number n ---------------------------
@@ -70,9 +70,7 @@ def test_annotated_frames_are_joined_in_time_and_sampled_evenly(tmp_path):
     assert [number(image) for image in episode.images] == [5, 10, 15, 20]
     expected = np.array([[n / 200, 0.5, (100 + n) / 200, 0.5] for n in (5, 10, 15, 20, 25)])
     np.testing.assert_allclose(episode.actions, expected[1:], atol=1e-6)
-    np.testing.assert_allclose(
-        dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6
-    )
+    np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
 
 
 def test_a_pause_ends_an_episode_and_unusable_frames_do_not_bridge_it(tmp_path):
@@ -135,21 +133,15 @@ def pose(n: int, camera: str = "cam01") -> list[dict]:
         "left_wrist": {"x": 30.0 * n, "y": 540.0, **point},
         "right_wrist": {"x": 1920.0 + 30 * n, "y": 1080.0, **point},
     }
-    return [
-        {"metadata": {"frame_number": n}, "annotation2D": {camera: wrists, "cam02": {}}, "annotation3D": {}}
-    ]
+    return [{"metadata": {"frame_number": n}, "annotation2D": {camera: wrists, "cam02": {}}, "annotation3D": {}}]
 
 
 def egoexo4d(tmp_path, poses: dict, settings=EgoExo4dSettings(min_frames=10), fps=30, size=(HEIGHT, WIDTH)):
-    (tmp_path / "takes.json").write_text(
-        json.dumps([TAKE, {**TAKE, "take_uid": "uid-2", "take_name": "other"}])
-    )
+    (tmp_path / "takes.json").write_text(json.dumps([TAKE, {**TAKE, "take_uid": "uid-2", "take_name": "other"}]))
     path = tmp_path / "annotations/ego_pose/train/hand/automatic/uid-1.json"
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(poses))
-    write_video(
-        tmp_path / "takes/cooking_1/frame_aligned_videos/downscaled/448/cam01.mp4", list(range(47)), fps, size
-    )
+    write_video(tmp_path / "takes/cooking_1/frame_aligned_videos/downscaled/448/cam01.mp4", list(range(47)), fps, size)
     return EgoExo4dSource(tmp_path, settings)
 
 
@@ -169,9 +161,7 @@ def test_clips_of_enough_labelled_frames_are_kept_and_shorter_ones_are_not(tmp_p
     n = np.arange(14, 40)[:, None]
     expected = np.concatenate([30 * n / 3840, 0 * n + 0.25, (1920 + 30 * n) / 3840, 0 * n + 0.5], axis=1)
     np.testing.assert_allclose(episode.actions, expected[1:], atol=1e-6)
-    np.testing.assert_allclose(
-        dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6
-    )
+    np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
 
 
 def test_what_never_shows_both_hands_is_left_out_and_counted(tmp_path):

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from data_pipelines.convert.write import convert
+from data_pipelines.errors import DataError
 from data_pipelines.sources.human.detections import read_hands
 from data_pipelines.sources.human.epic_kitchens import EpicKitchensSource
 from data_pipelines.sources.settings import EpicKitchensSettings
-from data_pipelines.convert.write import convert
-from data_pipelines.errors import DataError
 from tests.data_pipelines.convert.sources import colour, detections, hand, number, read_back, write_epic
 
 LEFT, RIGHT = 0, 1
@@ -41,9 +41,7 @@ def test_frames_positions_and_displacements_at_10_hz(tmp_path, video, step):
     assert [number(image) for image in episode.images] == kept[:-1].tolist()
     expected = rows(1, step, len(kept))
     np.testing.assert_allclose(episode.actions, np.diff(expected, axis=0), atol=1e-6)
-    np.testing.assert_allclose(
-        dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6
-    )
+    np.testing.assert_allclose(dataset.record(0)["steps/observation/state"].reshape(-1, 4), expected[:-1], atol=1e-6)
     assert (
         dataset.record(0)["steps/observation/image"][1]
         == (tmp_path / f"EPIC/{video[:3]}/rgb_frames/{video}/frame_{kept[1]:010d}.jpg").read_bytes()
@@ -99,9 +97,7 @@ def test_a_pickle_that_is_a_program_is_refused_and_not_run(tmp_path):
     frames, folder = write_epic(tmp_path, "P01_01", [moving(1)])
     path = folder / "P01" / "P01_01.pkl"
     path.write_bytes(pickle.dumps([Program()]))
-    with pytest.raises(
-        DataError, match=r"P01_01.pkl: not a pickled list of bytes \(it asks for .*it was not run"
-    ):
+    with pytest.raises(DataError, match=r"P01_01.pkl: not a pickled list of bytes \(it asks for .*it was not run"):
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
     assert not ran.exists()
 
@@ -138,9 +134,7 @@ def test_frames_that_are_missing_damaged_or_of_another_extraction_are_named(tmp_
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
     frame.write_bytes(whole)
     frame.with_name("frame_0000000031.jpg").write_bytes(whole)
-    with pytest.raises(
-        DataError, match="ends with frame 30: frames and detections are of different extractions"
-    ):
+    with pytest.raises(DataError, match="ends with frame 30: frames and detections are of different extractions"):
         convert(EpicKitchensSource(frames, folder, SHORT), tmp_path, "epic")
 
 

@@ -7,10 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from data_pipelines.sources.lerobot import LeRobotSource
-from data_pipelines.sources.settings import LeRobotSettings
 from data_pipelines.convert.write import convert
 from data_pipelines.errors import DataError
+from data_pipelines.sources.lerobot import LeRobotSource
+from data_pipelines.sources.settings import LeRobotSettings
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import (
     CAMERA,
@@ -126,9 +126,7 @@ def test_a_video_that_ends_too_early_or_is_none_is_named(tmp_path):
     root = write_lerobot(tmp_path / "toy", "v3.0")
     path = next(root.rglob("*.mp4"))
     write_video(path, list(range(12)), FPS)
-    with pytest.raises(
-        DataError, match=r"file-000.mp4: no frame at 1.2000 s within 0.0501 s: the nearest is at 1.1"
-    ):
+    with pytest.raises(DataError, match=r"file-000.mp4: no frame at 1.2000 s within 0.0501 s: the nearest is at 1.1"):
         convert(LeRobotSource(root), tmp_path, "arm")
     path.write_bytes(b"no video")
     with pytest.raises(DataError, match="file-000.mp4: no readable video"):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from data_pipelines.convert.write import convert
+from data_pipelines.errors import DataError
 from data_pipelines.sources.robomimic import RobomimicSource, succeeded
 from data_pipelines.sources.robomimic_dataset import RobomimicDataset
 from data_pipelines.sources.settings import RobomimicSettings
-from data_pipelines.convert.write import convert
-from data_pipelines.errors import DataError
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import demo_actions, number, read_back, write_robomimic
 

@@ -257,7 +257,9 @@ def test_shuffled_actions_reach_every_real_frame(tmp_path):
     store = store_of(tmp_path, {"mixed": [8, 30] * 5})
     config = LoaderConfig(frames=6, batch=4)
     table = store.embodiment_table(("mixed",))
-    pairs = zip(take(store, table, 12, config), take(store, table, 12, replace(config, shuffle_actions=True)), strict=True)
+    pairs = zip(
+        take(store, table, 12, config), take(store, table, 12, replace(config, shuffle_actions=True)), strict=True
+    )
     for true, shuffled in pairs:
         assert np.array_equal(true["real"], shuffled["real"]) and np.array_equal(true["tokens"], shuffled["tokens"])
         given = shuffled["actions"][..., 0]  # the number of the episode

@@ -8,8 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from data_pipelines.registry import MIXTURES, DatasetSpec, all_specs, get_mixture, get_spec, known_groups, register
-from data_pipelines.registry import openx_rest
+from data_pipelines.registry import (
+    MIXTURES,
+    DatasetSpec,
+    all_specs,
+    get_mixture,
+    get_spec,
+    known_groups,
+    openx_rest,
+    register,
+)
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.openx import OPENX
 from data_pipelines.registry.openx_counts import EPISODES, LONG

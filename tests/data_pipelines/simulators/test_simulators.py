@@ -18,9 +18,7 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(
-        bool(missing_packages(EMBODIMENTS)), reason="simulators not installed: pip install -e '.[sim]'"
-    ),
+    pytest.mark.skipif(bool(missing_packages(EMBODIMENTS)), reason="simulators not installed: pip install -e '.[sim]'"),
 ]
 
 NAMES = ("pusht", "dmc_reacher", "aloha")

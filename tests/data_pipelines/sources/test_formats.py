@@ -63,7 +63,9 @@ def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
     assert open_source(tmp_path / "elsewhere" / "toy-arm").fingerprint() == source.fingerprint()
     (tmp_path / "机器人").symlink_to(root)
     for read in (open_source, source_name):
-        with pytest.raises(DataError, match="机器人: a LeRobot dataset is called as its folder, which has none of a to z"):
+        with pytest.raises(
+            DataError, match="机器人: a LeRobot dataset is called as its folder, which has none of a to z"
+        ):
             read(tmp_path / "机器人")
 
 
@@ -288,7 +290,11 @@ def test_every_format_is_inspected(places):
         assert spec.image_key in [c.key for c in facts.cameras] and shown[0].instruction
         assert spec.image_key in shown[0].frames and not facts.damaged
         entry = suggest_entry(facts, facts.hz)
-        assert (entry.image_key, entry.action_keys, entry.action_dims) == (spec.image_key, spec.action_keys, spec.action_dims)
+        assert (entry.image_key, entry.action_keys, entry.action_dims) == (
+            spec.image_key,
+            spec.action_keys,
+            spec.action_dims,
+        )
 
 
 # --- damage and failure ----------------------------------------------------------------------------

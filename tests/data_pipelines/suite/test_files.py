@@ -65,9 +65,7 @@ def test_tfds_decodes_exactly_what_was_simulated(suite, name):
     rollout = simulate(spec, seeds)
     for split, i in (("train", 3), ("val", 1)):
         shards = [index_shard(directory / f) for f in builder.info.splits[split].filenames]
-        records = [
-            read_record(s.path, o, n) for s in shards for o, n in zip(s.offsets, s.lengths, strict=True)
-        ]
+        records = [read_record(s.path, o, n) for s in shards for o, n in zip(s.offsets, s.lengths, strict=True)]
         assert sum(map(len, records)) == builder.info.splits[split].num_bytes
         example = builder.info.features.deserialize_example_np(records[i])
         check_episode(spec, example, rollout, i if split == "train" else FEWEST + i)
@@ -156,9 +154,7 @@ def test_images_are_jpegs_without_chroma_subsampling(suite):
 
 def test_bytes_do_not_depend_on_the_number_of_workers(suite, tmp_path):
     seen = []
-    paths = generate_suite(
-        tmp_path, **TINY, names=NAMES, workers=2, progress=lambda name, k, n: seen.append((k, n))
-    )
+    paths = generate_suite(tmp_path, **TINY, names=NAMES, workers=2, progress=lambda name, k, n: seen.append((k, n)))
     assert [p.parent.name for p in paths] == list(NAMES)
     assert seen == [(1, 3), (2, 3), (3, 3)]
     assert contents(tmp_path) == contents(suite)

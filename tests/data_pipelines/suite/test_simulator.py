@@ -52,7 +52,10 @@ def test_what_is_refused_changes_no_episode():
     sim.reset(start)
     now = sim.step([np.array([0.9, 0.0]), None])
     for episodes in ([2], [-1], [0, 0]):
-        for refused in (lambda which=episodes: sim.reset(start, episodes=which), lambda which=episodes: sim.rewind(0, which)):
+        for refused in (
+            lambda which=episodes: sim.reset(start, episodes=which),
+            lambda which=episodes: sim.rewind(0, which),
+        ):
             with pytest.raises(ConfigError, match="episodes must be different numbers below 2"):
                 refused()
     with pytest.raises(ConfigError, match="with which seed"):

@@ -78,9 +78,7 @@ def test_ids_episodes_and_actions_arrive_as_they_are(tmp_path, pair):
     rows = np.arange(21)
     np.testing.assert_allclose(manifest.action_mean, [10, 5, -10])
     np.testing.assert_allclose(manifest.action_std[0], rows.std())
-    assert (
-        len(train_windows(store, "toy_arm", 3, least=3)) == 1 + 0 + 2
-    )  # 6 native frames each, starts every other one
+    assert len(train_windows(store, "toy_arm", 3, least=3)) == 1 + 0 + 2  # 6 native frames each, starts every other one
 
 
 def test_latents_become_scaled_patches_in_the_order_the_models_read(tmp_path):

@@ -221,9 +221,7 @@ def test_skipping_too_much_stops_the_job(tmp_path):
 
 def test_progress_reaches_the_number_of_episodes(tmp_path, rlds):
     calls = []
-    tokenize_dataset(
-        SPEC, rlds, FakeTokenizer(), tmp_path / "store", batch=4, progress=lambda *c: calls.append(c)
-    )
+    tokenize_dataset(SPEC, rlds, FakeTokenizer(), tmp_path / "store", batch=4, progress=lambda *c: calls.append(c))
     assert calls[-1] == (8, 8) and len(calls) > 2
 
 

@@ -30,9 +30,7 @@ def test_windows_of_an_episode_do_not_overlap(store):
 
 
 def test_spacing_allows_overlap_when_asked(store):
-    counts = [
-        len(freeze_manifest(store, ("arm",), 4, 500, 0, spacing=s).datasets[0].windows) for s in (4, 2, 1)
-    ]
+    counts = [len(freeze_manifest(store, ("arm",), 4, 500, 0, spacing=s).datasets[0].windows) for s in (4, 2, 1)]
     assert counts == [6, 12, 24]  # two episodes of 15 model frames
 
 
@@ -81,9 +79,7 @@ def test_the_first_windows_of_each_dataset_alone(store, table, manifest):
 def test_latents_come_in_the_windows_of_the_ids(store, latent_store, table, manifest):
     frozen = freeze_manifest(latent_store, store.names, frames=4, windows_per_dataset=5, seed=0)
     assert frozen.datasets == manifest.datasets
-    pairs = zip(
-        eval_batches(store, table, manifest, 2), eval_batches(latent_store, table, frozen, 2), strict=True
-    )
+    pairs = zip(eval_batches(store, table, manifest, 2), eval_batches(latent_store, table, frozen, 2), strict=True)
     for a, b in pairs:
         assert b["tokens"].shape == (2, 4, 4, 3) and b["tokens"].dtype == np.float32
         assert np.array_equal(b["tokens"][..., 0] * 256 + b["tokens"][..., 1], a["tokens"])
@@ -187,7 +183,9 @@ def test_short_episodes_are_judged_up_to_their_end(tmp_path):
         assert real.tolist() == [True, True, True, name == "long"]
         assert all((x[~real] == 0).all() and (x[:3] != 0).any() for x in arrays)
     whole = freeze_manifest(store, store.names, 4, 5, 0)
-    assert whole.names == ("long",) and "real" not in next(eval_batches(store, store.embodiment_table(("long",)), whole, 2))
+    assert whole.names == ("long",) and "real" not in next(
+        eval_batches(store, store.embodiment_table(("long",)), whole, 2)
+    )
 
 
 def test_windows_frozen_by_an_earlier_version_are_read(manifest, tmp_path):

@@ -61,7 +61,10 @@ def test_retrieval_among_other_numbers_is_not_compared():
     """The true actions are found by chance once in four, or once in sixteen."""
 
     def among(side, number):
-        chance = {"retrieval": np.zeros(len(side.seeds[0])), "retrieval_chance": np.full(len(side.seeds[0]), 1 / number)}
+        chance = {
+            "retrieval": np.zeros(len(side.seeds[0])),
+            "retrieval_chance": np.full(len(side.seeds[0]), 1 / number),
+        }
         return replace(side, seeds={s: replace(t, metrics=t.metrics | chance) for s, t in side.seeds.items()})
 
     a, b = sides()

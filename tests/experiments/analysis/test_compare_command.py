@@ -113,7 +113,10 @@ def write_evaluated(directory, windows, seed=None):
 
 @pytest.mark.parametrize(
     ("seed", "kept"),
-    [(1, "1 is compared."), (None, "0 is compared. model does not say with which seed it was trained, and stands for 0.")],
+    [
+        (1, "1 is compared."),
+        (None, "0 is compared. model does not say with which seed it was trained, and stands for 0."),
+    ],
 )
 def test_an_evaluated_model_is_compared_with_a_study_of_its_seed(seed, kept, table, tmp_path, capsys):
     """It stood for seed 0, whichever it was trained with."""

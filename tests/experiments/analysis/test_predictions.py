@@ -157,7 +157,9 @@ def test_an_axis_of_a_file_is_predicted(root):
 
 
 def test_of_several_curves_one_is_chosen(root, capsys):
-    with_own_axis(root, "replace(sweep, points=tuple(replace(p, series=s) for s in ('a/b', 'as well') for p in sweep.points))")
+    with_own_axis(
+        root, "replace(sweep, points=tuple(replace(p, series=s) for s in ('a/b', 'as well') for p in sweep.points))"
+    )
     assert predict_own(root, "own") == 2
     said = " ".join(capsys.readouterr().err.split())
     assert f"which curve of own? Write one of own-a/b={HELD}, 'own-as well={HELD}'" in said

@@ -25,7 +25,13 @@ def write_trial(trials: Path, trial: Trial, windows: WindowTable, provenance=PRO
                                                     "execution": to_dict(ExecutionConfig())}))  # fmt: skip
     windows.save(directory / FILE, directory.name)
     evaluation = summarise(windows, trial.eval.perplexity_group).to_dict()
-    result = {"evaluation": evaluation, "untrained": None, "training_loss": last_loss([3.0, 2.0]), "parameters": 10, "train_flops": 1e9}
+    result = {
+        "evaluation": evaluation,
+        "untrained": None,
+        "training_loss": last_loss([3.0, 2.0]),
+        "parameters": 10,
+        "train_flops": 1e9,
+    }
     write_result(directory, result)
     return directory
 

@@ -1,1 +1,1 @@
-from tests.hma_jax.simulator.compiled import shared_programs  # noqa: F401: a fixture
+from tests.hma_jax.simulator.compiled import shared_programs  # noqa: F401  a fixture

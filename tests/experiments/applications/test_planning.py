@@ -115,6 +115,9 @@ def test_the_learned_model_imagines_again_from_the_same_present():
 
 def test_a_figure_shows_planners_that_always_or_never_succeed(tmp_path):
     episode = {"distance": 0.1, "seconds": 1.0}
-    tried = {"MPPI in the model": [episode | {"success": True}] * 50, "random actions": [episode | {"success": False}] * 5}
+    tried = {
+        "MPPI in the model": [episode | {"success": True}] * 50,
+        "random actions": [episode | {"success": False}] * 5,
+    }
     draw(summarise(tried), tmp_path / "planning.png")
     assert (tmp_path / "planning.png").exists()

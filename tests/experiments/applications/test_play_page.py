@@ -193,7 +193,9 @@ def test_two_visitors_do_not_mix_and_a_third_is_told(browsing):
         assert other[:7] == pytest.approx([0.5] * 7, abs=0.01), "the arm's rest"
         third = await (await browser.new_context(bypass_csp=True)).new_page()
         await third.goto(address)
-        await third.wait_for_function("document.getElementById('status').textContent.includes('seats')", timeout=PATIENCE)
+        await third.wait_for_function(
+            "document.getElementById('status').textContent.includes('seats')", timeout=PATIENCE
+        )
 
     browsing(test)
 
@@ -209,7 +211,9 @@ def test_what_is_clicked_while_an_answer_is_under_way_does_not_make_the_next_one
         for button in ("#again", "#record", "#again", "#robots button[data-name=arm]", "#starts button", "#record"):
             await page.evaluate(f"document.querySelector('{button}').click()")
         await page.wait_for_function("document.body.dataset.count > 5")
-        asked = [(talk[:i].count("<") - 1, i - talk[:i].count("<")) for i in range(first, len(talk)) if talk[i] == "act"]
+        asked = [
+            (talk[:i].count("<") - 1, i - talk[:i].count("<")) for i in range(first, len(talk)) if talk[i] == "act"
+        ]
         assert len(asked) > 3 and all(a == b for a, b in asked), f"(answers but for the greeting, questions): {asked}"
         await page.wait_for_function("+document.getElementById('latency').textContent >= 50")
         assert not page.faults

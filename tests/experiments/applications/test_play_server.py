@@ -36,7 +36,9 @@ from tests.hma_jax.simulator.small import simulator
 def test_the_page_and_what_it_must_know_are_served():
     async def test(client):
         page = await (await client.get("/")).text()
-        assert "<!doctype html>" in page and "http" + "://" not in page.replace("connect-src", ""), "it needs nothing from elsewhere"
+        assert "<!doctype html>" in page and "http" + "://" not in page.replace("connect-src", ""), (
+            "it needs nothing from elsewhere"
+        )
         robots = await (await client.get("/robots")).json()
         assert [(r["name"], len(r["starts"]), len(r["dimensions"]), r["truth"]) for r in robots] == [
             ("pusher", 2, 2, False),
@@ -469,7 +471,9 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
         await player.drive(0.45, 1)
         assert (await ask(player.socket, type="record", on=False))["recorded"] == 4
         await player.drive(0.5, 1)
-        assert (await ask(player.socket, type="rewind", frames=2))["recorded"] == 4, "a finished recording stays as it is"
+        assert (await ask(player.socket, type="rewind", frames=2))["recorded"] == 4, (
+            "a finished recording stays as it is"
+        )
 
         video = await (await client.get(f"/recording/{player.token}/mp4")).read()
         import av

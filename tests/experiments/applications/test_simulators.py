@@ -35,7 +35,12 @@ def run(tmp_path_factory):
 def test_robots_of_the_suite_are_described_and_begin_at_held_out_episodes(run):
     simulator = load_simulator(run)
     pusher, gripper = simulator.robots.values()
-    assert (pusher.dimensions, pusher.unit, pusher.keeps, pusher.recorded) == (("xy x", "xy y"), "per step", False, False)
+    assert (pusher.dimensions, pusher.unit, pusher.keeps, pusher.recorded) == (
+        ("xy x", "xy y"),
+        "per step",
+        False,
+        False,
+    )
     assert gripper.keeps and gripper.hz == 4.0
     assert {s.robot for s in simulator.starts} == {"pusher_sand", "gripper_wood"}
     assert all(s.seed is not None and s.images.shape == (3, 8, 8, 3) for s in simulator.starts)

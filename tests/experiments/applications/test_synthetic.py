@@ -146,7 +146,8 @@ def test_the_second_control_is_a_model_without_actions_which_shows_the_same_unde
     images, acted = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8), rng.uniform(-1, 1, (2, 4, 2)).astype(np.float32)
     demos = Demonstrations(images, acted, 4 * ones, np.ones((2, 4), bool), ones > 0, ones)
     shown = [
-        synthetic.imagine(blind, robot, replace(demos, actions=a), 1, lambda *_: None) for a in (acted, others_actions(demos))
+        synthetic.imagine(blind, robot, replace(demos, actions=a), 1, lambda *_: None)
+        for a in (acted, others_actions(demos))
     ]
     np.testing.assert_array_equal(*shown)
     assert (shown[0][:, 1:] != images[:, 1:]).any()

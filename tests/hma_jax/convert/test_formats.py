@@ -58,9 +58,7 @@ def test_training_goes_on_from_a_converted_run(tmp_path):
     run = replace(small_run(), step=0)
     write_run(run, tmp_path / "run")
     make = batches(run.model)
-    result = train_model(
-        run.model, run.table, run.train, make, run_dir=tmp_path / "run", provenance=run.provenance
-    )
+    result = train_model(run.model, run.table, run.train, make, run_dir=tmp_path / "run", provenance=run.provenance)
     assert result.resumed_from == 0 and len(result.losses) == 2
     after = load_run(tmp_path / "run")
     assert after.step == 2
@@ -81,9 +79,7 @@ def test_safetensors_bring_everything_back(changes, tmp_path):
     same(read_neutral(tmp_path / "out"), run)
     described = json.loads((tmp_path / "out" / "model.json").read_text())["tensors"]
     stored = read_safetensors(tmp_path / "out" / "model.safetensors")
-    assert {name: tuple(t["shape"]) for name, t in described.items()} == {
-        n: t.shape for n, t in stored.items()
-    }
+    assert {name: tuple(t["shape"]) for name, t in described.items()} == {n: t.shape for n, t in stored.items()}
     assert described["stem/into/kernel"] == {"shape": [3, 14, 32], "axes": ["E", "U", "D"], "role": "input"}
 
 
@@ -155,9 +151,7 @@ assert not [name for name in sys.modules if name.split(".")[0] in ("hma_jax", "e
     "changes, decode",
     [
         ({}, DecodeConfig(2, 1.0)),
-        pytest.param(
-            {"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3)), marks=pytest.mark.slow
-        ),
+        pytest.param({"diffusion": DIFFUSION}, DecodeConfig(2, sampler=SamplerConfig(steps=3)), marks=pytest.mark.slow),
     ],
     ids=["discrete", "continuous"],
 )
@@ -174,9 +168,7 @@ def test_the_program_generates_the_same_frames_where_this_project_is_not_install
         "key": key,
     }
     np.savez(out / "inputs.npz", **given)
-    done = subprocess.run(
-        [sys.executable, "-I", "-c", SCRIPT, str(out)], capture_output=True, text=True, cwd="/"
-    )
+    done = subprocess.run([sys.executable, "-I", "-c", SCRIPT, str(out)], capture_output=True, text=True, cwd="/")
     assert done.returncode == 0, done.stderr
 
     declared = lively_params(run.model)[0]

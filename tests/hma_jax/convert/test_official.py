@@ -46,9 +46,7 @@ def test_there_and_back_is_byte_identical(base, robots, tmp_path):
     start = make_checkpoint(tmp_path / "a", base, robots)
     run = read_official(start)
     assert run.table.names == tuple(name for name, _, _ in robots)
-    assert [(e.action_dim, e.stride) for e in run.table.entries] == [
-        (dim, stride) for _, dim, stride in robots
-    ]
+    assert [(e.action_dim, e.stride) for e in run.table.entries] == [(dim, stride) for _, dim, stride in robots]
     remarks = write_official(run, tmp_path / "b")
     same_files(start, tmp_path / "b")
     loads = loads_in_release(json.loads((tmp_path / "b" / "config.json").read_text()))

@@ -155,7 +155,10 @@ def test_action_values_that_do_not_vary_are_nothing_to_the_release_either(change
 
 
 def test_the_release_is_given_the_scale_that_the_model_has_in_both_files():
-    config, robot = model_config(frames=3), Embodiment("push", 2, 1, (0.0, 1.0), (1.0, 2.0), low=(-3.0, 0.0), high=(1.0, 8.0))
+    config, robot = (
+        model_config(frames=3),
+        Embodiment("push", 2, 1, (0.0, 1.0), (1.0, 2.0), low=(-3.0, 0.0), high=(1.0, 8.0)),
+    )
     table = EmbodimentTable((robot,))
     run = Run(config, train_config(), table, declare_model(config, table).init(0), 7, {})
     tensors, said = official_tensors(run)[0], official_config(run)["action_stats"]

@@ -128,9 +128,7 @@ def test_an_official_checkpoint_may_be_a_torch_file(name, tmp_path):
     (folder / "model.safetensors").rename(tmp_path / "expected.safetensors")
     write_torch(folder / name, *state_dict({f"module.{key}": x for key, x in tensors.items()}))
     write_official(read_official(folder), tmp_path / "b")
-    assert (tmp_path / "b" / "model.safetensors").read_bytes() == (
-        tmp_path / "expected.safetensors"
-    ).read_bytes()
+    assert (tmp_path / "b" / "model.safetensors").read_bytes() == (tmp_path / "expected.safetensors").read_bytes()
 
 
 class Malicious:
@@ -191,9 +189,7 @@ def test_other_files_and_other_contents_are_named(tmp_path):
     with pytest.raises(ConfigError, match="something else than names and tensors"):
         read_torch(write_torch(tmp_path / "x.bin", {"step": 3}, {}))
     with pytest.raises(ConfigError, match="cannot be read"):
-        read_torch(
-            write_torch(tmp_path / "y.bin", {"w": rebuild(Storage("FloatStorage", "9", 1), (1,), (1,))}, {})
-        )
+        read_torch(write_torch(tmp_path / "y.bin", {"w": rebuild(Storage("FloatStorage", "9", 1), (1,), (1,))}, {}))
     with zipfile.ZipFile(tmp_path / "z.bin", "w") as archive:
         archive.writestr("readme", "")
     with pytest.raises(ConfigError, match="without a torch state dict"):

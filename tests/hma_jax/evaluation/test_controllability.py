@@ -59,7 +59,12 @@ def test_a_model_deaf_to_actions_tells_nothing_apart(models):
     """To the last bit: every sequence is judged by one program."""
     _, reads, deaf = models
     some = ~np.isnan(deaf.windows.metrics["action_nats"])
-    for metric, want in (("action_nats", 0), ("retrieval", 1 / 16), ("retrieval_rank", 8.5), ("retrieval_chance", 1 / 16)):
+    for metric, want in (
+        ("action_nats", 0),
+        ("retrieval", 1 / 16),
+        ("retrieval_rank", 8.5),
+        ("retrieval_chance", 1 / 16),
+    ):
         np.testing.assert_array_equal(deaf.windows.metrics[metric][some], np.float32(want))
     assert deaf.summary.datasets["pusher"]["counterfactual_gain"].mean == 0
     assert np.abs(reads.windows.metrics["action_nats"][some]).min() > 0

@@ -150,9 +150,9 @@ def test_samples_show_true_predicted_and_randomly_driven_clips(params):
     result = run(params)
     (batch, *_) = make_batches(CONFIG)
     clip = result.samples["pusher"]
-    assert {k: v.shape for k, v in clip.items()} == {
-        k: (1, CONFIG.frames, SIZE, SIZE, 3) for k in ("true", "predicted", "random")
-    }
+    assert {k: v.shape for k, v in clip.items()} == dict.fromkeys(
+        ("true", "predicted", "random"), (1, CONFIG.frames, SIZE, SIZE, 3)
+    )
     np.testing.assert_array_equal(clip["true"][0], batch["images"][0])
     np.testing.assert_array_equal(clip["true"][:, :2], clip["predicted"][:, :2])
     score = psnr(clip["predicted"][0, 2:], clip["true"][0, 2:]).mean()

@@ -57,9 +57,7 @@ TOLERANCE = {"float32": 2e-5, "bfloat16": 2e-2}
 )
 def test_attention_within_frames_is_plain_attention(within, shape: tuple, dtype: str):
     qkv = drawn(0, *shape, dtype=dtype)
-    check_equal(
-        lambda x: within(x, SCALE), lambda x: plain.within(x, SCALE), qkv, tolerance=TOLERANCE[dtype]
-    )
+    check_equal(lambda x: within(x, SCALE), lambda x: plain.within(x, SCALE), qkv, tolerance=TOLERANCE[dtype])
 
 
 @pytest.mark.parametrize("dtype", TOLERANCE)

@@ -76,9 +76,7 @@ def test_padding_the_action_axis_changes_no_bit(rows: tuple, out: int):
 @pytest.mark.parametrize("entries", [5, 3000], ids=["multiplied", "scattered"])
 def test_looking_up_has_the_gradient_of_a_take(entries: int):
     ids = np.random.default_rng(0).integers(0, entries, (3, 4))
-    check_equal(
-        lambda t: look_up(t, ids), lambda t: jnp.take(t, ids, axis=0), drawn(0, entries, 6), tolerance=1e-6
-    )
+    check_equal(lambda t: look_up(t, ids), lambda t: jnp.take(t, ids, axis=0), drawn(0, entries, 6), tolerance=1e-6)
 
 
 def test_a_token_seen_a_thousand_times_gets_all_of_its_gradient():

@@ -44,7 +44,9 @@ def rolled_out(first, chunks: np.ndarray, seed: int, decode: DecodeConfig) -> np
     return tokenizer.decode(np.asarray(made)[0, 0])
 
 
-@pytest.mark.parametrize("decode", [DECODE, pytest.param(STREAMING, marks=pytest.mark.slow)], ids=["exact", "streaming"])
+@pytest.mark.parametrize(
+    "decode", [DECODE, pytest.param(STREAMING, marks=pytest.mark.slow)], ids=["exact", "streaming"]
+)
 def test_episodes_of_different_robots_starts_and_seeds_are_what_rollout_makes_of_each(decode):
     lengths, seeds = (1, 2, 6), (5, 5, 2**32 - 1)
     starts = [start(robot, frames) for robot, frames in enumerate(lengths)]

@@ -96,7 +96,9 @@ def tokenize(root: Path) -> None:
     size = sum(p.stat().st_size for p in root.iterdir()) / 1e6
     records = len(manifest.train.steps) + len(manifest.val.steps)
     peak = _peak()
-    print(f"peak {peak:.0f} MB, growth {peak - at_rest:.0f} MB, for {size:.0f} MB in {records} records, {frames} frames, {seconds:.1f} s")
+    print(
+        f"peak {peak:.0f} MB, growth {peak - at_rest:.0f} MB, for {size:.0f} MB in {records} records, {frames} frames, {seconds:.1f} s"
+    )
 
 
 def _peak() -> float:

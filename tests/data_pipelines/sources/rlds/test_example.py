@@ -42,9 +42,7 @@ def test_real_records_equal_a_protobuf_message(records):
     feature = file.message_type.add(name="Feature")
     feature.oneof_decl.add(name="kind")
     for number, name in ((1, "BytesList"), (2, "FloatList"), (3, "Int64List")):
-        feature.field.add(
-            name=name.lower(), number=number, label=1, type=11, type_name=f".t.{name}", oneof_index=0
-        )
+        feature.field.add(name=name.lower(), number=number, label=1, type=11, type_name=f".t.{name}", oneof_index=0)
     features = file.message_type.add(name="Features")
     entry = features.nested_type.add(name="FeatureEntry")
     entry.options.map_entry = True

@@ -215,7 +215,9 @@ def test_small_records_of_a_remote_shard_share_requests(tmp_path, monkeypatch):
     fs = fsspec.filesystem("memory")
     fs.put(str(tmp_path / "shard"), "/requests/shard")
     asked, read = [], fs.cat_file
-    monkeypatch.setattr(fs, "cat_file", lambda path, start, end: (asked.append(end - start), read(path, start=start, end=end))[1])
+    monkeypatch.setattr(
+        fs, "cat_file", lambda path, start, end: (asked.append(end - start), read(path, start=start, end=end))[1]
+    )
     assert len(index_shard(UPath("memory://requests/shard"))) == 100
     assert len(asked) <= 3
     write_shard(tmp_path / "large", [bytes(2**20)] * 5)

@@ -51,7 +51,9 @@ def fail(monkeypatch, name, number, times):
 def test_a_read_that_fails_for_ever_stops_and_costs_no_episode(directory, monkeypatch, waits, number, corrupt):
     dataset = RldsDataset(directory, corrupt=corrupt)
     fail(monkeypatch, "pread", number, 10**6)
-    with pytest.raises(UnreachableError, match=rf"{directory}.*00000-of-00002: cannot be read .*{os.strerror(number)}") as caught:
+    with pytest.raises(
+        UnreachableError, match=rf"{directory}.*00000-of-00002: cannot be read .*{os.strerror(number)}"
+    ) as caught:
         dataset.episode(0, *KEYS)
     assert not isinstance(caught.value, EpisodeError) and not dataset.skipped
     assert len(waits) == len(location.RETRY_WAITS) and sum(waits) < 15

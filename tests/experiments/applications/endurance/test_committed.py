@@ -95,8 +95,14 @@ def test_robots_that_lose_their_heading_steer_to_the_end_as_the_page_says():
     said = "minute {:.2f} and {:.2f} for rover_road, {:.2f} and {:.2f} for omni_chalk, in no minute below {:.2f}; in the true"
     assert said.format(*ends, worst) in page and f"simulator's own frames {truly:.2f}" in page
     last = [f"{100 * row['object_found']:.0f}" for row in rows if (row["robot"], row["part"]) == ("rover_road", 10)]
-    assert "shows its own in {} % of the last; from the other starts in the third minute, and in {} %".format(*last) in page
-    lost = [[r["part"] for r in rows if r["robot"] == "omni_chalk" and r["start"] == s and r["object_found"] < 0.1] for s in (0, 1)]
+    assert (
+        "shows its own in {} % of the last; from the other starts in the third minute, and in {} %".format(*last)
+        in page
+    )
+    lost = [
+        [r["part"] for r in rows if r["robot"] == "omni_chalk" and r["start"] == s and r["object_found"] < 0.1]
+        for s in (0, 1)
+    ]
     assert [min(parts) for parts in lost] == [4, 3]
     follows = [row["follows"] for row in rows]
     assert f'"follows" wanders from {min(follows):.2f} to {max(follows):.2f}' in page
@@ -105,7 +111,11 @@ def test_robots_that_lose_their_heading_steer_to_the_end_as_the_page_says():
 def test_size_and_data_keep_objects():
     page = words_of(PAGE)
     larger, grown = (
-        [x for measure in ("object_found", "object_close", "tool_close", "psnr") for x in gains(name, measure, "weighed")]
+        [
+            x
+            for measure in ("object_found", "object_close", "tool_close", "psnr")
+            for x in gains(name, measure, "weighed")
+        ]
         for name in ("larger", "grown")
     )
     said = (
@@ -126,9 +136,14 @@ def test_half_of_what_was_hidden_comes_back():
     hidden, control = ([row for row in rows if row["kind"] == kind] for kind in ("hidden", "control"))
     assert len(hidden) == len(control) == 48
     found, close, stay, stay_close = (
-        [round(100 * x) for x in over_robots(mine, name)[:2]] for mine in (hidden, control) for name in ("found", "close")
+        [round(100 * x) for x in over_robots(mine, name)[:2]]
+        for mine in (hidden, control)
+        for name in ("found", "close")
     )
-    assert f"in {found[0]} ± {found[1]} % of the cases, in {close[0]} ± {close[1]} % in place; of those never hidden" in page
+    assert (
+        f"in {found[0]} ± {found[1]} % of the cases, in {close[0]} ± {close[1]} % in place; of those never hidden"
+        in page
+    )
     assert f"of those never hidden {stay[0]} ± {stay[1]} and {stay_close[0]} ± {stay_close[1]} %." in page
     short, long = ([r["found"] for r in hidden if (r["gone"] >= 4) == late] for late in (False, True))
     assert f"it is {sum(short):.0f} of {len(short)}, after four or more {sum(long):.0f} of {len(long)}" in page

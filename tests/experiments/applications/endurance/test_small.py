@@ -60,7 +60,7 @@ def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     minute = [gains("long", measure, "weighed") for measure in ("object_found", "psnr")]
     assert "robot, {:+.2f} ± {:.2f}; PSNR {:.1f} ± {:.1f} dB)".format(*minute[0], *minute[1]) in page
     rounds = [gains("mended", measure, "long") for measure in ("object_found", "psnr", "follows")]
-    said = "found {:.2f} ± {:.2f} beside \"long\", PSNR {:.1f} ± {:.1f} dB, follows {:+.2f} ± {:.2f}."
+    said = 'found {:.2f} ± {:.2f} beside "long", PSNR {:.1f} ± {:.1f} dB, follows {:+.2f} ± {:.2f}.'
     assert said.format(*rounds[0], *rounds[1], *rounds[2]) in page
     tables = ("weighed", "long", "long_likeliest", "mended_likeliest")
     weighed, drawn, long, mended = ({k: r for k, r in by_place(f"{n}.csv").items() if k[2] > 1} for n in tables)
@@ -98,7 +98,10 @@ def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
     last = over_robots([row for row in ten.values() if row["part"] == 10], "object_found")[0]
     later = [(row, served[place]) for place, row in ten.items() if row["part"] > 1]
     gained = gain("object_found", later)
-    assert f"found in {100 * last:.0f} % of the frames of the last minute, {gained[0]:.2f} ± {gained[1]:.2f} beside" in page
+    assert (
+        f"found in {100 * last:.0f} % of the frames of the last minute, {gained[0]:.2f} ± {gained[1]:.2f} beside"
+        in page
+    )
     for robot, measure, words in (
         ("pusher_sand", "object_found", '({:.0f} % of the last minute, "weighed" {:.0f})'),
         ("picker_slate", "tool_found", 'its own body ({:.0f} %, "weighed" {:.0f})'),
@@ -136,7 +139,9 @@ def test_ten_minutes_are_as_the_page_says():
     tools, objects = percent("tool_found", 10), [percent("object_found", minute) for minute in (1, 2, 10)]
     assert f"Tools are found in {tools} % of the frames of the last minute" in page
     assert f"commands by {mean('follows', 10):.2f} after {mean('follows', 1):.2f} in the first minute" in page
-    assert f"found in {objects[0]} % of frames of the first minute, in {objects[1]} % of those of the second, in" in page
+    assert (
+        f"found in {objects[0]} % of frames of the first minute, in {objects[1]} % of those of the second, in" in page
+    )
     assert f"Objects are found in {objects[2]} % of the frames of the last minute" in page
     variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
     assert f"variance ({variance:.2f} of the truth's)" in page

@@ -51,7 +51,10 @@ def test_a_policy_is_run_from_starts_at_which_the_goal_is_not_reached():
 
 
 def test_robots_of_the_suite_and_of_physics_simulators_have_no_common_truth():
-    robots = [Robot(TASK.robot, 5, (-1.0,) * 4, (1.0,) * 4, (0.0,) * 4), Robot("pusher_sand", 1, (-1.0,) * 2, (1.0,) * 2, (0.0,) * 2)]
+    robots = [
+        Robot(TASK.robot, 5, (-1.0,) * 4, (1.0,) * 4, (0.0,) * 4),
+        Robot("pusher_sand", 1, (-1.0,) * 2, (1.0,) * 2, (0.0,) * 2),
+    ]
     with pytest.raises(ConfigError, match="have no common one: metaworld_drawer, pusher_sand"):
         true_worlds(robots, image_size=8)
 
