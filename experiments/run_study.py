@@ -52,6 +52,7 @@ def run_study(
     from experiments.preparing.suite import require_simulated
     from experiments.preparing.windows import require_judged, require_same_windows
     from experiments.running.provenance import trial_closure
+    from experiments.trainable import require_trainable
 
     study, workspace = setting.study, setting.workspace
     if not setting.data:
@@ -79,18 +80,6 @@ def run_study(
         states = run_jobs(jobs, workspace, place, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
-
-
-def require_trainable(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
-    """Raises ConfigError for a trial that would fail once all is prepared (`trainable.check_trials`)."""
-    from experiments.trainable import check_trials
-
-    share = launching.share()
-    if share is None and launching.name == "local":  # trials have what JAX finds, as it does here
-        import jax
-
-        share = float(jax.device_count())
-    check_trials(study, sweeps, share)
 
 
 def make_jobs(

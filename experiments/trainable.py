@@ -6,10 +6,21 @@ import math
 from collections.abc import Sequence
 
 from experiments.done import UNKNOWN
+from experiments.running.launchers.registry import Launching
 from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from experiments.words import few
 from hma_jax.config import MeshConfig, TrainConfig, require
+
+
+def require_trainable(study: Study, sweeps: Sequence[Sweep], launching: Launching) -> None:
+    """Raises ConfigError for a trial that would fail once all is prepared (`check_trials`)."""
+    share = launching.share()
+    if share is None and launching.name == "local":  # no accelerator was found: they have what JAX finds here
+        import jax
+
+        share = float(jax.device_count())
+    check_trials(study, sweeps, share)
 
 
 def devices_of(mesh: MeshConfig, share: float | None) -> float:

@@ -75,10 +75,11 @@ def decay_fits(config: OptimizerConfig, steps: int) -> bool:
 
 def check_schedule(config: OptimizerConfig, steps: int) -> None:
     """Raises ConfigError for a decay phase of wsd that would begin within the warm-up and end above final_fraction."""
+    decay, share = decay_steps(config, steps), config.decay_fraction
     require(
         decay_fits(config, steps),
         f"train.steps={steps} are too few for the warm-up (train.optimizer.warmup_steps={config.warmup_steps}) and the "
-        f"decay of schedule wsd ({decay_steps(config, steps)}: train.optimizer.decay_fraction={config.decay_fraction:g} of all steps): "
+        f"decay of schedule wsd ({decay}: train.optimizer.decay_fraction={share:g} of all steps): "
         "the rate would not come down to final_fraction; set one of these three, or train.optimizer.schedule=constant",
     )
 
