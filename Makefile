@@ -37,13 +37,13 @@ PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest 
 PER_CORE = -n auto --maxprocesses 8 --dist worksteal
 
 # Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py: in a process beside the
-# others, which says what it found after them.
+# others, which takes what time they leave (they wait for files and browsers now and then) and says what it found after them.
 EXACT = $(shell grep -rl --include='test_*.py' 'mark.exact' tests)
 EXACT_LOG = $(VENV)/exact.log
 
 test: $(VENV)/installed-test
 	@echo "beside these tests, those of equal numbers run in a process of their own"; \
-	XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT) >$(EXACT_LOG) 2>&1 & exact=$$!; \
+	XLA_FLAGS= nice $(PYTEST) -m "exact and not slow" $(EXACT) >$(EXACT_LOG) 2>&1 & exact=$$!; \
 	$(PYTEST) $(PER_CORE) -m "not exact and not slow" && others=0 || others=$$?; \
 	wait $$exact && found=0 || found=$$?; \
 	echo "tests of equal numbers:"; cat $(EXACT_LOG); \
