@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
+from hma_jax.runtime.locks import Held, exclusive
 from hma_jax.runtime.outputs import unwritable
 
 
@@ -25,21 +25,25 @@ def require_free(directory: Path) -> None:
 
 @contextmanager
 def written_aside(directory: Path) -> Iterator[Path]:
-    """A new directory to write into, which takes the place of `directory` when the block ends well.
+    """A new directory to write into, which takes the place of `directory` when the block ends well. One that a killed
+    process left half written is removed.
 
-    Raises ConfigError if something is there already, or if nothing can be written there.
+    Raises ConfigError if something is there already, if nothing can be written there, or while another process writes
+    there.
     """
-    require_free(directory)
     directory = Path(directory).absolute()
-    # Not by the process's number: in a container that is the one that a killed process had, which left its directory.
-    aside = directory.with_name(f".{directory.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        aside.mkdir()
-    except OSError as error:
-        raise unwritable(directory, error) from error
-    try:
+    aside, lock = (directory.with_name(f".{directory.name}.{kind}") for kind in ("tmp", "lock"))
+    with ExitStack() as stack:
+        try:
+            directory.parent.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(exclusive(lock, remove=True))
+            require_free(directory)
+            shutil.rmtree(aside, ignore_errors=True)
+            aside.mkdir()
+        except Held as held:
+            raise ConfigError(f"{directory} is being written ({held.who}); choose another output directory") from None
+        except OSError as error:
+            raise unwritable(directory, error) from error
+        stack.callback(shutil.rmtree, aside, ignore_errors=True)
         yield aside
         os.replace(aside, directory)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)

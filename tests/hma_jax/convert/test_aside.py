@@ -1,7 +1,5 @@
 """Directories that appear whole or not at all."""
 
-import os
-
 import pytest
 
 from hma_jax.config import ConfigError
@@ -21,9 +19,19 @@ def test_a_directory_appears_whole_or_not_at_all(tmp_path):
         pass
 
 
-def test_what_a_killed_process_of_the_same_number_left_is_in_nobody_s_way(tmp_path):
-    """Programs in containers often have the same number each time."""
-    (tmp_path / f".out.{os.getpid()}.tmp").mkdir()
+def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
+    with pytest.raises(KeyError), written_aside(tmp_path / "out") as aside:
+        raise KeyError
+    aside.mkdir()
+    (aside / "half").touch()
     with written_aside(tmp_path / "out") as aside:
         (aside / "a").touch()
-    assert (tmp_path / "out" / "a").exists()
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
+
+
+def test_two_that_write_to_one_place_do_not_meet(tmp_path):
+    with written_aside(tmp_path / "out") as aside:
+        (aside / "a").touch()
+        with pytest.raises(ConfigError, match="out is being written .process"), written_aside(tmp_path / "out"):
+            pass
+    assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
