@@ -18,7 +18,7 @@ from hma_jax.config import ConfigError, ModelConfig, TrainConfig, require
 from hma_jax.config.json import from_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.table import check_names, flat, nested
-from hma_jax.convert.tensors import read_safetensors, write_safetensors
+from hma_jax.convert.tensors import read_finite, read_safetensors, write_safetensors
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import ParamSpec
@@ -96,7 +96,7 @@ def read_neutral(directory: Path) -> Run:
         model,
         from_dict(TrainConfig, description["train"], f"{path}: train"),
         table,
-        nested({name: tensor.read() for name, tensor in tensors.items()}),
+        nested({name: read_finite(tensors, name, str(directory / WEIGHTS)) for name in tensors}),
         description["step"],
         description["provenance"],
     )

@@ -85,7 +85,7 @@ def read_official(directory: Path) -> Run:
     foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
     require(not foreign, f"{directory}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
     leaves = declare_model(model, table).leaves()
-    params = from_official(tensors, official_parts(model, table, leaves), leaves)
+    params = from_official(tensors, official_parts(model, table, leaves), leaves, str(directory))
     provenance = {
         "official": {
             "variant": _variant(config),

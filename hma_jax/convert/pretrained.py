@@ -20,7 +20,7 @@ from hma_jax.config import Dtype, ImageSize, Magvit2Config, require
 from hma_jax.config.json import from_dict
 from hma_jax.convert.official import read_config
 from hma_jax.convert.table import check_names, nested
-from hma_jax.convert.tensors import Stored, read_safetensors
+from hma_jax.convert.tensors import Stored, read_finite, read_safetensors
 from hma_jax.convert.torch_file import read_torch
 from hma_jax.model.params import Declared, Params, ParamSpec
 from hma_jax.tokenizers.pretrained import Magvit2Tokenizer, SvdVaeTokenizer
@@ -121,13 +121,13 @@ def tokenizer_shapes(source: Source, declared: Declared) -> dict[str, tuple[int,
 
 def tokenizer_params(source: Source, declared: Declared, tensors: Mapping[str, Stored], where: str) -> Params:
     """Our parameters, float32. Raises ConfigError naming tensors that are missing, too many, of another
-    shape or no floats."""
+    shape, no floats or not finite."""
     check_names(tokenizer_shapes(source, declared), {n: t.shape for n, t in tensors.items()}, where)
     foreign = {n: t.dtype.name for n, t in tensors.items() if t.dtype.name not in FLOATS}
     require(not foreign, f"{where}: tensors that are not of type {', '.join(FLOATS)}: {foreign}")
 
     def read(path: str, spec: ParamSpec) -> jnp.ndarray:
-        values = tensors[source.official_name(path)].read().astype(np.float32)
+        values = read_finite(tensors, source.official_name(path), where).astype(np.float32)
         order = _reversed(spec)
         return jnp.asarray(values.reshape([spec.shape[i] for i in order]).transpose(np.argsort(order)))
 

@@ -20,7 +20,7 @@ from einops import rearrange
 from flax import nnx
 
 from hma_jax.config import ConfigError, ModelConfig
-from hma_jax.convert.tensors import Stored
+from hma_jax.convert.tensors import Stored, read_finite
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import EMBODIMENT_AXIS, LAYER_AXIS, Params, ParamSpec
 
@@ -192,14 +192,17 @@ def official_parts(
 
 
 def from_official(
-    tensors: Mapping[str, Stored], parts: Mapping[str, list[Part]], leaves: Mapping[str, ParamSpec]
+    tensors: Mapping[str, Stored], parts: Mapping[str, list[Part]], leaves: Mapping[str, ParamSpec], where: str
 ) -> Params:
-    """Our parameters from official tensors whose names and shapes have been checked."""
+    """Our parameters from official tensors, of the directory `where`, whose names and shapes have been checked.
+
+    Raises ConfigError naming one that is not finite.
+    """
 
     def assemble(path: str, spec: ParamSpec) -> np.ndarray:
         whole = np.zeros(spec.shape, np.float32)
         for part in parts[path]:
-            whole[part.index] = part.from_official(tensors[part.name].read())
+            whole[part.index] = part.from_official(read_finite(tensors, part.name, where))
         return whole
 
     return nested({path: assemble(path, spec) for path, spec in leaves.items()})

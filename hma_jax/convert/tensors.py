@@ -12,7 +12,7 @@ import numpy as np
 import safetensors.numpy
 from safetensors import SafetensorError, safe_open
 
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, require
 
 DTYPES = {
     "F64": np.dtype(np.float64),
@@ -36,6 +36,17 @@ class Stored:
     shape: tuple[int, ...]
     dtype: np.dtype
     read: Callable[[], np.ndarray]
+
+
+def read_finite(tensors: Mapping[str, Stored], name: str, where: str) -> np.ndarray:
+    """The values of one tensor of the file or directory `where`. Raises ConfigError if some are not finite."""
+    values = tensors[name].read()
+    require(
+        bool(np.isfinite(values).all()),
+        f"{where}: {name} holds values that are not finite: it is damaged, or was saved after its training had diverged; "
+        "fetch it again, or take an earlier one",
+    )
+    return values
 
 
 def read_safetensors(path: Path) -> dict[str, Stored]:

@@ -113,6 +113,14 @@ def test_what_does_not_fit_its_description_is_refused_by_name(tmp_path):
         read_neutral(tmp_path / "out")
 
 
+def test_weights_that_are_not_finite_are_refused_by_name(tmp_path):
+    run = small_run()
+    run.params["embed"]["mask"] = np.full_like(run.params["embed"]["mask"], np.nan)
+    write_neutral(run, tmp_path / "out")
+    with pytest.raises(ConfigError, match="model.safetensors: embed/mask holds values that are not finite"):
+        read_neutral(tmp_path / "out")
+
+
 @pytest.mark.parametrize(("umask", "mode"), [(0o022, 0o644), (0o007, 0o660)])
 def test_weights_can_be_read_by_those_whom_the_umask_lets_read(umask, mode, tmp_path):
     """safetensors itself writes files for their owner alone, of no use to a colleague on a shared disk."""

@@ -106,6 +106,16 @@ def test_missing_extra_and_misshapen_tensors_are_all_named(base, tmp_path):
     assert "action_mlp.push.model.0.weight: expected (16, 2), found (16, 5)" in said
 
 
+def test_tensors_that_are_not_finite_are_refused_by_name(tmp_path):
+    config = official_config(DISCRETE, ONE)
+    tensors = random_tensors(config, ONE)
+    tensors["out_x_proj.bias"][3] = np.inf
+    halves = {name: x.astype(ml_dtypes.bfloat16) for name, x in tensors.items()}
+    for folder, written in (("floats", tensors), ("halves", halves)):
+        with pytest.raises(ConfigError, match=f"{folder}: out_x_proj.bias holds values that are not finite"):
+            read_official(write_checkpoint(tmp_path / folder, config, written))
+
+
 def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
     config = official_config(DISCRETE, ONE)
     tensors = {name: x for name, x in random_tensors(config, ONE).items() if not name.startswith("decoder")}

@@ -147,6 +147,15 @@ def test_integer_weights_are_refused(tmp_path):
         small(folder)
 
 
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    folder = write_published(tmp_path / "a", "svd-vae")
+    tensors = official_tensors("svd-vae")
+    tensors["quant_conv.bias"][0] = np.nan
+    write_safetensors(folder / "diffusion_pytorch_model.safetensors", tensors)
+    with pytest.raises(ConfigError, match="quant_conv.bias holds values that are not finite"):
+        small(folder)
+
+
 # --- config.json -------------------------------------------------------------------------------
 
 
