@@ -131,7 +131,7 @@ def plan_trials(
     plans = {}
     for id, trial in trials.items():
         cost = estimate(trial)
-        if id in done.finished:
+        if id in done.finished or id in done.left:
             plans[id] = TrialPlan(trial, cost, 0.0, 0.0)
             continue
         whole = cost.flops if evaluated else cost.train_flops

@@ -7,13 +7,14 @@ refuses it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from experiments.preparing.made_from import read_stamp
 from experiments.running.attempts import RESULT, RUN
+from experiments.running.ledger import DIVERGED, FAILED, Ledger
 from experiments.running.provenance import Provenance
 from experiments.running.results_version import RESULTS_VERSION
 from experiments.running.workspace import Workspace, find_record
@@ -36,14 +37,18 @@ class Done:
     tokens: bool = False  # and the evaluation windows
     provenance: Provenance = UNKNOWN
     finished: frozenset[str] = frozenset()
+    left: Mapping[str, str] = field(default_factory=dict)  # that ended without a result and are not run again, and how
     steps: Mapping[str, int] = field(default_factory=dict)  # that trials have made, of those that have begun
 
 
 NOTHING = Done()
 
 
-def find_done(setting: Setting, sweeps: Sequence[Sweep]) -> Done:
-    """What there is of the trials of `sweeps` in the study's directory; nothing where another study is."""
+def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = False) -> Done:
+    """What there is of the trials of `sweeps` in the study's directory; nothing where another study is.
+
+    `retry_failed`: trials that failed or diverged are run again. Raises ConfigError for a damaged ledger.
+    """
     study, workspace = setting.study, setting.workspace
     try:
         record = find_record(workspace)
@@ -55,7 +60,8 @@ def find_done(setting: Setting, sweeps: Sequence[Sweep]) -> Done:
     if record is None or record.provenance is None:
         return done
     provenance = dataclasses.replace(record.provenance, results=RESULTS_VERSION)
-    return dataclasses.replace(done, provenance=provenance, **_trials(workspace, unique_trials(sweeps, provenance)))
+    trials = _trials(workspace, unique_trials(sweeps, provenance), retry_failed)
+    return dataclasses.replace(done, provenance=provenance, **trials)
 
 
 def find_prepared(setting: Setting) -> Done:
@@ -69,10 +75,15 @@ def newest_step(run: Path) -> int:
     return max(steps, default=0)
 
 
-def _trials(workspace: Workspace, ids: Iterable[str]) -> dict[str, Any]:
+def _trials(workspace: Workspace, ids: Collection[str], retry_failed: bool) -> dict[str, Any]:
     finished = frozenset(id for id in ids if (workspace.trials / id / RESULT).exists())
-    steps = {id: newest_step(workspace.trials / id / RUN) for id in ids if id not in finished}
-    return {"finished": finished, "steps": {id: n for id, n in steps.items() if n}}
+    events = {id: record["event"] for id, record in Ledger(workspace.ledger).states().items()}
+    ended = {id: events[id] for id in ids if id not in finished and events.get(id) in (FAILED, DIVERGED)}
+    left = {} if retry_failed else ended
+    # A trial that diverged is run anew (`runner`).
+    begun = [id for id in ids if id not in finished and id not in left and events.get(id) != DIVERGED]
+    steps = {id: newest_step(workspace.trials / id / RUN) for id in begun}
+    return {"finished": finished, "left": left, "steps": {id: n for id, n in steps.items() if n}}
 
 
 def _prepared_by(study: Study) -> list[Any]:

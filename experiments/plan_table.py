@@ -49,7 +49,7 @@ def plan_table(
     before = estimate_preparing(
         study, simulated=not (given or done.suite), trained=trained and not done.tokenizer, tokenised=not done.tokens
     )
-    left = [plan for id, plan in plans.items() if id not in done.finished]
+    left = [plan for id, plan in plans.items() if id not in done.finished and id not in done.left]
     table.caption = _say_done(done, len(plans))
     if left:
         table.caption += _caption(study, left, devices, before, evaluated)
@@ -59,7 +59,7 @@ def plan_table(
     shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
     axes = _axes(sweeps, done.provenance)
     for id, plan in plans.items():
-        trial, cost, over = plan.trial, plan.cost, id in done.finished
+        trial, cost, over = plan.trial, plan.cost, "finished" if id in done.finished else done.left.get(id)
         seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
         table.add_row(
             escape(("reference" if id in shared else axes.get(id, "source")) + seed),
@@ -70,7 +70,7 @@ def plan_table(
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
             "" if over else _flops(plan.flops).removesuffix("FLOP"),
-            "finished" if over else _duration(plan.seconds),
+            over or _duration(plan.seconds),
         )
     return table
 
@@ -81,7 +81,11 @@ def _say_done(done: Done, trials: int) -> str:
     parts = [name for name, there in before.items() if there]
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
     parts += [f"{sum(done.steps.values()):,} steps of unfinished training"] if done.steps else []
-    return f"There already, and not counted: {', '.join(parts)}. " if parts else ""
+    said = f"There already, and not counted: {', '.join(parts)}. " if parts else ""
+    if done.left:
+        how = " or ".join(sorted(set(done.left.values())))
+        said += f"{len(done.left)} of {trials} trials {how}: not run again, and not counted, without --retry-failed. "
+    return said
 
 
 def _caption(study: Study, plans: Sequence[TrialPlan], devices: Devices, before: PreparingCost, evaluated: bool) -> str:

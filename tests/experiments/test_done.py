@@ -8,6 +8,7 @@ from experiments.cost import plan_trials
 from experiments.done import NOTHING, find_done
 from experiments.plan_table import plan_table
 from experiments.running.attempts import RESULT
+from experiments.running.ledger import DIVERGED, FAILED, Ledger
 from experiments.running.workspace import save_record
 from experiments.setting import Setting, StudyArguments
 from experiments.study import TokenizerTrainConfig
@@ -47,6 +48,29 @@ def test_finished_trials_are_not_priced_again_and_begun_ones_from_their_step(set
     assert plans[second].flops == plans[second].cost.flops
     said = plan_table(STUDY, sweeps, done=done).caption
     assert f"{len(done.finished)} of {len(plans)} trials, 2 steps of unfinished training. About " in said
+
+
+def test_trials_that_stay_without_a_result_are_priced_only_where_they_are_tried_again(setting):
+    sweeps = plan_sweeps(STUDY, SCALING)
+    failed, diverged, *_ = sorted(find_done(setting, sweeps).finished)
+    ledger = Ledger(setting.workspace.ledger)
+    for id, event in ((failed, FAILED), (diverged, DIVERGED)):
+        (setting.workspace.trials / id / RESULT).unlink()
+        (setting.workspace.trials / id / "run" / "checkpoints" / "2").mkdir(parents=True)
+        ledger.append(id, event)
+
+    done = replace(find_done(setting, sweeps), tokens=True)
+    plans, table = plan_trials(STUDY, sweeps, done=done), plan_table(STUDY, sweeps, done=done)
+    assert not any(plan.seconds for plan in plans.values())
+    assert {"failed", "diverged", "finished"} == set(table.columns[-1].cells)
+    assert table.caption.endswith(
+        f"2 of {len(plans)} trials diverged or failed: not run again, and not counted, without --retry-failed. "
+    )
+
+    done = find_done(setting, sweeps, retry_failed=True)
+    plans = plan_trials(STUDY, sweeps, done=done)
+    assert plans[failed].flops == pytest.approx(plans[failed].cost.flops - 2 / 3 * plans[failed].cost.train_flops)
+    assert plans[diverged].flops == plans[diverged].cost.flops  # from its first step
 
 
 def test_nothing_of_a_study_on_other_tokens_or_none_is_taken_for_done(setting, tmp_path):
