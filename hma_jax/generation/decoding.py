@@ -128,6 +128,8 @@ def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array
     before = size
     for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
         chosen = choose_patches(order, size if decode.resample else before, still_masked)
+        if not chosen.size:  # of more steps than tokens, the first few leave as many masked as the one before
+            continue
         keys = jax.vmap(lambda k, s=step: jax.random.fold_in(k, s))(key_B)
         # The denoiser, not the trunk, costs most: it sees only the patches it is asked for.
         new = denoise(model, jnp.take_along_axis(z, chosen[..., None], axis=1), keys, decode)

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import pytest
 from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.generation import (
     advance,
+    decoding,
     next_frame_outputs,
     next_frames,
     rollout,
@@ -254,6 +256,22 @@ def test_known_positions_are_never_drawn_again():
     np.testing.assert_array_equal(out.masked, [[False, True, False, False]])
     out = unmask(out, jnp.array([[5, 6, 7, 8]]), jnp.zeros((1, 4)), 0)
     np.testing.assert_array_equal(out.values, [[7, 6, 3, 4]])
+
+
+@pytest.mark.parametrize("tokens", [1, 4])
+def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monkeypatch, tokens: int):
+    """Of nine looks at so few tokens some unmask none, and the denoiser has nothing to draw."""
+    drawn, config = [], model_config(tokens=tokens, diffusion=DIFFUSION)
+
+    def numbered(model, z, keys, decode):
+        drawn.append(z.shape[1])
+        return jnp.full((*z.shape[:2], DIFFUSION.token_channels), float(len(drawn)))
+
+    monkeypatch.setattr(decoding, "denoise", numbered)
+    said, keys = jnp.zeros((2, tokens, 3)), jax.random.split(jax.random.key(0), 2)
+    frame = decoding.decode_frame(SimpleNamespace(config=config), said, lambda _: said, keys, DecodeConfig(9))
+    assert min(drawn) == 1 and sum(drawn) == tokens
+    np.testing.assert_array_equal(np.sort(frame[..., 0]), [np.repeat(np.arange(1.0, len(drawn) + 1), drawn)] * 2)
 
 
 def test_temperature_is_a_temperature():
