@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,7 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, step, tidy_table
-from experiments.setting import UNSET
+from experiments.setting import UNSET, command
 from experiments.wrote import wrote
 from hma_jax.config import require
 
@@ -20,6 +19,7 @@ def judge(
     robot: Annotated[str, arg(metavar="NAME")],
     out: Annotated[Path, arg(metavar="DIR")],
     task: Literal["own", "reach", "hover"] = "own",
+    policies: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
     starts: int = 50,
     batch: Annotated[int | None, UNSET] = None,
     frames: Annotated[int | None, UNSET] = None,
@@ -35,7 +35,7 @@ def judge(
     """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
 
     Policies are trained on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and
-    a random one; the model itself, where it has action heads. Success in the model is told by a head, in the truth by
+    a random one; the model itself, where it has action heads; your own. Success in the model is told by a head, in the truth by
     the state; the head looks at true frames too, and a control executes what a policy does in another episode. Writes
     table, agreement with intervals, a page with clips, and a page on which a person can label successes blindly. Goes
     on where it was stopped. docs/judging.md says how to read it.
@@ -46,6 +46,7 @@ def judge(
         out: Where everything is written.
         task: The robot's own task; of the suite's robots also reaching the mark with the tool, or hovering
             with the tool above a puck.
+        policies: Python file with policies(robot), policies of your own by name, which are judged too.
         starts: Held-out episodes at whose beginning every policy starts.
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's.
@@ -53,8 +54,8 @@ def judge(
         steps: Of training of each kind of policy.
         head_episodes: Recorded episodes that the success head is trained on.
         head_steps: Of training of the success head.
-        cloned: Checkpoints of behaviour cloning.
-        diffusion: Checkpoints of the Diffusion Policy.
+        cloned: Checkpoints of behaviour cloning; 0 for none.
+        diffusion: Checkpoints of the Diffusion Policy; 0 for none.
         seed: Of recordings, training and episodes.
         labels: Saved by the blind page: only says how often that person agrees with the judges of --out.
     """
@@ -86,18 +87,19 @@ def judge(
         head=replace(HeadConfig(), fit=replace(HeadConfig().fit, steps=head_steps)),
         head_episodes=head_episodes,
     )
-    judged = judge_run(run, out, config, step)
+    judged = judge_run(run, out, config, step, policies)
     summary = summarise(judged)
     write_outcomes(judged.outcomes, out / "outcomes.csv")
     write_summary(summary, out / "agreement.json")
     draw_scatter(summary, out / "scatter.png")
-    command = (
-        f"hma judge {shlex.quote(str(run))} --robot {robot} --task {task} --starts {starts} "
-        f"--batch {config.batch} --frames {config.task.frames} "
-        f"--demonstrations {demonstrations} --steps {steps} --head-episodes {head_episodes} --head-steps {head_steps} --cloned {cloned} "
-        f"--diffusion {diffusion} --seed {seed} --out {shlex.quote(str(out))}"
-    )
-    page = write_page(judged, summary, out, command)
+    asked: list[str | Path] = [
+        run, "--robot", robot, "--task", task, *(["--policies", policies] if policies else []),
+        "--starts", f"{starts}", "--batch", f"{config.batch}", "--frames", f"{config.task.frames}",
+        "--demonstrations", f"{demonstrations}", "--steps", f"{steps}", "--head-episodes", f"{head_episodes}",
+        "--head-steps", f"{head_steps}", "--cloned", f"{cloned}", "--diffusion", f"{diffusion}",
+        "--seed", f"{seed}", "--out", out,
+    ]  # fmt: skip
+    page = write_page(judged, summary, out, command("judge", *asked))
     blind = write_blind(judged, out)
     _say(summary)
     then = f"label the clips of {blind}, and the same command with --labels labels.json"
@@ -105,12 +107,15 @@ def judge(
 
 
 def _say(summary: dict) -> None:
+    from experiments.applications.judging.page import say_beyond
     from experiments.applications.judging.summary import COLUMNS, shown
 
     table = tidy_table(f"{summary['robot']}: {summary['task']}", "policy", *COLUMNS)
     for name, rates in summary["policies"].items():
         table.add_row(name, *(shown(rates[column]) for column in COLUMNS))
     console.print(table)
+    if beyond := say_beyond(summary):
+        console.print(beyond, markup=False, soft_wrap=True)
     measures = list(next(iter(summary["agreement"].values()))["starts"])
     table = tidy_table("agreement, intervals over other policies and starts", "compared", *measures)
     for name, found in summary["agreement"].items():

@@ -9,13 +9,12 @@ import difflib
 import importlib
 import json
 import math
-import sys
-import types
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from experiments.own_file import find_function
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import Point, Sweep, judge_less
@@ -69,7 +68,7 @@ def find_axis(axis: str, root: Path = Path()) -> Plan:
     Raises ConfigError without any.
     """
     if is_file(axis):
-        return _load(root / axis)
+        return find_function(root / axis, "plan(study)", "an axis is", "docs/own_axis.md")
     if axis not in AXES:
         near = difflib.get_close_matches(axis, AXES, n=1)
         meant = f"did you mean {near[0]}?" if near else f"known: {', '.join(AXES)}; or a file of your own, AXIS.py"
@@ -145,18 +144,3 @@ def _require_distinct(sweep: Sweep, where: str) -> None:
     for (x, series, role, seed), count in places.items():
         at = ", ".join(filter(None, (f"{x:g}", series, role, f"seed {seed}")))
         require(count == 1, f"{where} returned {count} points at {at}; give each a position or a series of its own")
-
-
-def _load(path: Path) -> Plan:
-    """`plan` of a file, which is run. What it raises is its author's, and not caught.
-
-    Compiled anew each time: Python's cached bytecode cannot tell a file from what it was in the same second.
-    """
-    require(path.is_file(), f"{path}: no such file; an axis is a Python file with plan(study) (docs/own_axis.md)")
-    module = types.ModuleType(f"axis_{path.stem}")
-    module.__file__ = str(path)
-    sys.modules[module.__name__] = module  # dataclasses of the file look themselves up there
-    exec(compile(path.read_bytes(), path, "exec"), vars(module))
-    plan = getattr(module, "plan", None)
-    require(callable(plan), f"{path}: has no function plan(study) (docs/own_axis.md)")
-    return plan

@@ -1,5 +1,6 @@
 """Whether policies that succeed in the learned simulator succeed in the true one (the paper's Table 5).
 
 `head` tells success from frames, `rollouts` runs a policy in either world, `outcomes` is the table of what came of it,
-`agreement` compares the worlds, `ladder` makes the policies, `judge` puts these together, `page` and `blind` show it.
+`agreement` compares the worlds, `ladder` makes the policies, `own_policies` takes a user's, `outside` gives what is not the
+model's: where episodes begin, what success looks like, the truth. `judge` puts these together, `page` and `blind` show it.
 """

@@ -34,6 +34,7 @@ from experiments.applications.policies.network import (
     mlp,
     shrink_bytes,
 )
+from experiments.applications.policies.tasks import Task, held
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.runtime.files import write_file
@@ -116,11 +117,23 @@ def train_head(
     steps = demos.steps()
     images, begun = demos.images[steps[:, 0], steps[:, 1]], demos.images[steps[:, 0], 0]
     labels = demos.reached[steps[:, 0], steps[:, 1]]
-    require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
     if reconstruct is not None:
         for seen in (images, begun):
             seen[::RECONSTRUCTED] = reconstruct(seen[::RECONSTRUCTED])
     seen = np.stack([shrink_bytes(x, config.encoder.size) for x in (begun, images)], 1)
+    return fit_head(seen, labels, config, seed, report)
+
+
+def fit_head(
+    seen: np.ndarray,
+    labels: np.ndarray,
+    config: HeadConfig,
+    seed: int = 0,
+    report: Report = lambda done, total, note: None,
+) -> SuccessHead:
+    """From n pairs of frames uint8 [n, 2, size, size, 3], the episode's first and the present one, and whether the goal is
+    reached in the latter, bool [n]. Raises ConfigError where all have one label."""
+    require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
     data = {"images": seen, "label": labels.astype(np.float32), "weight": weight}
 
@@ -129,8 +142,31 @@ def train_head(
         errors = optax.sigmoid_binary_cross_entropy(apply_head(params, config, frames), data["label"][index])
         return jnp.mean(errors * data["weight"][index])
 
-    kept = fit(init_head(config, seed), loss, data, len(steps), config.fit, seed, report)
+    kept = fit(init_head(config, seed), loss, data, len(seen), config.fit, seed, report)
     return SuccessHead(config, kept[config.fit.steps])
+
+
+def measure_head(head: SuccessHead, demos: Demonstrations, task: Task) -> dict[str, float]:
+    """On recorded true frames: accuracy and AUROC of frames, and accuracy of whole episodes."""
+    steps = demos.steps()
+    score = head.probabilities(demos.images, demos.images[:, :1])
+    frames, labels = score[steps[:, 0], steps[:, 1]], demos.reached[steps[:, 0], steps[:, 1]]
+    by_head = held(score > head.config.threshold, task.hold).any(1)
+    return worth_of(head, frames, labels, by_head, demos.successes)
+
+
+def worth_of(
+    head: SuccessHead, frames: np.ndarray, labels: np.ndarray, by_head: np.ndarray, successes: np.ndarray
+) -> dict[str, float]:
+    """From probabilities [n] and labels of frames, and what the head says of episodes [N] beside what is true of them."""
+    return {
+        "frames": float(len(labels)),
+        "positive": float(labels.mean()),
+        "frame accuracy": float(((frames > head.config.threshold) == labels).mean()),
+        "frame AUROC": auroc(frames, labels),
+        "episodes": float(len(successes)),
+        "episode accuracy": float((by_head == successes).mean()),
+    }
 
 
 def auroc(score: np.ndarray, label: np.ndarray) -> float:

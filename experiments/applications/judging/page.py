@@ -24,6 +24,11 @@ from hma_jax.runtime.files import write_file
 CLIPS = 6
 """Episodes that are shown."""
 
+OWN_COLOUR = "#2f7d4f"
+
+MANY_BEYOND = 0.1
+"""A policy of which more than this share of actions is clipped may mean them in other units."""
+
 
 def draw_scatter(summary: dict[str, Any], path: Path) -> None:
     """Success in the true world against success in the learned one, and in the control, a point for each policy."""
@@ -44,7 +49,8 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
                     [[x["mean"] - x["low"]], [x["high"] - x["mean"]]],
                     [[y["mean"] - y["low"]], [y["high"] - y["mean"]]],
                 )
-                colour = {"cloned": "#2b5c8a", "diffusion": "#b3541e"}.get(name.split("-")[0], MUTED)
+                made = {"cloned": "#2b5c8a", "diffusion": "#b3541e"}.get(name.split("-")[0], MUTED)
+                colour = OWN_COLOUR if name in summary["own"] else made
                 panel.errorbar(
                     x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
                     color=colour, elinewidth=0.8, markersize=5,
@@ -79,6 +85,18 @@ def thin_out(words: Sequence[Annotation]) -> None:
         kept += [box] if word.get_visible() else []
 
 
+def say_beyond(summary: dict[str, Any]) -> str:
+    """In words, of which policies of the user's many actions were clipped; "" where of none."""
+    shares = {name: summary["actions beyond the range"][name] for name in summary["own"]}
+    many = [f"{name} ({share:.0%})" for name, share in shares.items() if share > MANY_BEYOND]
+    if not many:
+        return ""
+    return (
+        f"Many actions lay outside what {summary['robot']} was ever given, and were clipped to it: of {', '.join(many)}. "
+        "Are they raw, in the units of its recordings?"
+    )
+
+
 def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str) -> Path:
     """OUT/judge.html, from the figures drawn already."""
     measured = summary["head"]
@@ -95,7 +113,7 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
         f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode "
         f"succeeds when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
         picture(out / "scatter.png", "success in both worlds"),
-        section("Success by policy", table(["policy", *COLUMNS], lines)),
+        section("Success by policy", table(["policy", *COLUMNS], lines), f"<p>{html.escape(say_beyond(summary))}</p>"),
         section(
             "Agreement with the true simulator",
             table(["compared", "interval over other", *measures], agreed, text=2),

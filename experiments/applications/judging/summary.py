@@ -24,18 +24,21 @@ COLUMNS = {
 }
 """What is shown of every policy: (world, judge)."""
 
+REFERENCE = "true, by state"
+
 COMPARED = {
     "learned model": "learned, by head",
     "the head alone, on true frames": "true, by head",
     "control: actions of other episodes": "shuffled, by head",
 }
-"""What is compared with success in the true world by state."""
+"""What is compared with the reference."""
 
 
 def summarise(judged: Judged) -> dict[str, Any]:
     """What agreement.json says; every number with its interval."""
-    each = {name: successes(judged.outcomes, judged.policies, *column) for name, column in COLUMNS.items()}
-    reference = each["true, by state"]
+    columns = {name: where for name, where in COLUMNS.items() if where[0] in judged.worlds}
+    each = {name: successes(judged.outcomes, judged.policies, *where) for name, where in columns.items()}
+    reference = each[REFERENCE]
     compared = {name: agree(reference, each[column]) for name, column in COMPARED.items()}
     same = each["learned, by head"] == reference
     alike = {
@@ -53,6 +56,8 @@ def summarise(judged: Judged) -> dict[str, Any]:
             name: {column: _plain(rate_interval(found[i])) for column, found in each.items()}
             for i, name in enumerate(judged.policies)
         },
+        "own": list(judged.own),
+        "actions beyond the range": {name: round(share, 4) for name, share in judged.beyond.items()},
         "agreement": {
             name: {
                 "policies and starts": {m: _plain(x) for m, x in found.measures.items()},

@@ -1,6 +1,7 @@
 """`hma judge` with a model that has learnt nothing: what it writes, and how it goes on."""
 
 import json
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 
 from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
+from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.head import HeadConfig, HeadJudge, load_head
-from experiments.applications.judging.judge import JudgeConfig, judge_run
+from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, read_outcomes, write_outcomes
-from experiments.applications.judging.page import draw_scatter, write_page
+from experiments.applications.judging.page import draw_scatter, say_beyond, write_page
 from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
 from experiments.applications.policies.learning import FitConfig
@@ -95,6 +97,61 @@ def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged)
     assert again.outcomes == found.outcomes
     with pytest.raises(ConfigError, match="other settings .config.starts: 4 -> 2"):
         judge_run(root / "model", root / "out", replace(ASKED, starts=2), step)
+
+
+OWN = """
+import numpy as np
+
+
+class Still:
+    def reset(self, episodes=None, *, seeds=None): ...
+
+    def act(self, images):
+        return np.full((len(images), 4), {value})
+
+
+def policies(robot):
+    return {{"still": Still()}}
+"""
+
+
+def test_policies_of_ones_own_are_judged_beside_the_random_one_and_told_from_changed_ones(judged, tmp_path):
+    root, before = judged
+    out, file = tmp_path / "out", tmp_path / "mine.py"
+    file.write_text(OWN.format(value=0.0))
+    shutil.copytree(root / "out" / "head", out / "head")  # what is the same in any judgement of this seed
+    for kept in (p for p in (root / "out" / "rollouts").iterdir() if p.name.startswith(("random.", "hma."))):
+        (out / "rollouts").mkdir(exist_ok=True)
+        shutil.copy(kept, out / "rollouts" / kept.name)
+    alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
+    found = judge_run(root / "model", out, alone, step, file)
+    assert found.policies == ("random", "hma", "still") and found.own == ("still",)
+    assert not (out / "policies").exists() and (out / "own_policies.py").read_text() == file.read_text()
+    assert (found.rollouts("still", TRUE).actions == 0).all()
+    assert found.beyond["still"] == 0
+    assert [o for o in found.outcomes if o.policy == "random"] == [o for o in before.outcomes if o.policy == "random"]
+
+    kept = out / "rollouts" / "still.learned.npz"
+    kept.unlink()
+    again = judge_run(root / "model", out, alone, step, file)
+    assert again.outcomes == found.outcomes and kept.exists()
+    file.write_text(OWN.format(value=9.0))
+    with pytest.raises(ConfigError, match="other settings .contents of --policies: '[0-9a-f]+' -> '[0-9a-f]+'"):
+        judge_run(root / "model", out, alone, step, file)
+
+
+def test_actions_in_other_units_are_told():
+    said = {"robot": "arm", "own": ["a", "b"], "actions beyond the range": {"a": 0.5, "b": 0.05, "random": 1.0}}
+    assert "outside what arm was ever given, and were clipped to it: of a (50%)." in say_beyond(said)
+    assert not say_beyond(said | {"own": ["b"]})
+
+
+def test_a_policy_without_right_actions_is_refused_before_anything_is_made(judged, tmp_path):
+    root, file = judged[0], tmp_path / "mine.py"
+    file.write_text(OWN.format(value="0"))
+    with pytest.raises(ConfigError, match=r"mine.py: policy 'still': .*float32 \[2, 4\].* it gave int64 \[2, 4\]"):
+        judge_run(root / "model", tmp_path / "out", ASKED, step, file)
+    assert not (tmp_path / "out").exists()
 
 
 def test_frames_that_no_policy_could_look_at_are_refused_before_anything_is_recorded(judged):

@@ -1,0 +1,42 @@
+"""What is judged, and how its parts are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+
+from experiments.applications.judging.head import HeadConfig
+from experiments.applications.judging.ladder import LadderConfig
+from experiments.applications.policies.learning import Report
+from experiments.applications.policies.tasks import Task
+from hma_jax.config import require
+
+Step = Callable[[str], AbstractContextManager[Report]]
+
+
+@dataclass(frozen=True)
+class JudgeConfig:
+    """What is judged, and how its parts are made."""
+
+    task: Task
+    starts: int = 50
+    batch: int = 50  # episodes at once
+    seed: int = 0
+    demonstrations: int = 3000
+    demonstration_frames: int = 12
+    noise: tuple[float, ...] = (0.0, 0.1)  # of the expert that is cloned
+    ladder: LadderConfig = field(default_factory=LadderConfig)
+    head: HeadConfig = field(default_factory=HeadConfig)
+    head_episodes: int = 3000
+    head_noise: tuple[float, ...] = (0.0, 0.2, 0.6)  # of the expert in the head's recordings; a third are play
+
+    def __post_init__(self):
+        require(self.demonstrations >= 1, f"--demonstrations must be at least 1, got {self.demonstrations}")
+        fewest = 3  # a third of them are play
+        require(self.head_episodes >= fewest, f"--head-episodes must be at least {fewest}, got {self.head_episodes}")
+        last = 2**32 - self.starts  # the i-th start has the seed plus i
+        require(0 <= self.seed <= last, f"--seed must lie in 0..{last}, got {self.seed}")
+        fewest = 2  # with one at a time the control has no other episode to take actions from
+        require(self.batch >= fewest, f"--batch must be at least {fewest}, got {self.batch}")
+        require(self.starts % self.batch == 0, f"{self.starts} starts cannot be run {self.batch} at a time")

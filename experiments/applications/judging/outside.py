@@ -1,0 +1,107 @@
+"""What of a judgement does not come from the model: where episodes begin, what success looks like, and the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, closing
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.head import SuccessHead, measure_head, train_head
+from experiments.applications.judging.outcomes import WORLDS
+from experiments.applications.judging.rollouts import make_starts
+from experiments.applications.policies.demonstrations import Demonstrations, join, record
+from experiments.applications.simulators import has_truth, true_simulator
+from hma_jax.config import require
+from hma_jax.simulator.interface import AnySimulator
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.simulator import Simulator
+from hma_jax.simulator.starts import Start
+
+HELD_OUT = 7919
+"""Added to the seed of recordings that nothing is trained on."""
+
+Reconstruct = Callable[[np.ndarray], np.ndarray]
+"""uint8 [n, H, W, 3] as the model's tokenizer shows them."""
+
+
+class Outside(Protocol):
+    """The part in which a robot with a true simulator differs from one with recordings alone.
+
+    worlds: those in which policies act, in this order; the true one only where `open` gives it. `about`: what tells it
+    from others, for whoever goes on. Expensive parts are made when they are asked for.
+    """
+
+    config: JudgeConfig
+    worlds: tuple[str, ...]
+
+    def about(self) -> dict[str, Any]: ...
+
+    def demonstrations(self) -> Demonstrations:
+        """What the ladder is trained on."""
+        ...
+
+    def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
+        """Trained, and measured on what it was not trained on."""
+        ...
+
+    def starts(self) -> list[Start]: ...
+
+    def open(self) -> AbstractContextManager[AnySimulator | None]:
+        """The true simulator, if there is one."""
+        ...
+
+
+class TrueOutside:
+    """Of a robot that has a true simulator: its expert is cloned, and its state is the truth."""
+
+    worlds = WORLDS
+
+    def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator, step: Step):
+        """Raises ConfigError for a robot that has none."""
+        require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
+        self.config, self._robot, self._learned, self._step = config, robot, learned, step
+        self._size = learned.tokenizer.image_size
+
+    def about(self) -> dict[str, Any]:
+        return {}
+
+    def demonstrations(self) -> Demonstrations:
+        config = self.config
+        short = replace(config.task, frames=config.demonstration_frames)
+        with self._step(f"record {config.demonstrations} demonstrations"):
+            return record(
+                short,
+                config.demonstrations,
+                stride=self._robot.stride,
+                image_size=self._size,
+                noise=config.noise,
+                after=0,
+                seed=config.seed,
+            )
+
+    def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
+        config, size, stride = self.config, self._size, self._robot.stride
+        with self._step("record episodes for the success head"):
+            known = head_recordings(config, size, stride, config.head_episodes, config.seed)
+            new = head_recordings(config, size, stride, max(config.head_episodes // 10, 12), config.seed + HELD_OUT)
+        with self._step("train the success head") as report:
+            head = train_head(known, config.head, config.seed, reconstruct, report)
+        head.measured |= measure_head(head, new, config.task)
+        return head
+
+    def starts(self) -> list[Start]:
+        return make_starts(self.config.task, self.config.starts, self._size, self._robot.stride)
+
+    def open(self) -> AbstractContextManager[AnySimulator]:
+        return closing(true_simulator(self._learned, [self._robot], self.config.batch))
+
+
+def head_recordings(config: JudgeConfig, size: int, stride: int, episodes: int, seed: int) -> Demonstrations:
+    """Episodes of experts of several kinds and of play: successes, failures, and what lies between."""
+    play = episodes // 3
+    expert = record(config.task, episodes - play, stride=stride, image_size=size, noise=config.head_noise, seed=seed)
+    return join([expert, record(config.task, play, stride=stride, image_size=size, play=True, seed=seed + 1)])

@@ -1,0 +1,97 @@
+"""Policies of a user's own: `policies(robot)` of a Python file gives them by name. What they answer is checked."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from experiments.applications.judging.ladder import OWN_HEAD, RANDOM
+from experiments.applications.policies.cloning import ClonedPolicy
+from experiments.applications.policies.diffusion import DiffusionPolicy
+from experiments.applications.policies.policy import Policy
+from experiments.own_file import find_function
+from hma_jax.config import ConfigError, require
+from hma_jax.simulator.robots import Robot
+
+PAGE = "docs/judging.md"
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+TAKEN = re.compile(rf"{RANDOM}|{OWN_HEAD}|({ClonedPolicy.kind}|{DiffusionPolicy.kind})-\d+")
+"""Names of policies that are made here, whichever of them there are in a judgement."""
+
+
+class CheckedPolicy:
+    """A user's policy: what it gives is what the protocol says, or an error that names it. It is shown copies, and what
+    it gives is copied, so that it may write into both."""
+
+    def __init__(self, policy: Policy, robot: Robot, where: str):
+        """`where`: file and name, for messages. Raises ConfigError for what is no policy."""
+        for method, takes, shown in (
+            ("reset", {"episodes": None, "seeds": [0]}, "reset(episodes=None, *, seeds=None)"),
+            ("act", {"images": None}, "act(images)"),
+        ):
+            found = getattr(policy, method, None)
+            require(callable(found), f"{where} is of type {type(policy).__name__} and has no {shown} ({PAGE})")
+            try:
+                signature = inspect.signature(found)
+                signature.bind(*takes.values()) if method == "act" else signature.bind(**takes)
+            except TypeError as error:
+                raise ConfigError(f"{where}: its {method}{signature} cannot be called as {shown}: {error}") from error
+        self.policy, self.robot, self.where = policy, robot, where
+
+    def reset(self, episodes: Sequence[int] | None = None, *, seeds: Sequence[int] | None = None) -> None:
+        self.policy.reset(episodes=episodes, seeds=seeds)
+
+    def act(self, images: np.ndarray) -> np.ndarray:
+        """Raises ConfigError for actions of another shape or type, and for such that are not finite."""
+        shape, given = (len(images), self.robot.action_dim), self.policy.act(images.copy())
+        wanted = f"{self.where}: act(images) must give float32 {list(shape)}, a raw action of {self.robot.name} for each image"
+        try:
+            actions = np.asarray(given)
+        except ValueError as error:  # lists of different lengths
+            raise ConfigError(f"{wanted}; it gave what is no array ({error})") from error
+        good = actions.shape == shape and np.issubdtype(actions.dtype, np.floating)
+        require(good, f"{wanted}; it gave {actions.dtype} {list(actions.shape)}")
+        actions = np.array(actions, np.float32)
+        for b in np.flatnonzero(~np.isfinite(actions).all(1))[:1]:
+            raise ConfigError(f"{wanted}; what it gave for image {b} is not finite: {actions[b].tolist()}")
+        return actions
+
+
+def load_policies(path: Path, robot: Robot) -> dict[str, CheckedPolicy]:
+    """What `policies(robot)` of the file gives. Modules beside the file can be imported by it, as where it is a program.
+
+    Raises ConfigError for another thing than policies, and for names that rollouts cannot be kept under.
+    """
+    beside = str(path.resolve().parent)
+    if beside not in sys.path:
+        sys.path.append(beside)  # behind all others: it hides none
+    found = find_function(path, "policies(robot)", "policies of your own are", PAGE)(robot)
+    where = f"{path}: policies(robot)"
+    require(isinstance(found, dict), f"{where} must return a dict of policies by name, got {type(found).__name__}")
+    require(bool(found), f"{where} returned no policy")
+    for name in found:
+        fits = isinstance(name, str) and NAME.fullmatch(name)
+        require(
+            bool(fits),
+            f"{where}: {name!r} becomes the name of files; write it with at most 100 letters, digits, '.', '_' and '-', a "
+            "letter or digit first",
+        )
+        require(
+            not TAKEN.fullmatch(name), f"{where}: {name!r} is the name of a policy that is made here; choose another"
+        )
+    lower = [name.lower() for name in found]
+    twice = [name for name in found if lower.count(name.lower()) > 1]
+    require(not twice, f"{where}: {', '.join(twice)} would be the same files where case does not count; rename one")
+    return {name: CheckedPolicy(policy, robot, f"{path}: policy {name!r}") for name, policy in found.items()}
+
+
+def try_out(policies: dict[str, CheckedPolicy], batch: int, shape: tuple[int, int]) -> None:
+    """Asks each for an action on black images: what would stop it later stops it before anything is made."""
+    for policy in policies.values():
+        policy.reset(seeds=range(batch))
+        policy.act(np.zeros((batch, *shape, 3), np.uint8))

@@ -1,0 +1,28 @@
+"""Python files of a user's own that the program runs for one function: an axis, policies."""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hma_jax.config import require
+
+
+def find_function(path: Path, signature: str, what: str, page: str) -> Callable[..., Any]:
+    """The function of a file, which is run; `what` it has it for, and the `page` that says so, are of the messages. What
+    the file raises is its author's, and not caught. Raises ConfigError where there is no such file or function.
+
+    Compiled anew each time: Python's cached bytecode cannot tell a file from what it was in the same second.
+    """
+    name = signature.partition("(")[0]
+    require(path.is_file(), f"{path}: no such file; {what} a Python file with {signature} ({page})")
+    module = types.ModuleType(f"{name}_{path.stem}")
+    module.__file__ = str(path)
+    sys.modules[module.__name__] = module  # dataclasses of the file look themselves up there
+    exec(compile(path.read_bytes(), path, "exec"), vars(module))
+    found = getattr(module, name, None)
+    require(callable(found), f"{path}: has no function {signature} ({page})")
+    return found

@@ -1,0 +1,125 @@
+"""Policies of a user's file: what is refused, and that what they do to arrays is their own affair."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.applications.judging.own_policies import CheckedPolicy, load_policies, try_out
+from hma_jax.config import ConfigError
+from hma_jax.simulator.robots import Robot
+
+ROBOT = Robot("arm", 2, (-1.0,) * 3, (1.0,) * 3, (0.0,) * 3)
+
+FILE = """
+import numpy as np
+from dataclasses import dataclass
+from helper_of_policies import VALUE
+
+
+@dataclass
+class Constant:
+    value: float
+    dim: int
+
+    def reset(self, episodes=None, *, seeds=None):
+        self.seeds = seeds
+
+    def act(self, images):
+        return np.full((len(images), self.dim), self.value)
+
+
+def policies(robot):
+    return {"still": Constant(0.0, robot.action_dim), "Onward-2": Constant(VALUE, robot.action_dim)}
+"""
+
+
+def test_policies_of_a_file_are_found_by_name_with_what_lies_beside_it(tmp_path):
+    (tmp_path / "helper_of_policies.py").write_text("VALUE = 0.5")
+    (tmp_path / "mine.py").write_text(FILE)
+    found = load_policies(tmp_path / "mine.py", ROBOT)
+    assert list(found) == ["still", "Onward-2"]
+    try_out(found, 2, (8, 8))
+    actions = found["Onward-2"].act(np.zeros((2, 8, 8, 3), np.uint8))
+    assert actions.dtype == np.float32 and actions.tolist() == [[0.5] * 3] * 2
+    assert list(found["still"].policy.seeds) == [0, 1]
+
+
+def test_the_policies_of_the_page_are_some(tmp_path):
+    page = (Path(__file__).parents[4] / "docs" / "judging.md").read_text()
+    (tmp_path / "my_policies.py").write_text(page.split("```python\n")[1].split("```")[0])
+    found = load_policies(tmp_path / "my_policies.py", ROBOT)
+    try_out(found, 2, (8, 8))
+    bright = np.full((1, 8, 8, 3), 255, np.uint8)
+    assert {name: policy.act(bright).tolist() for name, policy in found.items()} == {
+        "timid": [[0] * 3],
+        "bold": [[1] * 3],
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"no such file; policies of your own are a Python file with policies\(robot\)"),
+        ("policy = 1", r"has no function policies\(robot\)"),
+        ("def policies(robot): return [1]", r"policies\(robot\) must return a dict of policies by name, got list"),
+        ("def policies(robot): return {}", "returned no policy"),
+        ("def policies(robot): return {'a/b': 1}", "'a/b' becomes the name of files"),
+        ("def policies(robot): return {'..': 1}", "'..' becomes the name of files"),
+        ("def policies(robot): return {7: 1}", "7 becomes the name of files"),
+        ("def policies(robot): return {'cloned-60': 1}", "'cloned-60' is the name of a policy that is made here"),
+        ("def policies(robot): return {'random': 1}", "'random' is the name of a policy"),
+        ("def policies(robot): return {'Net': 1, 'net': 1}", "Net, net would be the same files"),
+        ("def policies(robot): return {'net': 1}", r"policy 'net' is of type int and has no reset\(episodes=None"),
+        (
+            "class P:\n def reset(self): ...\n def act(self, images): ...\ndef policies(robot): return {'net': P()}",
+            r"policy 'net': its reset\(\) cannot be called as reset\(episodes=None, \*, seeds=None\)",
+        ),
+    ],
+)
+def test_what_is_no_file_of_policies_is_refused_by_file_function_and_name(tmp_path, text, message):
+    path = tmp_path / "mine.py"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ConfigError, match=message) as error:
+        load_policies(path, ROBOT)
+    assert str(error.value).startswith(str(path))
+
+
+class Gives:
+    def __init__(self, actions):
+        self.actions = actions
+
+    def reset(self, episodes=None, *, seeds=None): ...
+
+    def act(self, images):
+        images[:] = 0
+        return self.actions
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((2, 4), np.float32), r"it gave float32 \[2, 4\]"),
+        (np.zeros(3, np.float32), r"it gave float32 \[3\]"),
+        (np.zeros((2, 3), int), r"it gave int64 \[2, 3\]"),
+        (None, r"it gave object \[\]"),
+        ([[0.0], [0.0, 1.0]], "it gave what is no array"),
+        (np.array([[0, 0, 0], [0, np.nan, 0]]), r"for image 1 is not finite: \[0.0, nan, 0.0\]"),
+        (np.full((2, 3), 1e300), "for image 0 is not finite"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_actions_that_are_none_are_refused_by_policy_and_shape(actions, message):
+    policy = CheckedPolicy(Gives(actions), ROBOT, "mine.py: policy 'net'")
+    with pytest.raises(ConfigError, match=message) as error:
+        policy.act(np.zeros((2, 8, 8, 3), np.uint8))
+    assert "mine.py: policy 'net': act(images) must give float32 [2, 3], a raw action of arm" in str(error.value)
+
+
+def test_a_policy_may_write_into_images_and_into_what_it_gave():
+    given = Gives(np.ones((2, 3), np.float32))
+    policy, images = CheckedPolicy(given, ROBOT, "net"), np.full((2, 8, 8, 3), 9, np.uint8)
+    kept = policy.act(images)
+    given.actions[:] = 5
+    assert (images == 9).all() and (kept == 1).all()
