@@ -14,6 +14,10 @@ RESULTS_VERSION = max(CHANGES)
 OF_SOME = {
     "a frame's own action is told from earlier ones by its weight": {"model.conditioning": "cross_attention"},
     "robots without actions have no error of predicted actions": {"model.action_heads": True},
+    "stems learn from hidden actions that leak into blocks": {"train.masking.action_leak": "conditioning"},
+    "stems learn from hidden actions that leak": {"train.masking.action_leak": "all"},
+    "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
+    "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
 }
 """Changes that alter the numbers of a few trials only: those whose fields have such values. They are part of the names
 of these trials, and all others stay finished."""

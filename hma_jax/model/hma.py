@@ -47,7 +47,8 @@ class HMA(nnx.Module):
     def __init__(self, config: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig):
         self.config, self.table, self.dtype = config, table, jnp.dtype(execution.dtype)
         self.embed = make_embed(config)
-        self.recall = Recall(config) if config.recall else None
+        self.embed.mask.set_metadata(use="frames_predicted")  # no token is masked but to be predicted
+        self.recall = used("frames_predicted", Recall(config)) if config.recall else None
         shape = (config.frames, config.position_slots, config.width)
         self.positions = param(shape, ("T", "P", "D"), zeros, role="vector")
         self.norm = LayerNorm(config.width, eps=FINE_EPS) if config.diffusion else None

@@ -11,6 +11,7 @@ import numpy as np
 from einops import rearrange
 
 from hma_jax.config import ModelConfig, TrainConfig, check_micro_batches, check_objective, require
+from hma_jax.config.training import ActionLeak
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.params import Declared, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
@@ -102,7 +103,8 @@ def make_train_step(
             grads = keep_own(grads, specs, jnp.asarray(trained_E)[active.robots_G])
         grads, norm = clip_by_global_norm(grads, config.optimizer.clip_norm)
         rate = schedule(state.step)
-        presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT)
+        leak = masking.action_leak
+        presence = find_presence(masked, batch["embodiment"], trained_E, model, not config.only, real_BT, leak)
         here = presence._replace(robots={use: x[active.robots_G] for use, x in presence.robots.items()})
         new, adam = apply_update(
             grads, take_adam(state.opt_state, specs, active), own, specs, multipliers, here, rate, config.optimizer
@@ -128,14 +130,18 @@ def find_presence(
     model: ModelConfig,
     everything: bool = True,
     real_BT: jax.Array | None = None,
+    leak: ActionLeak = "none",
 ) -> Presence:
     """Which parameters a batch concerns. Only `trained_E` robots' own are moved, and the shared
-    ones not at all unless `everything` is trained. Frames that are not `real_BT` concern none."""
+    ones not at all unless `everything` is trained. Frames that are not `real_BT` concern none. Through a `leak`
+    actions are shown that are hidden."""
     hidden_BT = masked.hidden_T
+    # Where actions are tokens alone, that of blocks has nothing to show.
+    leaks = leak == "all" or (leak == "conditioning" and model.conditioning != "concat")
     real_BT = jnp.ones_like(hidden_BT) if real_BT is None else real_BT
     rows: dict[Use, jax.Array] = {
         "always": jnp.ones(len(embodiment_B), bool),
-        "actions_shown": (~hidden_BT & real_BT).any(axis=1),
+        "actions_shown": ((~hidden_BT | leaks) & real_BT).any(axis=1),
         # With causal alignment the first frame is never shown an action.
         "actions_hidden": (hidden_BT & real_BT).any(axis=1) | (model.action_alignment == "causal"),
         "actions_predicted": masked.action_targets_T.any(axis=1),
