@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import naming
 
 RUNNING, FINISHED, DIVERGED, FAILED = "running", "finished", "diverged", "failed"
 LOST, PREEMPTED = "lost", "preempted"
@@ -72,7 +73,7 @@ class Ledger:
         if "message" in details:
             details["message"] = name_within(self.path.parent, details["message"])
         line = json.dumps({"time": round(self.clock(), 3), "trial": trial, "event": event, **details})
-        with open(self.path, "ab+") as file:
+        with naming(self.path), open(self.path, "ab+") as file:
             _cut_torn_line(file)
             file.write(line.encode() + b"\n")
             file.flush()

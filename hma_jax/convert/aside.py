@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from hma_jax.config import ConfigError, require
+from hma_jax.runtime.files import naming
 from hma_jax.runtime.locks import Held, exclusive
 from hma_jax.runtime.outputs import unwritable
 
@@ -45,5 +46,6 @@ def written_aside(directory: Path) -> Iterator[Path]:
         except OSError as error:
             raise unwritable(directory, error) from error
         stack.callback(shutil.rmtree, aside, ignore_errors=True)
-        yield aside
+        with naming(directory):
+            yield aside
         os.replace(aside, directory)

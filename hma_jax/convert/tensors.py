@@ -67,10 +67,13 @@ def read_safetensors(path: Path) -> dict[str, Stored]:
 
 
 def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None) -> None:
-    """Writes contiguous copies where needed; the values' bytes are kept."""
+    """Writes contiguous copies where needed; the values' bytes are kept. Raises OSError."""
     dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
     # safetensors puts a file in the place of ours that its owner alone may read: it gets the mode that the umask gave.
     path.touch()
     mode = stat.S_IMODE(path.stat().st_mode)
-    safetensors.numpy.save_file(dense, path, metadata)
+    try:
+        safetensors.numpy.save_file(dense, path, metadata)
+    except SafetensorError as error:
+        raise OSError(f"{path} cannot be written: {error}; check the space on its disk") from error
     path.chmod(mode)

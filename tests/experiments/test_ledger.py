@@ -8,6 +8,7 @@ import pytest
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Workspace
 from hma_jax.config import ConfigError
+from tests.full_disk import full_disk
 
 
 @pytest.fixture
@@ -32,6 +33,11 @@ def test_messages_name_files_as_seen_from_the_study(ledger, tmp_path, monkeypatc
     messages = [record["message"] for record in ledger.records()]
     assert messages[0] == "no checkpoint in trials/b/run; remove trials/b"
     assert messages[1] == f"output in trials/b, not in /else/{near}/c"
+
+
+def test_a_full_disk_is_said_of_the_ledger(ledger):
+    with full_disk(), pytest.raises(OSError, match="ledger.jsonl"):
+        ledger.append("a", "running")
 
 
 def test_lines_of_earlier_versions_are_read_in_todays_words(ledger):

@@ -15,6 +15,7 @@ from data_pipelines.publishing.journal import Journal
 from data_pipelines.publishing.marks import is_complete
 from hma_jax.runtime.files import write_file
 from hma_jax.runtime.locks import Held
+from tests.full_disk import full_disk
 
 
 def hold(place: Path, ready) -> None:
@@ -76,6 +77,9 @@ def test_a_file_is_whole_or_as_it_was(tmp_path, monkeypatch):
     assert [p.read_text() for p in tmp_path.iterdir()] == ["old"]
     write_file(tmp_path / "file", b"new")
     assert (tmp_path / "file").read_bytes() == b"new"
+    with full_disk(10), pytest.raises(OSError, match="/file'"):
+        write_file(tmp_path / "file", "longer than ten")
+    assert [p.read_text() for p in tmp_path.iterdir()] == ["new"]
 
 
 def test_a_line_of_a_journal_that_a_crash_cut_off_does_not_count(tmp_path):

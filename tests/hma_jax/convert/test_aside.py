@@ -1,9 +1,12 @@
 """Directories that appear whole or not at all."""
 
+import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
 from hma_jax.convert.aside import written_aside
+from hma_jax.convert.tensors import write_safetensors
+from tests.full_disk import full_disk
 
 
 def test_a_directory_appears_whole_or_not_at_all(tmp_path):
@@ -27,6 +30,14 @@ def test_what_a_killed_process_left_half_written_is_removed(tmp_path):
     with written_aside(tmp_path / "out") as aside:
         (aside / "a").touch()
     assert [p.name for p in tmp_path.rglob("*")] == ["out", "a"]
+
+
+def test_a_full_disk_is_said_of_the_place_and_leaves_nothing(tmp_path):
+    weights = {"one": np.zeros(9000, np.float32)}
+    for write in (lambda path: path.write_text("a" * 9000), lambda path: write_safetensors(path, weights)):
+        with full_disk(1000), pytest.raises(OSError, match="out.*"), written_aside(tmp_path / "out") as aside:
+            write(aside / "model.safetensors")
+        assert not list(tmp_path.iterdir())
 
 
 def test_two_that_write_to_one_place_do_not_meet(tmp_path):
