@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 
 from experiments.optima import diverged, ends, lowest
-from experiments.report.plot_style import LABELS, MUTED, count, plain_log, show_nothing, show_tally
+from experiments.report.plot_style import LABELS, MUTED, count, plain_log, show_legend, show_nothing, show_tally
 from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
 from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 
@@ -23,7 +23,7 @@ DRAWN = {
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
 CAPTION = (
     "bars: s.e. over seeds; star: lowest, hollow at an end of what was tried\n"
-    "cross: diverged; dotted: lowest of the base width"
+    "cross: diverged; dotted: lowest of the base curve"
 )
 
 
@@ -34,7 +34,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     measured = {r.metric for r in rows if r.sweep == sweep.name}
     metrics = [m for m in drawn if m in measured] or list(drawn)
     figure, panels = plt.subplots(
-        len(series), len(metrics), figsize=(4.3 * len(metrics), 0.4 + 2.9 * len(series)),
+        len(series), len(metrics), figsize=(4.3 * len(metrics), 0.7 + 2.9 * len(series)),
         layout="constrained", sharex=True, sharey="col", squeeze=False,
     )  # fmt: skip
     for line, role in zip(panels, series, strict=True):
@@ -47,9 +47,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
         if metric == "perplexity":
             plain_log(panel, panel.yaxis)
     show_tally(panels[0, -1], rows, sweep.name)
-    handles = panels[0, 0].get_legend_handles_labels()[0]
-    if handles:
-        panels[0, 0].legend(loc="best")
+    show_legend(figure, panels[0, 0])
     figure.supxlabel(CAPTION if sweep.base else "bars: s.e. over seeds", fontsize=8.5, color=MUTED)
     return figure
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,27 +15,34 @@ from experiments.analysis.fits import LEVEL
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import FLOPS, TRUNK, Fitted
-from experiments.report.plot_style import COLOURS, DEFAULT, INK, MUTED, STYLE, count, plain_log, save
+from experiments.report.plot_style import COLOURS, DEFAULT, INK, MUTED, STYLE, count, plain_log, save, show_legend
 
 LINE, BAND = COLOURS["perplexity"], 0.16
+ABREAST = 3
+"""Curves beside each other: of more, a page shows nothing that can be read."""
 POINTS = dict(marker="o", linestyle="none", markersize=4, alpha=0.6, markeredgewidth=0)
 
 
 def plot_fits(fits: Sequence[Fitted], outcomes: Sequence[Outcome], path: Path) -> None:
-    """A column per curve with a fit: loss above, residuals below. Without any, there is no file."""
+    """Of each curve with a fit the loss, and below it residuals; ABREAST beside each other. Without any, there is no
+    file."""
     path.unlink(missing_ok=True)
     fits = [f for f in fits if f.measured is not None and len(f.curve.axes) == 1 and not f.fit.refused]
     if not fits:
         return
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(
-            2, len(fits), figsize=(4.3 * len(fits), 4.6), layout="constrained", squeeze=False, sharex="col",
-            height_ratios=(3, 1),
-        )  # fmt: skip
-        for column, fitted in zip(panels.T, fits, strict=True):
-            _draw_fit(column, fitted, [o for o in outcomes if o.prediction.curve == fitted.curve.name])
-        panels[0, 0].set_ylabel("loss, nats per token")
-        panels[1, 0].set_ylabel("residual, %")
+        columns, rows = min(len(fits), ABREAST), math.ceil(len(fits) / ABREAST)
+        figure = plt.figure(figsize=(4.3 * columns, 4.6 * rows), layout="constrained")
+        cells = figure.add_gridspec(2 * rows, columns, height_ratios=(3, 1) * rows)
+        for i, fitted in enumerate(fits):
+            row, column = divmod(i, ABREAST)
+            above = figure.add_subplot(cells[2 * row, column])
+            below = figure.add_subplot(cells[2 * row + 1, column], sharex=above)
+            above.tick_params(labelbottom=False)
+            _draw_fit((above, below), fitted, [o for o in outcomes if o.prediction.curve == fitted.curve.name])
+            if not column:
+                above.set_ylabel("loss, nats per token")
+                below.set_ylabel("residual, %")
         save(figure, path)
 
 
@@ -106,6 +114,6 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
         plain_log(right, right.yaxis, count)
         left.set_ylabel("loss, nats per token")
         right.set_ylabel(f"best {TRUNK}")
-        left.legend(loc="best")
+        show_legend(figure, left)
         left.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
         save(figure, path)

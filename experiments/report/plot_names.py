@@ -21,9 +21,10 @@ from experiments.rows import Row, curve
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 CAPTION = (
-    "dots: seeds; bars: mean ± s.e. over seeds, all judged on the same windows\n"
-    "dashed: the default trained on shuffled actions, one seed"
+    "dots: seeds; bars: mean ± s.e. over seeds, {judged}\ndashed: the default trained on shuffled actions, one seed"
 )
+JUDGED = {False: "all judged on the same windows", True: "each judged on robots of its own"}
+"""By whether judged robots are drawn anew for every seed."""
 
 
 def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
@@ -38,7 +39,8 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     panels[0, 0].set_yticks(range(len(sweep.labels)), sweep.labels)
     panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
     panels[0, 0].get_yticklabels()[sweep.reference_x].set(color=DEFAULT, fontweight="bold")
-    figure.supxlabel(CAPTION, fontsize=8.5, color=MUTED)
+    judged = JUDGED[any(p.scope for p in sweep.points)]
+    figure.supxlabel(CAPTION.format(judged=judged), fontsize=8.5, color=MUTED)
     return figure
 
 

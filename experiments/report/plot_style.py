@@ -71,9 +71,11 @@ class LogTicks(Locator):
         low, high = sorted((vmin, vmax))
         ticks = LogLocator(subs=(1, 2, 3, 5)).tick_values(low, high)
         if sum(low <= t <= high for t in ticks) < 3 or high < 4 * low:
-            ticks = MaxNLocator(nbins=5, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high)
-        elif high > 300 * low:
+            ticks = MaxNLocator(nbins=5, steps=(1, 2, 2.5, 5, 10), min_n_ticks=3).tick_values(low, high)
+        elif high > 1000 * low:
             ticks = LogLocator().tick_values(low, high)
+        elif high > 200 * low:
+            ticks = LogLocator(subs=(1, 3)).tick_values(low, high)
         elif high > 20 * low:
             ticks = LogLocator(subs=(1, 2, 5)).tick_values(low, high)
         return [t for t in ticks if t > 0]
@@ -112,6 +114,15 @@ def show_control(panel: Axes, points: list[CurvePoint]) -> None:
 def show_tally(panel: Axes, rows: Iterable[Row], sweep: str) -> None:
     finished, total = tally(rows, sweep)
     panel.set_title(f"{finished} of {total} trials", loc="right", fontsize=8.5, color=MUTED)
+
+
+def show_legend(figure: plt.Figure, panel: Axes) -> None:
+    """What the lines of `panel` are, above all panels: within one, words would lie on what they are about."""
+    handles, labels = panel.get_legend_handles_labels()
+    if handles:
+        room = max(0.6 + 0.075 * len(label) for label in labels)  # inches of the longest one
+        columns = max(1, min(len(labels), int(figure.get_figwidth() / room)))
+        figure.legend(handles, labels, loc="outside upper center", ncols=columns)
 
 
 def show_nothing(panel: Axes) -> None:

@@ -27,6 +27,7 @@ from experiments.report.plot_style import (
     plain_log,
     save,
     show_control,
+    show_legend,
     show_nothing,
     show_tally,
 )
@@ -49,6 +50,7 @@ def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
             )
             for panel, metric in zip(panels[0], metrics, strict=True):
                 _draw(panel, rows, sweep, metric)
+            show_legend(figure, panels[0, 0])
         save(figure, path)
 
 
@@ -69,13 +71,14 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
         for column, sweep in enumerate(sweeps):
             own = of_sweep(rows, sweep.name)
             for panel, metric in zip(panels[:, column], metrics, strict=True):
-                _draw(panel, own, sweep, metric, legend=not column)
+                _draw(panel, own, sweep, metric)
                 if column:
                     panel.set_ylabel("")
+        show_legend(figure, panels[0, 0])
         save(figure, path)
 
 
-def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, legend: bool = True) -> None:
+def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     """One curve with standard errors, every seed's point, and the reference lines."""
     points = curve(rows, sweep.name, metric)
     colour = COLOURS[metric]
@@ -104,8 +107,6 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, legend: b
     show_tally(panel, rows, sweep.name)
     panel.set_xlabel(sweep.axis + (" · trunk parameters" if sweep.name == "width" else ""))
     panel.set_ylabel(LABELS[metric])
-    if legend and panel.get_legend_handles_labels()[0]:
-        panel.legend(loc="best")
 
 
 def _x_axis(panel: Axes, points: list[CurvePoint], sweep: Sweep) -> None:

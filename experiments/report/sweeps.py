@@ -168,10 +168,12 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
     head = [sweep.axis, "parameters, all robots"]
     for metric in columns:
         head += [HEADINGS[metric], "to the default"]
+    judged = "all variants are judged on the same windows"
+    if any(p.scope for p in sweep.points):
+        judged = "each seed judges robots of its own, all variants on the same windows of these"
     return table([*head, "seeds"], lines) + (
-        "<p>Bold: the default. Errors are standard errors over seeds, as in the figure: all variants are "
-        "judged on the same windows, so that those do not add to a difference. Differences are taken seed "
-        "by seed.</p>"
+        f"<p>Bold: the default. Errors are standard errors over seeds, as in the figure: {judged}, so that windows do "
+        "not add to a difference. Differences are taken seed by seed.</p>"
     )
 
 

@@ -13,12 +13,16 @@ from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.findings import read_findings
-from experiments.report.plot_style import count
+from experiments.report.plot_names import plot_names
+from experiments.report.plot_style import LogTicks, count
 from experiments.report.robots import read_data
 from experiments.report.sweeps import Along, describe
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.running.workspace import Workspace
+from experiments.sweeps.conditioning import plan as plan_conditioning
 from experiments.sweeps.datasets import plan as plan_datasets
+from experiments.sweeps.horizon import plan as plan_horizon
+from experiments.sweeps.newcomers import plan as plan_newcomers
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import unique_trials
 from experiments.sweeps.width import plan as plan_width
@@ -150,6 +154,40 @@ def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
         assert len(labelled) >= 3
         trunks = [count(trunk_parameters(replace(STUDY.model, width=p.x))) for p in points]
         assert [t.get_text().split("\n")[1] for t in panel.get_xticklabels() if t.get_text()] == trunks
+
+
+@pytest.mark.parametrize("span", [1.5, 3, 5, 15, 50, 250, 400, 900, 2e3, 1e6])
+@pytest.mark.parametrize("low", [0.011, 1.04, 105, 7e4])
+def test_an_axis_has_at_least_three_ticks(low, span):
+    high = low * span
+    ticks = [t for t in LogTicks().tick_values(low, high) if low <= t <= high]
+    assert 3 <= len(set(ticks)) <= 9, ticks
+
+
+def test_what_lines_are_is_said_outside_of_panels(drawn, tmp_path, monkeypatch):
+    """Within one it lay on the curves of `compute`."""
+    kept = []
+    monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
+    rows, width, steps = rows_of(drawn, [plan_width(STUDY)]), plan_width(STUDY), plan_horizon(CPU_FULL)
+    plots.plot_sweep(rows, width, tmp_path / "width.png")
+    plots.plot_overview(rows, [width, steps], tmp_path / "scaling.png")
+    several = replace(width, points=tuple(replace(p, series=f"width {p.x}") for p in width.points))
+    plots.plot_sweep([replace(r, series=f"width {r.x}") for r in rows], several, tmp_path / "several.png")
+    for figure in kept:
+        figure.canvas.draw()
+        (legend,) = figure.legends
+        box = legend.get_window_extent()
+        assert 0 <= box.x0 and box.x1 <= figure.bbox.x1
+        assert not any(panel.get_legend() or box.overlaps(panel.get_window_extent()) for panel in figure.axes)
+
+
+def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
+    for plan, own in ((plan_newcomers, True), (plan_conditioning, False)):
+        sweep = plan(CPU_FULL)
+        caption = plot_names([], sweep).get_supxlabel()
+        said = describe(sweep, [], [], Along())
+        assert ("each judged on robots of its own" in caption) == ("robots of its own, all variants" in said) == own
+        assert ("all judged on the same windows" in caption) != own
 
 
 @pytest.mark.parametrize("axes", [("settings", "width"), ("conditioning", "horizon"), ("newcomers", "horizon")])

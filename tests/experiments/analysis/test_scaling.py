@@ -137,6 +137,21 @@ def test_the_page_shows_fits_and_what_was_refused(branches, tmp_path):
     assert "No fit: " in describe_fits(refused, None, [], "")
 
 
+def test_many_fits_stand_in_several_rows(branches, tmp_path, monkeypatch):
+    """Beside each other they were too small to read on a page."""
+    kept = []
+    monkeypatch.setattr("experiments.report.plot_fits.save", lambda figure, _: kept.append(figure))
+    sweeps, windows, _ = branches
+    fits = [f for f in fit_study(sweeps, PROVENANCE, windows, draws=2) if len(f.curve.axes) == 1][:5]
+    plot_fits(fits, [], tmp_path / "fits.png")
+    (figure,) = kept
+    figure.canvas.draw()
+    assert len(figure.axes) == 2 * 5 and figure.get_figwidth() < 14
+    assert [panel.get_title("left") for panel in figure.axes[::2]] == [f.curve.name for f in fits]
+    boxes = [panel.get_window_extent() for panel in figure.axes]
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+
+
 @pytest.mark.parametrize("seeds", [(2, 1, 1, 1), (2, 2, 2, 2)])
 def test_the_scatter_of_few_seeds_is_known_no_better_than_by_as_many(seeds):
     """A prediction's interval is made of it: of new seeds, 90 % are within 90 % of Student's t."""
