@@ -23,7 +23,7 @@ from experiments.running.provenance import Provenance, read_record
 from experiments.running.run_trial import last_loss
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
-from experiments.sweeps.sweep import POINT, Point, Sweep
+from experiments.sweeps.sweep import CONTROL, POINT, Point, Sweep
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.sums import add_up
 from hma_jax.runtime.files import write_file
@@ -271,10 +271,11 @@ def difference(a: CurvePoint, b: CurvePoint) -> tuple[float, float]:
 
 
 def all_series(rows: Iterable[Row], sweep: str) -> dict[str, list[str]]:
-    """{role: its series}, of a sweep with several curves of trained models, in the order of the rows."""
+    """{role: its series}, of a sweep with several curves of trained models, in the order of the rows. Of controls there
+    is no curve, whichever they stand beside."""
     found: dict[str, list[str]] = {}
     for r in rows:
-        of_curve = r.sweep == sweep and r.series and r.role != UNTRAINED
+        of_curve = r.sweep == sweep and r.series and r.role not in (UNTRAINED, CONTROL)
         if of_curve and r.series not in found.setdefault(r.role, []):
             found[r.role].append(r.series)
     return found

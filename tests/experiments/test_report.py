@@ -9,6 +9,7 @@ import pytest
 
 from experiments.analysis.changes import find_changes
 from experiments.analysis.scaling import trunk_parameters
+from experiments.optima import find_optima
 from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
@@ -24,7 +25,7 @@ from experiments.sweeps.datasets import plan as plan_datasets
 from experiments.sweeps.horizon import plan as plan_horizon
 from experiments.sweeps.newcomers import plan as plan_newcomers
 from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import unique_trials
+from experiments.sweeps.sweep import CONTROL, POINT, unique_trials
 from experiments.sweeps.width import plan as plan_width
 from hma_jax.config import ConfigError
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
@@ -179,6 +180,21 @@ def test_what_lines_are_is_said_outside_of_panels(drawn, tmp_path, monkeypatch):
         box = legend.get_window_extent()
         assert 0 <= box.x0 and box.x1 <= figure.bbox.x1
         assert not any(panel.get_legend() or box.overlaps(panel.get_window_extent()) for panel in figure.axes)
+
+
+@pytest.mark.parametrize("base", ["", "width 16"])
+def test_a_control_beside_one_of_several_curves_is_no_curve(drawn, base, tmp_path):
+    """Drawing such an axis of one's own ended with a KeyError, after all its trials had run."""
+    width = plan_width(STUDY)
+    several = replace(
+        width, base=base, points=tuple(replace(p, series=f"width {p.trial.model.width}") for p in width.points)
+    )
+    rows = [replace(r, series=f"width {r.x}") for r in rows_of(drawn, [width])]
+    assert any(r.role == CONTROL for r in rows)
+    plots.plot_sweep(rows, several, tmp_path / "width.png")
+    optima = find_optima(rows, [several])
+    assert {o.role for o in optima} == ({POINT} if base else set())
+    assert "width 16" in describe(several, rows, optima, Along())
 
 
 def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
