@@ -22,6 +22,7 @@ from hma_jax.config import (
     TokenizerConfig,
     TokenizerTrainConfig,
     TrainConfig,
+    check_decoding,
     check_micro_batches,
     check_objective,
     require,
@@ -181,6 +182,7 @@ class Study:
         # As training asks for them, which comes after data and tokenizer were made.
         check_objective(self.model, self.train.masking)
         check_micro_batches(self.train.batch, self.execution.accumulate)
+        check_decoding(self.model, self.eval.decode)  # as the evaluation would, which comes after training
         require(not self.train.seed, f"train.seed: a trial has one of seeds; set seeds={self.train.seed}")
         for name in ("tau", "flops_per_second"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from hma_jax.config.base import check_choices, require
+from hma_jax.config.model import ModelConfig
 
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
 
@@ -107,3 +108,19 @@ class EvalConfig:
     def first_predicted(self) -> int:
         """The first frame of a window that is compared."""
         return self.prompt_frames if self.context == "generated" else 1
+
+
+def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:
+    """Raises ConfigError for a way of filling frames that tokens of `model` do not have."""
+    if model.diffusion is None:
+        require(
+            decode.top_k <= model.factor_vocab,
+            f"decode.top_k {decode.top_k} exceeds the {model.factor_vocab} entries of a factor",
+        )
+        return
+    require(decode.order == "random", "decode.order 'confidence' needs probabilities: continuous tokens have none")
+    steps, most = decode.sampler.steps, model.diffusion.steps
+    require(
+        steps <= most,
+        f"decode.sampler.steps {steps} exceeds the model.diffusion.steps {most} of the process; set one of the two",
+    )

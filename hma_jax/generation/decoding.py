@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import DecodeConfig, ModelConfig, require
+from hma_jax.config import DecodeConfig, ModelConfig, check_decoding
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
 from hma_jax.model.readout import ChainedReadout, Readout, drawing
@@ -95,7 +95,9 @@ Predict = Callable[[Frame], jax.Array]
 
 
 def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
-    """Values of a frame that starts wholly masked; `first` is what `predict` says of that one."""
+    """Values of a frame that starts wholly masked; `first` is what `predict` says of that one. Raises as
+    `check_decoding`."""
+    check_decoding(model.config, decode)
     if model.config.diffusion:
         return _decode_latents(model, first, predict, key_B, decode)
     return _decode_tokens(model, first, predict, key_B, decode)
@@ -121,7 +123,6 @@ def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array
     DIFFERS: the release never marks what it has predicted and samples it again in every step,
     all of it in the last (reference section 3.3); `resample` does so too.
     """
-    require(decode.order == "random", "decode.order 'confidence' needs probabilities: continuous tokens have none")
     batch, size = z.shape[:2]
     frame = blank_frame(model.config, batch)
     order = jax.vmap(lambda k: jax.random.permutation(jax.random.fold_in(k, decode.unmask_steps), size))(key_B)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from hma_jax.config import ModelConfig, require
+from hma_jax.config import ModelConfig
 from hma_jax.kernels.dense import contract, look_up
 from hma_jax.kernels.pointwise import gelu
 from hma_jax.model.initial import readout_init, trunk_init
@@ -78,11 +78,10 @@ class ChainedReadout(nnx.Module):
 
 def drawing(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, top_k: int = 0) -> Choose:
     """Draws factors of one example, whose logits have `shape` [..., Q, V]; temperature 0 takes the likeliest, `top_k`
-    draws among so many. Raises ConfigError if there are not as many.
+    draws among so many.
 
     Factors that are chosen in turn have the noise that they would have if they were drawn at once.
     """
-    require(top_k <= shape[-1], f"decode.top_k {top_k} exceeds the {shape[-1]} entries of a factor")
     if temperature == 0:
         return likeliest
     noise = jax.random.gumbel(key, shape)

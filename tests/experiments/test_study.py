@@ -110,6 +110,19 @@ def test_model_that_takes_other_tokens_is_told_what_to_set(preset, setting, mess
         override(get_preset(preset), [setting])
 
 
+@pytest.mark.parametrize(
+    ("preset", "setting", "message"),
+    [
+        ("smoke", "eval.decode.top_k=99", "decode.top_k 99 exceeds the"),
+        ("smoke-continuous", "eval.decode.order=confidence", "needs probabilities"),
+        ("smoke-continuous", "model.diffusion.steps=2", "decode.sampler.steps 3 exceeds the model.diffusion.steps 2"),
+    ],
+)
+def test_a_decoding_that_every_trained_trial_would_fail_at_is_refused(preset, setting, message):
+    with pytest.raises(ConfigError, match=message):
+        override(get_preset(preset), [setting])
+
+
 def test_the_seed_of_a_study_s_trials_is_one_of_its_seeds():
     """`train.seed` would be replaced by each of them without a word."""
     with pytest.raises(ConfigError, match="train.seed: a trial has one of seeds; set seeds=3"):

@@ -274,6 +274,26 @@ def test_more_looks_than_tokens_draw_each_token_of_a_continuous_frame_once(monke
     np.testing.assert_array_equal(np.sort(frame[..., 0]), [np.repeat(np.arange(1.0, len(drawn) + 1), drawn)] * 2)
 
 
+@pytest.mark.parametrize(
+    ("diffusion", "decode", "message"),
+    [
+        (None, DecodeConfig(top_k=9), "decode.top_k 9 exceeds the 8 entries"),
+        (DIFFUSION, DecodeConfig(order="confidence"), "'confidence' needs probabilities"),
+        (
+            DIFFUSION,
+            DecodeConfig(sampler=SamplerConfig(steps=21)),
+            "sampler.steps 21 exceeds the model.diffusion.steps 20",
+        ),
+    ],
+)
+def test_frames_are_not_filled_in_ways_that_their_tokens_do_not_have(diffusion, decode: DecodeConfig, message: str):
+    model = SimpleNamespace(config=model_config(diffusion=diffusion))
+    with pytest.raises(ConfigError, match=message):
+        decoding.decode_frame(
+            model, jnp.zeros((1, 9, 3)), lambda _: None, jax.random.split(jax.random.key(0), 1), decode
+        )
+
+
 def test_temperature_is_a_temperature():
     """Low temperatures approach the most likely token; the release's made no difference."""
     config = shallow_config()

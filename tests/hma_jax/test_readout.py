@@ -112,11 +112,6 @@ def test_what_stands_in_all_factors_at_once_costs_a_chain_once(kind: type, nats:
     assert losses[-1] == pytest.approx(nats, abs=0.05)
 
 
-def test_more_entries_than_there_are_cannot_be_drawn_among():
-    with pytest.raises(ConfigError, match="decode.top_k 5 exceeds the 4 entries"):
-        drawing(jax.random.key(0), (FACTORS, ENTRIES), top_k=5)
-
-
 @pytest.mark.parametrize("changes", [{"factors": 1}, {"diffusion": DIFFUSION}], ids=["one factor", "latents"])
 def test_there_must_be_several_factors_to_chain(changes: dict):
     with pytest.raises(ConfigError, match="model.chain_factors needs ids of several factors"):
