@@ -7,10 +7,18 @@ from collections.abc import Sequence
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullLocator
 
 from experiments.optima import diverged, ends, lowest
-from experiments.report.plot_style import LABELS, MUTED, count, plain_log, show_legend, show_nothing, show_tally
+from experiments.report.plot_style import (
+    LABELS,
+    MUTED,
+    axis_of_points,
+    count,
+    plain_log,
+    show_legend,
+    show_nothing,
+    show_tally,
+)
 from experiments.rows import LOSS, OVERALL, TRAINING, Row, all_series, curve
 from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 
@@ -81,8 +89,5 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str
             panel.axvline(best.x, color=MUTED, linewidth=1, linestyle=":", zorder=1)
     if not panel.lines:
         show_nothing(panel)
-    panel.set_xscale("log")
-    panel.set_xlim(xs[0] / 1.25, xs[-1] * 1.25)
-    panel.set_xticks(xs, [count(x) if x >= 1 else f"{x:.2g}" for x in xs])
-    panel.xaxis.set_minor_locator(NullLocator())
+    axis_of_points(panel, xs, [count(x) if x >= 1 else f"{x:.2g}" for x in xs], room=1.25)
     panel.set_ylabel(label)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -99,6 +99,17 @@ def plain_log(panel: Axes, axis: Axis, label: Callable[[float], str] = plain_num
     axis.set_major_locator(LogTicks())
     axis.set_major_formatter(FuncFormatter(lambda v, _: label(v)))
     axis.set_minor_locator(NullLocator())
+
+
+def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room: float | None = None) -> None:
+    """Ticks are the points themselves, and `room` the factor that is left beyond the ends, where it matters. A log axis,
+    but where one of them has no logarithm: it would be left out."""
+    if min(xs) > 0:
+        panel.set_xscale("log")
+        if room:
+            panel.set_xlim(min(xs) / room, max(xs) * room)
+    panel.set_xticks(xs, names)
+    panel.xaxis.set_minor_locator(NullLocator())
 
 
 def show_control(panel: Axes, points: list[CurvePoint]) -> None:

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullLocator
 
 from experiments.analysis.scaling import trunk_parameters
 from experiments.report.plot_families import plot_family
@@ -22,6 +21,7 @@ from experiments.report.plot_style import (
     LABELS,
     MUTED,
     STYLE,
+    axis_of_points,
     count,
     drawn_metrics,
     plain_log,
@@ -110,13 +110,8 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
 
 
 def _x_axis(panel: Axes, points: list[CurvePoint], sweep: Sweep) -> None:
-    """A log axis whose ticks are the points themselves."""
-    panel.set_xscale("log")
     names = [count(p.x) for p in points]
     if sweep.name == "width":
         trunks = {p.x: trunk_parameters(p.trial.model) for p in sweep.points}
         names = [f"{p.x}\n{count(trunks[p.x])}" for p in points]
-    panel.set_xticks([p.x for p in points], names)
-    panel.xaxis.set_minor_locator(NullLocator())
-    if len(points) == 1:
-        panel.set_xlim(points[0].x / 2, points[0].x * 2)
+    axis_of_points(panel, [p.x for p in points], names, room=2 if len(points) == 1 else None)

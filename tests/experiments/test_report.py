@@ -182,6 +182,21 @@ def test_what_lines_are_is_said_outside_of_panels(drawn, tmp_path, monkeypatch):
         assert not any(panel.get_legend() or box.overlaps(panel.get_window_extent()) for panel in figure.axes)
 
 
+@pytest.mark.parametrize("series", ["", "of two"])
+def test_a_point_at_zero_is_drawn(drawn, series, tmp_path, monkeypatch):
+    """As of an axis of one's own over a dropout or a decay: a log axis left it out without a word."""
+    kept, width = [], plan_width(STUDY)
+    monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
+    rows = [replace(r, sweep="decay", x=16 - r.x, series=series) for r in rows_of(drawn, [width])]
+    points = tuple(replace(p, x=16 - p.x, series=series) for p in width.points)
+    plots.plot_sweep(rows, replace(width, name="decay", points=points), tmp_path / "decay.png")
+    kept[0].canvas.draw()
+    for panel in kept[0].axes:
+        low, high = panel.get_xlim()
+        assert low < 0 < high and any(line.get_marker() == "o" and 0 in line.get_xdata() for line in panel.lines)
+        assert [t.get_text() for t in panel.get_xticklabels()] == ["0", "8"]
+
+
 @pytest.mark.parametrize("base", ["", "width 16"])
 def test_a_control_beside_one_of_several_curves_is_no_curve(drawn, base, tmp_path):
     """Drawing such an axis of one's own ended with a KeyError, after all its trials had run."""
