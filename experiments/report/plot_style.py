@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullLocator
 
 from experiments.rows import CurvePoint, Row, tally
+from hma_jax.runtime.files import write_file
 
 INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
 COLOURS = {"perplexity": "#2b5c8a", "delta_psnr": "#b3541e"}
@@ -54,10 +56,10 @@ def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
 
 
 def save(figure: plt.Figure, path: Path) -> None:
-    aside = path.with_suffix(".tmp.png")
-    figure.savefig(aside, dpi=160, metadata={"Software": None})
+    content = io.BytesIO()
+    figure.savefig(content, format="png", dpi=160, metadata={"Software": None})
     plt.close(figure)
-    aside.replace(path)
+    write_file(path, content.getvalue())
 
 
 class LogTicks(Locator):

@@ -15,7 +15,7 @@ from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.findings import read_findings
 from experiments.report.plot_names import plot_names
-from experiments.report.plot_style import LogTicks, count
+from experiments.report.plot_style import LogTicks, count, save
 from experiments.report.robots import read_data
 from experiments.report.sweeps import Along, describe
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
@@ -30,6 +30,7 @@ from experiments.sweeps.width import plan as plan_width
 from hma_jax.config import ConfigError
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of, rows_of
 from tests.experiments.judged import WIDE, windows_of
+from tests.full_disk import full_disk
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,12 @@ def test_page_is_self_contained_and_names_what_failed(drawn):
 def test_figures_are_pictures(drawn):
     for name in ("datasets", "trajectories", "width", "scaling"):
         assert (drawn.figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_full_disk_is_said_of_the_figure_and_leaves_nothing(tmp_path):
+    with full_disk(100), pytest.raises(OSError, match="width.png"):
+        save(plots.plt.figure(), tmp_path / "width.png")
+    assert not list(tmp_path.iterdir())
 
 
 def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
