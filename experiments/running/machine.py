@@ -32,15 +32,20 @@ def describe_machine(devices: Sequence[Any] = ()) -> dict[str, Any]:
 def git_commit() -> str:
     """The commit of the sources, marked when the work tree differs from it; '' outside git. As it was when a process
     first asked: what it runs was loaded then."""
-    root = Path(__file__).resolve().parent.parent
+    return commit_of(Path(__file__).resolve())
+
+
+def commit_of(file: Path) -> str:
+    """The commit of the repository that `file` is part of, marked when its work tree differs; '' for a file of none."""
 
     def git(*arguments: str) -> str:
         done = subprocess.run(
-            ["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=30, check=True
+            ["git", "-C", str(file.parent), *arguments], capture_output=True, text=True, timeout=30, check=True
         )
         return done.stdout.strip()
 
     try:
+        git("ls-files", "--error-unmatch", file.name)  # an installed file may lie within a repository of others
         changed = git("status", "--porcelain", "--untracked-files=no")
         return git("rev-parse", "--short=12", "HEAD") + (" + uncommitted changes" if changed else "")
     except (OSError, subprocess.SubprocessError):

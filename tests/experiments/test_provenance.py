@@ -21,6 +21,7 @@ from experiments.running.closure import ROOT, closure_hash, trace
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.launchers.registry import Launching
 from experiments.running.ledger import REFUSED, Ledger
+from experiments.running.machine import commit_of
 from experiments.running.provenance import ROOTS, CodeChanged, load_sources, record_end, record_start
 from experiments.running.runner import Job, run_missing
 from experiments.running.sealed import read_result, write_result
@@ -187,6 +188,25 @@ def test_a_start_is_recorded_once(tmp_path):
 
 def ids_of(study=STUDY) -> list[str]:
     return list(unique_trials(plan_sweeps(study, SCALING), PROVENANCE))
+
+
+def test_the_commit_is_that_of_the_sources_not_of_a_repository_around_them(tmp_path):
+    """A package may be installed into an environment that lies in the directory of a user's own project."""
+
+    def git(*arguments):
+        who = ("-c", "user.name=a", "-c", "user.email=a@b")
+        done = subprocess.run(["git", "-C", tmp_path, *who, *arguments], check=True, capture_output=True, text=True)
+        return done.stdout.strip()
+
+    own, installed = tmp_path / "own.py", tmp_path / "installed.py"
+    own.touch()
+    installed.touch()
+    for command in (("init",), ("add", "own.py"), ("commit", "-m", "a project")):
+        git(*command)
+    assert commit_of(own) == git("rev-parse", "--short=12", "HEAD")
+    own.write_text("changed")
+    assert commit_of(own).endswith(" + uncommitted changes")
+    assert commit_of(installed) == ""
 
 
 def test_finished_trials_copied_from_another_machine_count_as_done(tmp_path):
