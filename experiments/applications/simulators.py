@@ -35,12 +35,12 @@ START_FRAMES = 3
 """Frames that an episode begins with: enough to see what moves."""
 
 
-def load_simulator(run: Path | str, **options: Any) -> Simulator:
+def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any) -> Simulator:
     """The learned simulator of a run, with robots and starts: those that lie beside it (`simulator.folder`), otherwise
     those of the study's directory that the run is in, which may be one of its trials. `options` are those of
     `Simulator.load`.
 
-    Raises ConfigError where there is no run, or nothing to start from.
+    Raises ConfigError where there is no run, or nothing to start from, unless whoever asks has starts of their own.
     """
     run = Path(run)
     study = Workspace.of_run(run)
@@ -49,6 +49,8 @@ def load_simulator(run: Path | str, **options: Any) -> Simulator:
     simulator = Simulator.load(run, **options)
     if not (run / ROBOTS).exists():
         simulator.describe(describe_robots(simulator, study))
+    if own_starts:
+        return simulator
     if not (run / STARTS).exists():
         simulator.starts = find_starts(simulator, study)
     require(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, step, tidy_table
-from experiments.setting import UNSET, command
+from experiments.setting import UNSET, command, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
 
@@ -20,53 +20,69 @@ def judge(
     out: Annotated[Path, arg(metavar="DIR")],
     task: Literal["own", "reach", "hover"] = "own",
     policies: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
+    recordings: Annotated[str | None, arg(metavar="DATASET"), UNSET] = None,
+    split: str = "train",
+    registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
+    real: Annotated[Path | None, arg(metavar="CSV"), UNSET] = None,
     starts: int = 50,
     batch: Annotated[int | None, UNSET] = None,
     frames: Annotated[int | None, UNSET] = None,
+    hold: Annotated[int | None, UNSET] = None,
     demonstrations: int = 3000,
     steps: int = 6000,
     head_episodes: int = 3000,
     head_steps: int = 6000,
-    cloned: int = 6,
-    diffusion: int = 3,
+    cloned: Annotated[int | None, UNSET] = None,
+    diffusion: Annotated[int | None, UNSET] = None,
     seed: int = 0,
     labels: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
 ) -> None:
     """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
 
-    Policies are trained on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and
-    a random one; the model itself, where it has action heads; your own. Success in the model is told by a head, in the truth by
-    the state; the head looks at true frames too, and a control executes what a policy does in another episode. Writes
-    table, agreement with intervals, a page with clips, and a page on which a person can label successes blindly. Goes
-    on where it was stopped. docs/judging.md says how to read it.
+    Policies act on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and a random
+    one; the model itself, where it has action heads; your own. Success in the model is told by a head, in the truth by
+    the state; the head looks at true frames too, and a control executes what a policy does in another episode. A robot
+    without a true simulator is judged in the model alone, by a head that learns from recordings. Writes table, agreement
+    with intervals, a page with clips, and a page on which a person can label successes blindly. Goes on where it was
+    stopped. docs/judging.md says how to read it.
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.
-        robot: Which of its robots; it must have a true simulator (of the suite, or metaworld_drawer and others).
+        robot: Which of its robots; it must have a true simulator (of the suite, or metaworld_drawer and others), or else
+            --recordings.
         out: Where everything is written.
         task: The robot's own task; of the suite's robots also reaching the mark with the tool, or hovering
             with the tool above a puck.
         policies: Python file with policies(robot), policies of your own by name, which are judged too.
-        starts: Held-out episodes at whose beginning every policy starts.
+        recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether they
+            succeeded: the head learns from them, and episodes begin as those that are held out.
+        split: Of --recordings.
+        registry: TOML file with entries of your own.
+        real: What came of policies on the real robot, with --recordings: columns policy, successes, episodes.
+        starts: Held-out episodes at whose beginning every policy starts; of --recordings at most as many as are held out.
         batch: Of these, run at once. Default: all.
-        frames: Of an episode, instead of the task's.
+        frames: Of an episode, instead of the task's, or of what nine of ten recorded successes needed.
+        hold: Frames in a row at the goal that make a success, instead of the task's, or of 2 of --recordings, whose
+            successes are taken to have reached it at their last ones.
         demonstrations: Episodes of the scripted expert that the policies are trained on.
         steps: Of training of each kind of policy.
-        head_episodes: Recorded episodes that the success head is trained on.
+        head_episodes: Recorded episodes that the success head is trained on; of --recordings at most so many are taken.
         head_steps: Of training of the success head.
-        cloned: Checkpoints of behaviour cloning; 0 for none.
-        diffusion: Checkpoints of the Diffusion Policy; 0 for none.
+        cloned: Checkpoints of behaviour cloning, 0 for none. Default: 6, with --recordings none.
+        diffusion: Checkpoints of the Diffusion Policy. Default: 3, with --recordings none.
         seed: Of recordings, training and episodes.
         labels: Saved by the blind page: only says how often that person agrees with the judges of --out.
     """
     from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
+    from experiments.applications.judging.config import JudgeConfig
     from experiments.applications.judging.head import HeadConfig
-    from experiments.applications.judging.judge import JudgeConfig, judge_run
+    from experiments.applications.judging.judge import judge_recorded, judge_run
     from experiments.applications.judging.ladder import LadderConfig
     from experiments.applications.judging.outcomes import read_outcomes, write_outcomes
     from experiments.applications.judging.page import draw_scatter, write_page
+    from experiments.applications.judging.real import read_real
     from experiments.applications.judging.summary import summarise, write_summary
-    from experiments.applications.policies.tasks import find_task
+    from experiments.applications.policies.tasks import AnyTask, RecordedTask, find_task
 
     if labels is not None:
         agreed = compare_labels(read_labels(labels, out), read_outcomes(out / "outcomes.csv"))
@@ -76,30 +92,47 @@ def judge(
         console.print(table)
         return
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
-    ladder = replace(LadderConfig(), cloned=cloned, diffusion=diffusion, steps=steps)
+    require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
+    rungs = (6, 3) if recordings is None else (0, 0)
+    cloned, diffusion = (n if m is None else m for n, m in zip(rungs, (cloned, diffusion), strict=True))
+    if recordings is None:
+        for flag, value in (("--real", real), ("--registry", registry)):
+            require(value is None, f"{flag} is of robots without a true simulator: give --recordings, or leave it out")
+        judged_task: AnyTask = find_task(robot, task, frames, hold)
+    else:
+        require(task == "own", f"--task {task} is of robots with a true simulator, not of --recordings")
+        require(cloned == diffusion == 0, "recordings have no expert to clone: leave --cloned and --diffusion out")
+        judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold)
     config = JudgeConfig(
-        find_task(robot, task, frames),
+        judged_task,
         starts,
         starts if batch is None else batch,
         seed,
         demonstrations=demonstrations,
-        ladder=ladder,
+        ladder=replace(LadderConfig(), cloned=cloned, diffusion=diffusion, steps=steps),
         head=replace(HeadConfig(), fit=replace(HeadConfig().fit, steps=head_steps)),
         head_episodes=head_episodes,
     )
-    judged = judge_run(run, out, config, step, policies)
-    summary = summarise(judged)
+    counts = None if real is None else read_real(real)
+    if recordings is None:
+        judged = judge_run(run, out, config, step, policies)
+    else:
+        use_entries(registry)
+        judged = judge_recorded(run, out, config, recordings, step, policies, split, tuple(counts or ()))
+    summary = summarise(judged, counts)
     write_outcomes(judged.outcomes, out / "outcomes.csv")
     write_summary(summary, out / "agreement.json")
     draw_scatter(summary, out / "scatter.png")
-    asked: list[str | Path] = [
-        run, "--robot", robot, "--task", task, *(["--policies", policies] if policies else []),
-        "--starts", f"{starts}", "--batch", f"{config.batch}", "--frames", f"{config.task.frames}",
-        "--demonstrations", f"{demonstrations}", "--steps", f"{steps}", "--head-episodes", f"{head_episodes}",
-        "--head-steps", f"{head_steps}", "--cloned", f"{cloned}", "--diffusion", f"{diffusion}",
-        "--seed", f"{seed}", "--out", out,
-    ]  # fmt: skip
-    page = write_page(judged, summary, out, command("judge", *asked))
+    given: dict[str, Any] = {
+        "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
+        "--recordings": recordings, "--split": recordings and split, "--registry": registry, "--real": real,
+        "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
+        "--hold": judged.config.task.hold, "--demonstrations": demonstrations, "--steps": steps,
+        "--head-episodes": head_episodes, "--head-steps": head_steps, "--cloned": cloned, "--diffusion": diffusion,
+        "--seed": seed, "--out": out,
+    }  # fmt: skip
+    said = [x for flag, value in given.items() if value is not None for x in (flag, value)]
+    page = write_page(judged, summary, out, command("judge", run, *said))
     blind = write_blind(judged, out)
     _say(summary)
     then = f"label the clips of {blind}, and the same command with --labels labels.json"
@@ -107,17 +140,24 @@ def judge(
 
 
 def _say(summary: dict) -> None:
-    from experiments.applications.judging.page import say_beyond
-    from experiments.applications.judging.summary import COLUMNS, shown
+    from experiments.applications.judging.page import NOTHING, say_beyond, say_recorded
+    from experiments.applications.judging.summary import shown
 
-    table = tidy_table(f"{summary['robot']}: {summary['task']}", "policy", *COLUMNS)
+    columns = list(next(iter(summary["policies"].values())))
+    table = tidy_table(f"{summary['robot']}: {summary['task']}", "policy", *columns)
     for name, rates in summary["policies"].items():
-        table.add_row(name, *(shown(rates[column]) for column in COLUMNS))
+        table.add_row(name, *(shown(rates[column]) for column in columns))
     console.print(table)
-    if beyond := say_beyond(summary):
-        console.print(beyond, markup=False, soft_wrap=True)
-    measures = list(next(iter(summary["agreement"].values()))["starts"])
-    table = tidy_table("agreement, intervals over other policies and starts", "compared", *measures)
-    for name, found in summary["agreement"].items():
-        table.add_row(name, *(shown(found["policies and starts"][m]) for m in measures))
+    found = summary["agreement"]
+    for said in (say_beyond(summary), say_recorded(summary["head"]), "" if found else NOTHING):
+        if said:
+            console.print(said, markup=False, soft_wrap=True)
+    if not found:
+        return
+    measures = list(next(iter(found.values()))["starts"])
+    table = tidy_table(
+        f"agreement with {summary['compared with']}, intervals over other policies and starts", "compared", *measures
+    )
+    for name, agreed in found.items():
+        table.add_row(name, *(shown(agreed["policies and starts"][m]) for m in measures))
     console.print(table)

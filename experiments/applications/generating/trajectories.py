@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from data_pipelines.registry import DatasetSpec, get_spec
+from data_pipelines.sources.identity import episode_ids
 from data_pipelines.sources.open import open_source, source_name
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.sources.source import INSTRUCTION_KEY
@@ -34,7 +35,16 @@ class Trajectory:
     instruction: str = ""
 
     def __len__(self) -> int:
+        """M."""
         return len(self.images)
+
+
+@dataclass(frozen=True)
+class Outline:
+    """What is known of a trajectory before its frames are decoded."""
+
+    frames: int  # M
+    success: bool | None  # whether it reached its goal, where the recording says so
 
 
 class Trajectories(ABC):
@@ -51,6 +61,14 @@ class Trajectories(ABC):
     @abstractmethod
     def __getitem__(self, i: int) -> Trajectory:
         """Raises EpisodeError for an episode that cannot be read."""
+
+    @abstractmethod
+    def outline(self, i: int) -> Outline:
+        """Raises EpisodeError for an episode that cannot be read."""
+
+    @abstractmethod
+    def ids(self) -> np.ndarray:
+        """uint64 [trajectories]: what decides which are held out, see `sampling.splits`."""
 
     def origin(self, i: int) -> str:
         return f"{self.name}/{self.split}/{i}"
@@ -78,6 +96,13 @@ class RldsTrajectories(Trajectories):
             said = self._source.record(i, [INSTRUCTION_KEY]).get(INSTRUCTION_KEY, ())
         instruction = said[0].decode(errors="replace") if len(said) else ""
         return _trajectory(self.origin(i), images, spec.convert(episode.actions), self._robot, instruction)
+
+    def outline(self, i: int) -> Outline:
+        with self._source.open_episode(i, self.spec.image_key, self.spec.action_keys) as episode:
+            return Outline(-(-episode.steps // self._robot.stride), episode.success)
+
+    def ids(self) -> np.ndarray:
+        return self._source.ids[self._source.numbers]
 
 
 class StoredTrajectories(Trajectories):
@@ -113,6 +138,15 @@ class StoredTrajectories(Trajectories):
         else:
             images = np.asarray(self._tokenizer.decode(np.array(episode.tokens[:: self._every])))
         return _trajectory(self.origin(i), images, episode.actions, self._robot, "")
+
+    def outline(self, i: int) -> Outline:
+        episode = self._store.episode(self.name, self.split, i)
+        return Outline(len(episode.tokens[:: self._every]), episode.success)
+
+    def ids(self) -> np.ndarray:
+        manifest = self._store.manifest(self.name)
+        numbers = np.asarray(manifest.split(self.split).episodes, np.int64)
+        return episode_ids(manifest.runs)[numbers] if manifest.runs else numbers.astype(np.uint64)
 
 
 def open_trajectories(

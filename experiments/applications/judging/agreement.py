@@ -68,14 +68,30 @@ def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed:
     Intervals are quantiles of `draws` bootstrap resamples of policies and starts, and of starts alone. A start drawn is
     drawn in both worlds and for all policies. Draws in which a measure is not defined are left out.
     """
-    policies, starts = true_PM.shape
+    return _agree(true_PM.mean(1), lambda columns: true_PM[:, columns].mean(1), learned_PM, draws, seed)
+
+
+def agree_with_counts(
+    successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed: int = 0
+) -> Agreement:
+    """As `agree`, of policies of which elsewhere so many of so many episodes succeeded. Those are of other starts: while
+    the model's are resampled, each count is drawn anew from a binomial distribution of its own rate."""
+    rates, rng = successes_P / episodes_P, np.random.default_rng([seed, 18])
+    return _agree(rates, lambda columns: rng.binomial(episodes_P, rates) / episodes_P, learned_PM, draws, seed)
+
+
+def _agree(
+    true_P: np.ndarray, draw: Callable[[np.ndarray], np.ndarray], learned_PM: np.ndarray, draws: int, seed: int
+) -> Agreement:
+    """`draw` gives true rates [P] anew, where the starts drawn are `columns`."""
+    policies, starts = learned_PM.shape
     found: tuple[dict[str, list[float]], ...] = ({name: [] for name in MEASURES}, {name: [] for name in MEASURES})
     for rows, columns in _resamples(policies, starts, draws, seed):
-        rates = true_PM[:, columns].mean(1), learned_PM[:, columns].mean(1)
+        rates = draw(columns), learned_PM[:, columns].mean(1)
         for kept, which in zip(found, (rows, slice(None)), strict=True):
             for name, measure in MEASURES.items():
                 kept[name].append(measure(rates[0][which], rates[1][which]))
-    value = {name: measure(true_PM.mean(1), learned_PM.mean(1)) for name, measure in MEASURES.items()}
+    value = {name: measure(true_P, learned_PM.mean(1)) for name, measure in MEASURES.items()}
     size = {"n": policies * starts, "episodes": starts}
     both, alone = (
         {name: _interval(value[name], np.array(drawn), size) for name, drawn in kept.items()} for kept in found
@@ -117,8 +133,13 @@ def _interval(value: float, drawn: np.ndarray, size: dict[str, int]) -> Interval
 
 
 def rate_interval(successes: np.ndarray) -> Interval:
+    """Of the success rate of episodes, bool [n], see `count_interval`."""
+    return count_interval(int(np.sum(successes)), len(successes))
+
+
+def count_interval(successes: int, n: int) -> Interval:
     """Of a success rate: Wilson's score interval, which holds at 0 and 1 too (Wilson 1927, JASA 22)."""
-    n, rate, z = len(successes), float(np.mean(successes)), 1.959964
+    rate, z = successes / n, 1.959964
     centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     low = centre - half if rate > 0 else 0.0  # to the last bit, or a figure's error bar would have a negative length

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from experiments.applications.judging.head import HeadConfig
 from experiments.applications.judging.ladder import LadderConfig
 from experiments.applications.policies.learning import Report
-from experiments.applications.policies.tasks import Task
+from experiments.applications.policies.tasks import AnyTask
 from hma_jax.config import require
 
 Step = Callable[[str], AbstractContextManager[Report]]
@@ -19,7 +19,7 @@ Step = Callable[[str], AbstractContextManager[Report]]
 class JudgeConfig:
     """What is judged, and how its parts are made."""
 
-    task: Task
+    task: AnyTask
     starts: int = 50
     batch: int = 50  # episodes at once
     seed: int = 0

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.applications.generating.trajectories import open_trajectories, require_layout
 from experiments.applications.judging.config import JudgeConfig, Step
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
 from experiments.applications.judging.head import SuccessHead, load_head, save_head
@@ -24,11 +25,15 @@ from experiments.applications.judging.ladder import OWN_HEAD, find_policy, names
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED, TRUE, Outcome, judge_rollout
 from experiments.applications.judging.outside import Outside, TrueOutside
 from experiments.applications.judging.own_policies import load_policies, try_out
+from experiments.applications.judging.recordings import Recordings
 from experiments.applications.judging.rollouts import Rollout, load_rollout, run, save_rollout
 from experiments.applications.made_with import claim, short_hash
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
+from experiments.running.workspace import Workspace
+from experiments.words import few
+from hma_jax.config import require
 from hma_jax.config.json import to_dict
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
@@ -64,8 +69,48 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step, o
     return _judge(run_directory, out, simulator, robot, TrueOutside(config, robot, simulator, step), step, own)
 
 
+def judge_recorded(
+    run_directory: Path,
+    out: Path,
+    config: JudgeConfig,
+    dataset: str,
+    step: Step,
+    own: Path | None = None,
+    split: str = "train",
+    counted: Sequence[str] = (),
+) -> Judged:
+    """The same for a robot without a true simulator, whose recordings in `dataset` say what success looks like. Of the
+    starts and episodes at once that are asked for, as many as recordings are held out. `counted` are the policies that the
+    real robot was seen to act by.
+
+    Raises ConfigError as `judge_run` does, for recordings that are not the robot's, and for too few of them; EpisodeError
+    for one that cannot be read.
+    """
+    simulator = load_simulator(run_directory, own_starts=True)
+    some = own is not None or simulator.model.config.action_heads
+    require(some, "there is no policy to judge but the random one: give --policies FILE")
+    robot, stores = simulator.robot(config.task.robot), Workspace.of_run(run_directory).store
+    recorded, _ = open_trajectories(dataset, split, robot, {}, simulator.tokenizer, stores)
+    require_layout(recorded, robot, simulator.model.table)
+    outside = Recordings(config, recorded, robot, step)
+    return _judge(run_directory, out, _of_episodes(simulator, outside.config.batch), robot, outside, step, own, counted)
+
+
+def _of_episodes(simulator: Simulator, episodes: int) -> Simulator:
+    """The same one with so many episodes at once."""
+    robots = tuple(simulator.robots.values())
+    return Simulator(simulator.model, simulator.tokenizer, robots=robots, episodes=episodes, decode=simulator.decode)
+
+
 def _judge(
-    run_directory: Path, out: Path, simulator: Simulator, robot: Robot, outside: Outside, step: Step, own: Path | None
+    run_directory: Path,
+    out: Path,
+    simulator: Simulator,
+    robot: Robot,
+    outside: Outside,
+    step: Step,
+    own: Path | None,
+    counted: Sequence[str] = (),
 ) -> Judged:
     config = outside.config
     for encoder in (config.ladder.encoder, config.head.encoder):
@@ -77,6 +122,10 @@ def _judge(
         try_out(users, config.batch, simulator.tokenizer.image_shape)
         about["contents of --policies"] = short_hash(own.read_bytes())
     policies += users
+    others = [name for name in counted if name not in policies]
+    require(
+        not others, f"counted on the real robot: {few(others)}; judged here: {', '.join(policies)}; use the same names"
+    )
     claim(out, run_directory, simulator, {"config": to_dict(config), **about}, file="judge.json")
     if own is not None:
         write_file(out / OWN_FILE, own.read_bytes())

@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.applications.judging.head import SuccessHead
 from experiments.applications.judging.rollouts import Rollout
-from experiments.applications.policies.tasks import Task, held
+from experiments.applications.policies.tasks import AnyTask, held
 from experiments.applications.tables import write_table
 from hma_jax.config import ConfigError
 
@@ -39,7 +39,7 @@ class Outcome:
 def judge_rollout(
     rollout: Rollout,
     head: SuccessHead,
-    task: Task,
+    task: AnyTask,
     policy: str,
     world: str,
     numbers: Sequence[int],

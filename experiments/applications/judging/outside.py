@@ -62,7 +62,7 @@ class TrueOutside:
 
     def __init__(self, config: JudgeConfig, robot: Robot, learned: Simulator, step: Step):
         """Raises ConfigError for a robot that has none."""
-        require(has_truth(robot), f"{robot.name} has no true simulator here: there is nothing to compare with")
+        require(has_truth(robot), f"{robot.name} has no true simulator here; give --recordings of it")
         self.config, self._robot, self._learned, self._step = config, robot, learned, step
         self._size = learned.tokenizer.image_size
 

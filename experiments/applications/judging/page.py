@@ -12,9 +12,10 @@ import numpy as np
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
+from experiments.applications.judging.agreement import count_interval
 from experiments.applications.judging.judge import Judged
-from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, successes
-from experiments.applications.judging.summary import COLUMNS, shown
+from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
+from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE, shown
 from experiments.report.clips import animate
 from experiments.report.pieces import data_uri, picture, section, table
 from experiments.report.plot_style import INK, MUTED, STYLE, save
@@ -30,21 +31,34 @@ MANY_BEYOND = 0.1
 """A policy of which more than this share of actions is clipped may mean them in other units."""
 
 
+AXES = {
+    REFERENCE: "success in the true simulator, by its state",
+    REAL: "success of the real robot",
+    CONTROL: "success in the control: actions of other episodes, by the head",
+}
+"""What is told from left to right."""
+
+
 def draw_scatter(summary: dict[str, Any], path: Path) -> None:
-    """Success in the true world against success in the learned one, and in the control, a point for each policy."""
+    """Success in the learned world, and in the control, against what they are compared with, a point for each policy;
+    where that is nothing, one against the other."""
+    across, titles = (
+        summary["compared with"] or CONTROL,
+        {MODEL: "learned model", CONTROL: "control: actions of other episodes"},
+    )
+    upwards = [column for column in titles if column != across]
     with plt.rc_context(STYLE):
-        figure, panels = plt.subplots(1, 2, figsize=(9.6, 4.7), sharex=True, sharey=True)
+        figure, panels = plt.subplots(
+            1, len(upwards), figsize=(4.8 * len(upwards), 4.7), sharex=True, sharey=True, squeeze=False
+        )
         labels: list[list[Annotation]] = []
-        for panel, column, title in zip(
-            panels,
-            ("learned, by head", "shuffled, by head"),
-            ("learned model", "control: actions of other episodes"),
-            strict=True,
-        ):
+        for panel, column in zip(panels[0], upwards, strict=True):
             panel.plot([0, 1], [0, 1], color=MUTED, linewidth=1, zorder=1)
             words = []
             for name, rates in summary["policies"].items():
-                x, y = rates["true, by state"], rates[column]
+                x, y = rates[across], rates[column]
+                if x["mean"] is None:  # nobody counted it
+                    continue
                 spread = (
                     [[x["mean"] - x["low"]], [x["high"] - x["mean"]]],
                     [[y["mean"] - y["low"]], [y["high"] - y["mean"]]],
@@ -61,14 +75,9 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
                     name, at, (-4 if left else 4, 4), textcoords="offset points", fontsize=7, color=INK,
                     ha="right" if left else "left",
                 ))  # fmt: skip
-            panel.set(
-                xlim=(-0.03, 1.03),
-                ylim=(-0.03, 1.03),
-                title=title,
-                xlabel="success in the true simulator, by its state",
-            )
+            panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), title=titles[column], xlabel=AXES[across])
             labels.append(words)
-        panels[0].set_ylabel("success in the model, by the head")
+        panels[0, 0].set_ylabel("success in the model, by the head")
         figure.tight_layout()
         figure.canvas.draw()
         for words in labels:
@@ -99,36 +108,18 @@ def say_beyond(summary: dict[str, Any]) -> str:
 
 def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str) -> Path:
     """OUT/judge.html, from the figures drawn already."""
-    measured = summary["head"]
-    lines = [[html.escape(name), *(shown(rates[c]) for c in COLUMNS)] for name, rates in summary["policies"].items()]
-    measures = list(next(iter(summary["agreement"].values()))["starts"])
-    agreed = [
-        [html.escape(name), html.escape(over), *(shown(found[over][m]) for m in measures)]
-        for name, found in summary["agreement"].items()
-        for over in found
-    ]
-    rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
+    columns = list(next(iter(summary["policies"].values())))
+    lines = [[html.escape(name), *(shown(rates[c]) for c in columns)] for name, rates in summary["policies"].items()]
+    picks, left = _left_of(judged)
     body = [
         f"<h1>{html.escape(summary['robot'])}: {html.escape(summary['task'])}</h1>",
         f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode "
         f"succeeds when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
-        picture(out / "scatter.png", "success in both worlds"),
-        section("Success by policy", table(["policy", *COLUMNS], lines), f"<p>{html.escape(say_beyond(summary))}</p>"),
-        section(
-            "Agreement with the true simulator",
-            table(["compared", "interval over other", *measures], agreed, text=2),
-            "<p>Model and truth say the same of a policy's episode from a start: "
-            + "; ".join(f"{html.escape(name)} {shown(x)}" for name, x in summary["episodes alike"].items())
-            + ".</p>",
-        ),
-        section(
-            "The success head",
-            f"<p>On {measured['episodes']:.0f} recorded true episodes that it was not trained on: accuracy "
-            f"of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of episodes "
-            f"{measured['episode accuracy']:.3f}.</p><p>Episodes per second, this machine as loaded as it was: "
-            f"{html.escape(rates)}.</p>",
-        ),
-        section("The same start, the true world on the left, the model on the right", _clips(judged)),
+        picture(out / "scatter.png", "success by policy"),
+        section("Success by policy", table(["policy", *columns], lines), f"<p>{html.escape(say_beyond(summary))}</p>"),
+        _agreement(summary),
+        _head(summary),
+        section(f"The same start, {left} on the left, the model on the right", _clips(judged, *picks)),
         section("How to repeat it", f"<pre>{html.escape(command)}</pre>"),
     ]
     path = out / "judge.html"
@@ -140,19 +131,97 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
     return path
 
 
-def _clips(judged: Judged) -> str:
+NOTHING = (
+    "Nothing outside the model was compared: there is no true simulator, and no counts of the real robot were given "
+    "(--real). The rates above are those of the model and of a head that learnt what success looks like from recordings; "
+    "either may be wrong. A policy that does as well in the control, where another episode's actions are executed, does "
+    "not succeed by what it does."
+)
+
+
+def _agreement(summary: dict[str, Any]) -> str:
+    if not summary["agreement"]:
+        return section("Compared with nothing", f"<p><b>{html.escape(NOTHING)}</b></p>")
+    measures = list(next(iter(summary["agreement"].values()))["starts"])
+    agreed = [
+        [html.escape(name), html.escape(over), *(shown(found[over][m]) for m in measures)]
+        for name, found in summary["agreement"].items()
+        for over in found
+    ]
+    heading = table(["compared", "interval over other", *measures], agreed, text=2)
+    if summary["compared with"] == REAL:
+        counted = [name for name, rates in summary["policies"].items() if rates[REAL]["mean"] is not None]
+        return section(
+            "Agreement with the real robot",
+            heading,
+            f"<p>Of the {len(counted)} policies that were counted there. Other starts of the model stand beside other "
+            "episodes of the robot, drawn from its rates.</p>",
+        )
+    return section(
+        "Agreement with the true simulator",
+        heading,
+        "<p>Model and truth say the same of a policy's episode from a start: "
+        + "; ".join(f"{html.escape(name)} {shown(x)}" for name, x in summary["episodes alike"].items())
+        + ".</p>",
+    )
+
+
+def _head(summary: dict[str, Any]) -> str:
+    measured = summary["head"]
+    said = (
+        f"On {measured['episodes']:.0f} recorded {'' if 'successes' in measured else 'true '}episodes that it was not "
+        f"trained on: accuracy of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of "
+        f"episodes {measured['episode accuracy']:.3f}."
+    )
+    rates = ", ".join(f"{world} {rate:g}" for world, rate in summary["episodes per second"].items())
+    return section(
+        "The success head",
+        f"<p>{said} {html.escape(say_recorded(measured))}</p><p>Episodes per second, this machine as loaded as it was: "
+        f"{html.escape(rates)}.</p>",
+    )
+
+
+def say_recorded(measured: dict[str, float]) -> str:
+    """In words, what a head that learnt from recordings of success and failure says of those held out; "" of another."""
+    if "successes" not in measured:
+        return ""
+    n, good = round(measured["episodes"]), round(measured["successes"])
+    told = round(measured["successes told"]), round(measured["failures told"])
+    accuracy, usual = count_interval(sum(told), n), max(good, n - good) / n
+    doubt = "" if accuracy.low > usual else " By these few it is not known to be better: do not trust the rates."
+    return (
+        f"It tells {told[0]} of {good} successes and {told[1]} of {n - good} failures: {accuracy.mean:.2f} "
+        f"({accuracy.low:.2f} to {accuracy.high:.2f}) of all, {measured['episode accuracy, decoded']:.2f} when they are "
+        f"shown as the model's tokenizer draws them. To call every one the same would be right in {usual:.2f}.{doubt} It learnt "
+        f"from {measured['learnt from']:.0f} recordings, {measured['successes among them']:.0f} of them successes; left out were "
+        f"{measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short."
+    )
+
+
+def _left_of(judged: Judged) -> tuple[tuple[tuple[str, str], ...], str]:
+    """Whose clips are shown beside each other, (world, judge) of both, and what the left one is called."""
+    if TRUE in judged.worlds:
+        return ((TRUE, STATE), (LEARNED, HEAD)), "the true world"
+    return ((SHUFFLED, HEAD), (LEARNED, HEAD)), "the control, which executes another episode's actions,"
+
+
+CALLED = {TRUE: "true", LEARNED: "model", SHUFFLED: "control"}
+
+
+def _clips(judged: Judged, *sides: tuple[str, str]) -> str:
     """Of policies spread over the ladder, one start each, and what the judges said."""
     chosen = np.unique(np.linspace(0, len(judged.policies) - 1, CLIPS).round().astype(int))
-    state = successes(judged.outcomes, judged.policies, TRUE, STATE)
-    head = successes(judged.outcomes, judged.policies, LEARNED, HEAD)
+    said = [successes(judged.outcomes, judged.policies, *side) for side in sides]
     figures = []
     for rank, p in enumerate(chosen):
         name, start = judged.policies[p], rank % judged.config.starts
-        clips = [judged.rollouts(name, world).images[start] for world in (TRUE, LEARNED)]
-        said = [("success" if x[p, start] else "failure") for x in (state, head)]
+        clips = [judged.rollouts(name, world).images[start] for world, _ in sides]
+        words = "".join(
+            f"<span>{CALLED[world]}: {'success' if found[p, start] else 'failure'} by {judge}</span>"
+            for found, (world, judge) in zip(said, sides, strict=True)
+        )
         figures.append(
             f"<figure class=trio><figcaption>{html.escape(name)}, start {start}</figcaption>"
-            f'<img alt="" src="{data_uri(animate(clips, 1), "webp")}">'
-            f"<div><span>true: {said[0]} by state</span><span>model: {said[1]} by head</span></div></figure>"
+            f'<img alt="" src="{data_uri(animate(clips, 1), "webp")}"><div>{words}</div></figure>'
         )
     return f"<div class=trios>{''.join(figures)}</div>"

@@ -15,7 +15,7 @@ from data_pipelines.suite.simulator import SuiteSimulator
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.applications.policies.learning import Report
 from experiments.applications.policies.policy import Policy
-from experiments.applications.policies.tasks import Task, reached
+from experiments.applications.policies.tasks import AnyTask, Task, reached
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.files import UNREADABLE, write_file
@@ -62,7 +62,7 @@ def run(
     policy: Policy,
     starts: Sequence[Start],
     seeds: Sequence[int],
-    task: Task,
+    task: AnyTask,
     *,
     shuffled: bool = False,
     report: Report = lambda done, total, note: None,
@@ -83,7 +83,12 @@ def run(
 
 
 def _run(
-    simulator: AnySimulator, policy: Policy, starts: Sequence[Start], seeds: Sequence[int], task: Task, shuffled: bool
+    simulator: AnySimulator,
+    policy: Policy,
+    starts: Sequence[Start],
+    seeds: Sequence[int],
+    task: AnyTask,
+    shuffled: bool,
 ) -> Rollout:
     policy.reset(seeds=seeds)
     images = [simulator.reset(list(starts), seeds=list(seeds)).copy()]
@@ -101,7 +106,7 @@ def _run(
     return Rollout(shown, np.stack(acted, 1), done, np.full(len(shown), seconds / len(shown)))
 
 
-def _reached(simulator: AnySimulator, task: Task) -> np.ndarray:
+def _reached(simulator: AnySimulator, task: AnyTask) -> np.ndarray:
     if isinstance(simulator, SuiteSimulator):
         return reached(task.spec, [simulator.state(b) for b in range(len(simulator))])
     return simulator.success() if isinstance(simulator, TrueSimulator) else np.zeros(len(simulator), bool)

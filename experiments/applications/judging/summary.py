@@ -5,70 +5,96 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from experiments.analysis.intervals import Interval
-from experiments.applications.judging.agreement import agree, rate_interval, share
+from experiments.applications.judging.agreement import (
+    Agreement,
+    agree,
+    agree_with_counts,
+    count_interval,
+    rate_interval,
+    share,
+)
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
+from experiments.applications.judging.real import Count
 from hma_jax.runtime.files import write_file
 
+REFERENCE, REAL, MODEL, CONTROL = "true, by state", "real robot", "learned, by head", "shuffled, by head"
+
 COLUMNS = {
-    "true, by state": (TRUE, STATE),
+    REFERENCE: (TRUE, STATE),
     "true, by head": (TRUE, HEAD),
-    "learned, by head": (LEARNED, HEAD),
-    "shuffled, by head": (SHUFFLED, HEAD),
+    MODEL: (LEARNED, HEAD),
+    CONTROL: (SHUFFLED, HEAD),
 }
 """What is shown of every policy: (world, judge)."""
 
-REFERENCE = "true, by state"
-
 COMPARED = {
-    "learned model": "learned, by head",
+    "learned model": MODEL,
     "the head alone, on true frames": "true, by head",
-    "control: actions of other episodes": "shuffled, by head",
+    "control: actions of other episodes": CONTROL,
 }
-"""What is compared with the reference."""
+"""What is compared with the reference: success in the true world by state, or that of the real robot."""
+
+UNKNOWN = {"mean": None, "low": None, "high": None}
 
 
-def summarise(judged: Judged) -> dict[str, Any]:
-    """What agreement.json says; every number with its interval."""
+def summarise(judged: Judged, real: Mapping[str, Count] | None = None) -> dict[str, Any]:
+    """What agreement.json says; every number with its interval. `real`: what happened on the real robot, of some
+    policies."""
     columns = {name: where for name, where in COLUMNS.items() if where[0] in judged.worlds}
     each = {name: successes(judged.outcomes, judged.policies, *where) for name, where in columns.items()}
-    reference = each[REFERENCE]
-    compared = {name: agree(reference, each[column]) for name, column in COMPARED.items()}
-    same = each["learned, by head"] == reference
-    alike = {
-        "all episodes": np.ones_like(same),
-        "those that truly succeed": reference,
-        "those that truly fail": ~reference,
+    rates = {
+        name: {column: _plain(rate_interval(found[i])) for column, found in each.items()}
+        for i, name in enumerate(judged.policies)
     }
+    if real:
+        counted = {name: _plain(count_interval(*real[name])) if name in real else UNKNOWN for name in judged.policies}
+        rates = {name: {REAL: counted[name], **found} for name, found in rates.items()}
     return {
         "robot": judged.config.task.robot,
         "task": judged.config.task.goal,
         "frames": judged.config.task.frames,
         "hold": judged.config.task.hold,
         "starts": judged.config.starts,
-        "policies": {
-            name: {column: _plain(rate_interval(found[i])) for column, found in each.items()}
-            for i, name in enumerate(judged.policies)
-        },
+        "policies": rates,
         "own": list(judged.own),
         "actions beyond the range": {name: round(share, 4) for name, share in judged.beyond.items()},
+        "compared with": REAL if real else REFERENCE if REFERENCE in each else None,
         "agreement": {
             name: {
                 "policies and starts": {m: _plain(x) for m, x in found.measures.items()},
                 "starts": {m: _plain(x) for m, x in found.over_starts.items()},
             }
-            for name, found in compared.items()
+            for name, found in _compare(judged, each, real).items()
         },
-        "episodes alike": {name: _plain(share(same, among)) for name, among in alike.items() if among.any()},
+        "episodes alike": _alike(each[MODEL], each[REFERENCE]) if REFERENCE in each else {},
         "head": judged.head.measured,
         "episodes per second": {world: round(1 / s, 3) for world, s in judged.seconds.items()},
     }
+
+
+def _compare(judged: Judged, each: Mapping[str, np.ndarray], real: Mapping[str, Count] | None) -> dict[str, Agreement]:
+    compared = {name: column for name, column in COMPARED.items() if column in each}
+    if REFERENCE in each:
+        return {name: agree(each[REFERENCE], each[column]) for name, column in compared.items()}
+    if not real:
+        return {}
+    rows = [judged.policies.index(name) for name in real]
+    counts = np.array(list(real.values())).T
+    return {name: agree_with_counts(*counts, each[column][rows]) for name, column in compared.items()}
+
+
+def _alike(learned: np.ndarray, true: np.ndarray) -> dict[str, dict[str, float | None]]:
+    same = learned == true
+    among = {"all episodes": np.ones_like(same), "those that truly succeed": true, "those that truly fail": ~true}
+    return {name: _plain(share(same, some)) for name, some in among.items() if some.any()}
 
 
 def _plain(interval: Interval) -> dict[str, float | None]:

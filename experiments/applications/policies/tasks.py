@@ -79,7 +79,7 @@ class Task:
         require(
             self.robot in SPECS or self.robot in EXPERTS,
             f"no task of a robot {self.robot!r}: a task needs a true simulator that says when it is done, and an expert "
-            f"in it, as there are of {', '.join([*SPECS, *EXPERTS])}",
+            f"in it, as there are of {', '.join([*SPECS, *EXPERTS])}; of others `hma judge` takes --recordings",
         )
         known = TASKS if self.in_suite else (OWN,)
         require(self.name in known, f"no task {self.name!r} of {self.robot}; there are {', '.join(known)}")
@@ -113,6 +113,28 @@ class Task:
         if self.name != OWN:
             return "the tool on the mark" if self.name == REACH else "the tool above a puck"
         return "the puck on the mark" if isinstance(SPECS[self.robot].task, Push) else "the puck carried to the mark"
+
+
+@dataclass(frozen=True)
+class RecordedTask:
+    """What a robot without a true simulator is to do, as its recordings show it; otherwise as `Task`."""
+
+    robot: str
+    frames: int = 0  # 0: as long as most of the recorded successes
+    hold: int = 2
+    goal: str = ""  # in words, where the recordings have some
+    name: str = "recorded"
+
+    def __post_init__(self):
+        require(self.frames >= 0, f"--frames must not be negative, got {self.frames}")
+        longest = self.frames or self.hold
+        require(
+            1 <= self.hold <= longest,
+            f"a goal held for {self.hold} frames does not fit {longest} frames (--hold, --frames)",
+        )
+
+
+AnyTask = Task | RecordedTask
 
 
 def find_task(robot: str, name: str = OWN, frames: int | None = None, hold: int | None = None) -> Task:

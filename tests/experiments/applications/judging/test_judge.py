@@ -163,7 +163,7 @@ def test_frames_that_no_policy_could_look_at_are_refused_before_anything_is_reco
     assert not (root / "small").exists()
 
 
-def test_table_summary_and_page(judged):
+def test_table_summary_and_page(judged, few_draws):
     root, found = judged
     out = root / "out"
     write_outcomes(found.outcomes, out / "outcomes.csv")

@@ -1,0 +1,48 @@
+"""What a person counted on the real robot: a CSV file with the columns policy, successes, episodes."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import NamedTuple
+
+from hma_jax.config import ConfigError, require
+
+COLUMNS = ("policy", "successes", "episodes")
+
+FEWEST = 3
+"""Policies: two are always in perfect order, or in perfect disorder."""
+
+
+class Count(NamedTuple):
+    """Of one policy."""
+
+    successes: int
+    episodes: int
+
+
+def read_real(path: Path) -> dict[str, Count]:
+    """{policy: its count}. Raises ConfigError, naming the line, for what is none."""
+    try:
+        with open(path, newline="") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{path} cannot be read as counts of the real robot ({error})") from error
+    there = list(rows[0]) if rows else []
+    missing = [name for name in COLUMNS if name not in there]
+    require(not missing, f"{path}: no column {', '.join(missing)}, or no row; a row has {', '.join(COLUMNS)}")
+    found: dict[str, Count] = {}
+    for line, row in enumerate(rows, start=2):
+        name = row["policy"]
+        try:
+            count = Count(int(row["successes"]), int(row["episodes"]))
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                f"{path}, line {line}: successes and episodes of {name} are whole numbers ({error})"
+            ) from error
+        fits = 0 <= count.successes <= count.episodes and count.episodes >= 1
+        require(fits, f"{path}, line {line}: {name} cannot succeed in {count.successes} of {count.episodes} episodes")
+        require(name not in found, f"{path}, line {line}: {name} has a line before this one; add them up")
+        found[name] = count
+    require(len(found) >= FEWEST, f"{path} has {len(found)} policies; an order to compare needs at least {FEWEST}")
+    return found

@@ -1,0 +1,166 @@
+"""A robot without a true simulator: recordings that say whether they succeeded teach the head, and episodes begin as they
+did.
+
+A recording is looked at from where a policy would take over, the last frame of a start. Frames at which nobody knows
+whether the goal is reached, between the first half of a success and its last `hold` frames, are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from data_pipelines.sampling.order import hash64, stream_seed
+from experiments.applications.generating.source import confined
+from experiments.applications.generating.trajectories import Trajectories, describe
+from experiments.applications.judging.config import JudgeConfig, Step
+from experiments.applications.judging.head import SuccessHead, fit_head, worth_of
+from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
+from experiments.applications.judging.outside import Reconstruct
+from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.learning import Report
+from experiments.applications.policies.network import shrink_bytes
+from experiments.applications.policies.tasks import RecordedTask, held
+from experiments.applications.simulators import START_FRAMES
+from hma_jax.config import ConfigError, require
+from hma_jax.simulator.robots import Robot
+from hma_jax.simulator.starts import Start
+
+FEWEST = 8
+"""Recordings of either kind that are needed: two of them are held out."""
+
+HELD_OUT = 4
+"""Every so many recordings of a kind are held out: nothing is learnt from them, the head is measured on them, and
+episodes begin as they did."""
+
+MOST = 0.9
+"""This share of the recorded successes is not longer than an episode, where its length is not given."""
+
+BEFORE = START_FRAMES - 1
+"""Frames of a recording before the first that is looked at."""
+
+
+class Recordings:
+    """See `outside.Outside`. `config` is the one asked for, with the task and the number of starts that the recordings
+    leave."""
+
+    worlds = (LEARNED, SHUFFLED)
+
+    def __init__(self, config: JudgeConfig, recorded: Trajectories, robot: Robot, step: Step):
+        """Raises ConfigError for too few recordings of either kind."""
+        task = config.task
+        if not isinstance(task, RecordedTask):
+            raise TypeError(f"recordings have a RecordedTask, not {task}")
+        self._recorded, self._robot, self._step = recorded, robot, step
+        with step("which recordings succeeded") as report:
+            outlines = [recorded.outline(i) for i in _one_by_one(range(len(recorded)), report)]
+        length = np.array([outline.frames - BEFORE for outline in outlines])
+        known = np.array([outline.success is not None for outline in outlines], bool)
+        self._success = np.array([bool(outline.success) for outline in outlines], bool)
+        # A recording that is held out of a model's training comes first here, too: by the same hash.
+        order = np.argsort(hash64(recorded.ids(), stream_seed("held-out", recorded.spec.name)), kind="stable")
+        enough = length > task.hold
+        usable = [int(i) for i in order if known[i] and enough[i]][: config.head_episodes]
+        kinds = [[i for i in usable if self._success[i] == kind] for kind in (True, False)]
+        self._left_out = {"unknown": float((~known).sum()), "too short": float((known & ~enough).sum())}
+        require(
+            min(map(len, kinds)) >= FEWEST,
+            f"{recorded.name}, split {recorded.split}: of {len(outlines)} recordings {len(kinds[0])} succeeded and "
+            f"{len(kinds[1])} failed ({self._left_out['unknown']:.0f} do not say, {self._left_out['too short']:.0f} have less "
+            f"than the {BEFORE + task.hold + 1} frames at the model's rate that --hold {task.hold} needs). A success head "
+            f"needs at least {FEWEST} of each",
+        )
+        self.held_out = sorted((i for kind in kinds for i in kind[: len(kind) // HELD_OUT]), key=usable.index)
+        self.learnt = [i for i in usable if i not in set(self.held_out)]
+        frames = task.frames or int(np.ceil(np.quantile(length[kinds[0]], MOST))) - 1  # one is the start's
+        said = recorded[self.held_out[0]].instruction
+        starts = min(config.starts, len(self.held_out))
+        batch = min(config.batch, starts)
+        goal = said or "what its recordings call success"
+        self.config = replace(
+            config, task=replace(task, frames=frames, goal=goal), starts=starts - starts % batch, batch=batch
+        )
+
+    def about(self) -> dict[str, Any]:
+        return {"recordings": describe(self._recorded)}
+
+    def demonstrations(self) -> Demonstrations:
+        raise ConfigError("recordings have no expert that the ladder could learn from: --cloned 0 --diffusion 0")
+
+    def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
+        config, pairs, labels = self.config, [], []
+        size, hold = config.head.encoder.size, config.task.hold
+        with self._step(f"read {len(self.learnt)} recordings for the success head") as report:
+            for i in _one_by_one(self.learnt, report):
+                images, rng = self._images(i), np.random.default_rng([config.seed, i, 17])
+                chosen, label = labelled(len(images), bool(self._success[i]), hold)
+                seen = np.stack([np.broadcast_to(images[0], images[chosen].shape), images[chosen]], 1)
+                # Half of them, drawn: taken in turn, the frames of one kind could all be of one turn.
+                decoded = rng.permutation(len(chosen))[: len(chosen) // 2]
+                flat = seen[decoded].reshape(-1, *images.shape[1:])
+                seen[decoded] = reconstruct(flat).reshape(seen[decoded].shape)
+                pairs.append(shrink_bytes(seen, size))
+                labels.append(label)
+        with self._step("train the success head") as report:
+            head = fit_head(np.concatenate(pairs), np.concatenate(labels), config.head, config.seed, report)
+        head.measured |= self._measure(head, reconstruct)
+        return head
+
+    def _measure(self, head: SuccessHead, reconstruct: Reconstruct) -> dict[str, float]:
+        """What the head is worth on the recordings that are held out, from first to last frame; also as the model's
+        tokenizer shows them, which is how it sees those of the model."""
+        hold, successes = self.config.task.hold, self._success[self.held_out]
+        scores, labels, said, said_decoded = [], [], [], []
+        for i in self.held_out:
+            images = self._images(i)
+            chosen, label = labelled(len(images), bool(self._success[i]), hold)
+            for shown, found in ((images, said), (reconstruct(images), said_decoded)):
+                probability = head.probabilities(shown, shown[:1])
+                found.append(held(probability[None, 1:] > head.config.threshold, hold).any())
+                if shown is images:
+                    scores.append(probability[chosen])
+                    labels.append(label)
+        by_head = np.array(said)
+        return worth_of(head, np.concatenate(scores), np.concatenate(labels), by_head, successes) | {
+            "successes": float(successes.sum()),
+            "successes told": float(by_head[successes].sum()),
+            "failures told": float((~by_head[~successes]).sum()),
+            "episode accuracy, decoded": float((np.array(said_decoded) == successes).mean()),
+            "learnt from": float(len(self.learnt)),
+            "successes among them": float(self._success[self.learnt].sum()),
+            **self._left_out,
+        }
+
+    def _images(self, i: int) -> np.ndarray:
+        return self._recorded[i].images[BEFORE:]
+
+    def starts(self) -> list[Start]:
+        found = []
+        for i in self.held_out[: self.config.starts]:
+            trajectory = confined(self._recorded[i], self._robot)
+            given = trajectory.chunks[:BEFORE].reshape(-1, self._robot.action_dim)
+            found.append(Start(self._robot.name, trajectory.images[:START_FRAMES], given))
+        return found
+
+    def open(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndarray]:
+    """Frames of a recording of which it is known whether the goal is reached, int [n], and whether it is, bool [n]: no
+    frame of a failure, of a success all of its last `hold` and none of its first half, as far as these leave it."""
+    if not success:
+        return np.arange(length), np.zeros(length, bool)
+    half = min(length // 2, length - hold)
+    return np.r_[:half, length - hold : length], np.arange(half + hold) >= half
+
+
+def _one_by_one(numbers: Sequence[int], report: Report) -> Iterator[int]:
+    """The numbers of recordings, while it is reported how many have been read."""
+    for done, i in enumerate(numbers):
+        report(done, len(numbers), "recordings")
+        yield i

@@ -1,0 +1,186 @@
+"""`hma judge --recordings`, from the command to the page, for a robot that no simulator has."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from data_pipelines.registry import get_spec
+from experiments.applications.judging.agreement import agree, agree_with_counts
+from experiments.applications.judging.outcomes import HEAD, read_outcomes
+from experiments.applications.judging.page import say_recorded
+from experiments.applications.judging.real import read_real
+from experiments.applications.judging.recordings import labelled
+from experiments.applications.judging.rollouts import load_rollout
+from experiments.applications.policies.network import EncoderConfig
+from experiments.cli.main import main
+from hma_jax.config import ConfigError
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from tests.data_pipelines.fakes import write_rlds
+from tests.experiments.applications.runs import make_run
+
+SPEC = get_spec("berkeley_gnm_cory_hall")
+TABLE = EmbodimentTable((Embodiment(SPEC.name, 2, 1, (0.0,) * 2, (1.0,) * 2, low=(-2.0,) * 2, high=(2.0,) * 2),))
+
+POLICIES = """
+import numpy as np
+
+
+class Constant:
+    def __init__(self, action):
+        self.action = np.array(action)
+
+    def reset(self, episodes=None, *, seeds=None): ...
+
+    def act(self, images):
+        return np.repeat(self.action[None], len(images), 0)
+
+
+def policies(robot):
+    return {"low": Constant(robot.low), "high": Constant(robot.high), "wild": Constant([9.0, 9.0])}
+"""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """A run of one robot, 20 recordings of which every other one succeeded, and three policies."""
+    root = tmp_path_factory.mktemp("own")
+    make_run(root, table=TABLE)
+    write_rlds(root, SPEC, [9] * 19 + [4])
+    (root / "mine.py").write_text(POLICIES)
+    return root
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    """Networks that look at images of 8 x 8 pixels."""
+    monkeypatch.setattr(EncoderConfig.__init__, "__defaults__", (8, (4, 4, 4), 8))
+
+
+def judge(root, out, *more: str) -> int:
+    asked = ["--robot", SPEC.name, "--policies", str(root / "mine.py"), "--recordings", str(root / SPEC.name)]
+    return main(["judge", str(root / "model"), *asked, "--out", str(out), "--head-steps", "2", *more])
+
+
+def said(capsys, error: bool = False) -> str:
+    found = capsys.readouterr()
+    return " ".join(re.sub("[│╭╮╰╯─]", " ", found.err if error else found.out).split())
+
+
+def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_real_robot(
+    study, tmp_path, capsys, few_draws
+):
+    out = tmp_path / "out"
+    assert judge(study, out, "--frames", "3") == 0
+    told = said(capsys)
+    assert "Nothing outside the model was compared" in told and "wild (100%)" in told
+    rows = read_outcomes(out / "outcomes.csv")
+    policies, starts = (
+        ("random", "hma", "low", "high", "wild"),
+        4,
+    )  # 9 successes, of one too few frames, and 10 failures
+    assert {(o.policy, o.start, o.world) for o in rows} == {
+        (p, m, w) for p in policies for m in range(starts) for w in ("learned", "shuffled")
+    }
+    assert {o.judge for o in rows} == {HEAD}
+    summary = json.loads((out / "agreement.json").read_text())
+    assert summary["compared with"] is None and not summary["agreement"] and summary["task"] == "push"
+    head = summary["head"]
+    assert (head["unknown"], head["too short"]) == (0, 1)
+    assert (head["episodes"], head["successes"], head["learnt from"], head["successes among them"]) == (4, 2, 15, 7)
+    page = (out / "judge.html").read_text()
+    assert "Nothing outside the model was compared" in page and "true" not in page.split("<h1>")[1].split("<pre>")[
+        0
+    ].replace("true simulator", "")
+    first = load_rollout(out / "rollouts" / "low.learned.npz")
+    assert first.images.shape == (4, 4, 8, 8, 3) and (first.actions == -2).all()
+
+    before = {path: path.stat().st_mtime_ns for path in (out / "rollouts").iterdir()}
+    counts = tmp_path / "real.csv"
+    counts.write_text("policy,successes,episodes\nlow,1,10\nhigh,9,10\nrandom,0,8\n")
+    assert judge(study, out, "--frames", "3", "--real", str(counts)) == 0
+    assert before == {path: path.stat().st_mtime_ns for path in (out / "rollouts").iterdir()}
+    summary = json.loads((out / "agreement.json").read_text())
+    assert summary["compared with"] == "real robot"
+    assert list(summary["agreement"]) == ["learned model", "control: actions of other episodes"]
+    assert summary["policies"]["high"]["real robot"]["mean"] == 0.9
+    assert summary["policies"]["hma"]["real robot"]["mean"] is None
+    page = (out / "judge.html").read_text()
+    assert "Agreement with the real robot" in page and "Nothing outside" not in page and "--real" in page
+    assert "agreement with real robot" in said(capsys)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--task", "reach"), "--task reach is of robots with a true simulator"),
+        (("--cloned", "2"), "recordings have no expert to clone"),
+        (("--split", "val"), "no split 'val'"),
+        (("--hold", "7"), "of 20 recordings 0 succeeded and 0 failed (0 do not say, 20 have less than the 10 frames"),
+        (("--frames", "0"), "--frames must be at least 1, got 0"),
+        (("--head-episodes", "15"), "A success head needs at least 8 of each"),
+        (("--frames", "1"), "a goal held for 2 frames does not fit 1 frames"),
+        (("--real", "nowhere.csv"), "nowhere.csv cannot be read as counts"),
+        (("--batch", "1"), "--batch must be at least 2"),
+    ],
+)
+def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_path, capsys, more, message):
+    assert judge(study, tmp_path / "out", *more) == 2
+    assert message in said(capsys, error=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_counts_of_policies_that_are_not_judged_are_refused(study, tmp_path, capsys):
+    counts = tmp_path / "real.csv"
+    counts.write_text("policy,successes,episodes\nlow,1,10\nhihg,9,10\nrandom,0,8\n")
+    assert judge(study, tmp_path / "out", "--real", str(counts)) == 2
+    assert "counted on the real robot: hihg; judged here: random, hma, low, high, wild" in said(capsys, error=True)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no column policy, successes, episodes"),
+        ("policy,successes\na,1\n", "no column episodes"),
+        ("policy,successes,episodes\na,1,\n", "line 2: successes and episodes of a are whole numbers"),
+        ("policy,successes,episodes\na,0.5,1\n", "line 2: successes and episodes of a are whole numbers"),
+        ("policy,successes,episodes\na,1,2\nb,3,2\n", "line 3: b cannot succeed in 3 of 2"),
+        ("policy,successes,episodes\na,1,2\na,1,2\n", "line 3: a has a line before"),
+        ("policy,successes,episodes\na,1,2\nb,1,2\n", "has 2 policies; an order to compare needs at least 3"),
+    ],
+)
+def test_counts_that_are_none_are_named_to_the_line(tmp_path, text, message):
+    path = tmp_path / "real.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_real(path)
+
+
+def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():
+    frames, reached = labelled(9, True, 2)
+    assert frames.tolist() == [0, 1, 2, 3, 7, 8] and reached.tolist() == [False] * 4 + [True] * 2
+    frames, reached = labelled(5, False, 2)
+    assert frames.tolist() == [0, 1, 2, 3, 4] and not reached.any()
+    frames, reached = labelled(3, True, 2)
+    assert frames.tolist() == [0, 1, 2] and reached.tolist() == [False, True, True]
+
+
+def test_few_episodes_of_the_real_robot_leave_more_doubt_than_many():
+    learned = np.random.default_rng(0).random((6, 50)) < np.linspace(0.1, 0.9, 6)[:, None]
+    few, many = (agree_with_counts(n * np.arange(1, 7) // 7, np.full(6, n), learned, draws=200) for n in (7, 700))
+    spread = [found.over_starts["pearson"].high - found.over_starts["pearson"].low for found in (few, many)]
+    assert few.measures["pearson"].mean == pytest.approx(many.measures["pearson"].mean) and spread[0] > 2 * spread[1]
+    assert agree(learned, learned, draws=20).over_starts["pearson"].low == pytest.approx(1)
+
+
+def test_a_head_that_is_no_better_than_always_saying_the_same_is_told():
+    measured = {
+        "episodes": 20.0, "successes": 10.0, "successes told": 9.0, "failures told": 10.0, "learnt from": 60.0,
+        "episode accuracy, decoded": 0.9, "successes among them": 30.0, "unknown": 0.0, "too short": 1.0,
+    }  # fmt: skip
+    assert "9 of 10 successes and 10 of 10 failures: 0.95" in say_recorded(measured)
+    assert "do not trust" not in say_recorded(measured)
+    assert "do not trust" in say_recorded(measured | {"failures told": 3.0}) and say_recorded({}) == ""
