@@ -11,6 +11,7 @@ import os
 import secrets
 import socket
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -25,6 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime import watchdog
+from hma_jax.runtime.exits import Exit, exit_of_interrupt
 
 COORDINATOR, PROCESSES, PROCESS = "HMA_COORDINATOR", "HMA_PROCESSES", "HMA_PROCESS"
 """Environment variables for what is not given otherwise."""
@@ -99,30 +101,56 @@ class Processes:
 
 def start(asked: Processes) -> None:
     """Joins the other processes; before anything else of JAX is used. A single process needs nothing and gets
-    nothing. Raises ConfigError if they do not come together."""
+    nothing. Raises ConfigError if they cannot. If not all come in time, or this one is asked to stop meanwhile, it says
+    so and ends here."""
     if not asked.several:
         return
     # JAX's own notice of pre-emption takes SIGTERM away from Python and knows no Ctrl-C; `Agreement` sees both.
     jax.config.update("jax_enable_preemption_service", False)
+    failed: list[Exception] = []
+
+    def join() -> None:
+        try:
+            jax.distributed.initialize(
+                asked.coordinator,
+                asked.processes,
+                asked.process,
+                cluster_detection_method=None if asked.detect else "deactivate",
+                initialization_timeout=int(asked.start_timeout + MARGIN),
+                heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),
+                shutdown_timeout_seconds=int(asked.lost_after),
+            )
+        except (RuntimeError, ValueError, TypeError) as error:
+            failed.append(error)
+
+    # JAX waits in a call that no signal interrupts, and aborts the process when its patience is over.
+    joining = threading.Thread(target=join, name="join", daemon=True)
     try:
-        jax.distributed.initialize(
-            asked.coordinator,
-            asked.processes,
-            asked.process,
-            cluster_detection_method=None if asked.detect else "deactivate",
-            initialization_timeout=int(asked.start_timeout),
-            heartbeat_timeout_seconds=int(2 * asked.lost_after + MARGIN),
-            shutdown_timeout_seconds=int(asked.lost_after),
-        )
-    except (RuntimeError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ConfigError(
-            f"the processes did not come together within {asked.start_timeout:.0f} s at "
-            f"{asked.coordinator or 'the address that was detected'} ({reason}); see that all were started with the "
-            "same address and that process 0 can be reached there"
-        ) from error
+        joining.start()
+        joining.join(asked.start_timeout)
+    except KeyboardInterrupt as request:
+        _leave("stopped while it waited for the other processes", exit_of_interrupt(request))
+    if joining.is_alive():
+        _leave(f"error: {_apart(asked, 'not all are there')}", Exit.REFUSED)
+    if failed:
+        reason = " ".join(str(failed[0]).split())[:300]
+        raise ConfigError(_apart(asked, reason)) from failed[0]
     if jax.process_count() > 1:
         _watch(asked.lost_after)
+
+
+def _apart(asked: Processes, reason: str) -> str:
+    return (
+        f"the processes did not come together within {asked.start_timeout:.0f} s at "
+        f"{asked.coordinator or 'the address that was detected'} ({reason}); see that all were started with the "
+        "same address and that process 0 can be reached there"
+    )
+
+
+def _leave(message: str, code: int) -> None:
+    """Ends the process beside a thread that hangs in a call of JAX, which would hold up any other end."""
+    print(message, file=sys.stderr, flush=True)
+    os._exit(code)
 
 
 def _watch(lost_after: float) -> None:

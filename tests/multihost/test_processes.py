@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import socket
 import threading
 from pathlib import Path
@@ -10,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from hma_jax.config import ConfigError
+from hma_jax.runtime import processes
+from hma_jax.runtime.exits import terminated_like_interrupted
 from hma_jax.runtime.processes import Processes
 from hma_jax.runtime.watchdog import DONE, FAILED, Board, Signs, Watchdog, visit
 from tests.multihost.processes import by_address, by_slurm, run
@@ -48,6 +52,36 @@ def test_what_is_given_goes_before_the_environment():
     asked = Processes(coordinator="a:1").or_from(environment)
     assert (asked.coordinator, asked.processes, asked.process, asked.several) == ("a:1", 2, 1, True)
     assert not Processes().or_from({}).several
+
+
+class Left(Exception):
+    """In place of the end of this process."""
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "code", "message"),
+    [
+        (lambda: None, 2, "error: .* did not come together within 1 s at a:1 .not all are there"),
+        (lambda: os.kill(os.getpid(), signal.SIGTERM), 143, "stopped while it waited"),
+    ],
+)
+def test_a_process_that_waits_in_vain_or_is_stopped_says_so(meanwhile, code, message, monkeypatch):
+    """JAX waits in C++, deaf to signals, and aborts in the end."""
+    ended = threading.Event()
+
+    def initialize(*_, initialization_timeout, **__):
+        meanwhile()
+        ended.wait(initialization_timeout)
+
+    def leave(said, how):
+        ended.set()
+        raise Left(f"{how}: {said}")
+
+    monkeypatch.setattr(processes.jax.distributed, "initialize", initialize)
+    monkeypatch.setattr(processes, "_leave", leave)
+    asked = Processes("a:1", 2, 0, start_timeout=1.0)
+    with pytest.raises(Left, match=f"{code}: {message}"), terminated_like_interrupted():
+        processes.start(asked)
 
 
 class World:
