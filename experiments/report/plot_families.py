@@ -50,10 +50,10 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
             _draw(panel, rows, sweep, metric, role, series[role])
             if len(series) > 1:
                 panel.set_title(ROLES[role], loc="left", fontsize=10)
-    for panel, metric in zip(panels[-1], metrics, strict=True):
-        panel.set_xlabel(sweep.axis)
-        if metric == "perplexity":
-            plain_log(panel, panel.yaxis)
+    for column, metric in zip(panels.T, metrics, strict=True):
+        column[-1].set_xlabel(sweep.axis)
+        if metric == "perplexity" and any(panel.containers for panel in column):
+            plain_log(column[-1], column[-1].yaxis)
     show_tally(panels[0, -1], rows, sweep.name)
     show_legend(figure, panels[0, 0])
     figure.supxlabel(CAPTION if sweep.base else "bars: s.e. over seeds", fontsize=8.5, color=MUTED)
@@ -87,7 +87,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str, role: str
         )  # fmt: skip
         if name == sweep.base:
             panel.axvline(best.x, color=MUTED, linewidth=1, linestyle=":", zorder=1)
-    if not panel.lines:
+    if not panel.containers:
         show_nothing(panel)
     axis_of_points(panel, xs, [count(x) if x >= 1 else f"{x:.2g}" for x in xs], room=1.25)
     panel.set_ylabel(label)

@@ -45,11 +45,13 @@ class Robot:
 def robots_of(
     rows: Sequence[Row], sweep: Sweep, provenance: Provenance, windows: Mapping[str, WindowTable]
 ) -> list[Robot]:
-    """Of the scope of a sweep, by the trials at its default, the most controllable first."""
+    """Of the scope of a sweep, by the trials at its default, the most controllable first. Where each seed judges robots
+    of its own, of those seeds that judge all of the scope."""
     tables = {}
     for p in sweep.points:
         id = trial_id(p.trial, provenance)
-        if p.role == POINT and p.x == sweep.reference_x and id in windows:
+        whole = set(sweep.scope) <= set(p.trial.evaluated)
+        if p.role == POINT and p.x == sweep.reference_x and whole and id in windows:
             tables[p.trial.train.seed] = windows[id]
     follows: dict[str, dict[str, Controlled]] = {name: {} for name in sweep.scope}
     for line in controllability(tables) if tables else ():

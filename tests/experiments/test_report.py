@@ -16,9 +16,10 @@ from experiments.report.draw import draw
 from experiments.report.findings import read_findings
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, count, save
-from experiments.report.robots import read_data
+from experiments.report.robots import read_data, robots_of
 from experiments.report.sweeps import Along, describe
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
+from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
 from experiments.sweeps.conditioning import plan as plan_conditioning
 from experiments.sweeps.datasets import plan as plan_datasets
@@ -226,6 +227,19 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
         said = describe(sweep, [], [], Along())
         assert ("each judged on robots of its own" in caption) == ("robots of its own, all variants" in said) == own
         assert ("all judged on the same windows" in caption) != own
+
+
+def test_robots_that_are_others_for_every_seed_are_shown_of_the_seed_that_judges_them():
+    """Of `newcomers` alone no page could be drawn: two seeds' windows do not fit together."""
+    sweep = plan_newcomers(replace(CPU_FULL, seeds=(0, 1)))
+    points = [p for p in sweep.points if p.role == POINT]
+    assert len({p.scope for p in points}) == 2
+    windows = {trial_id(p.trial, PROVENANCE): windows_of(p.trial) for p in points}
+    robots = robots_of([], sweep, PROVENANCE, windows)
+    assert {r.name for r in robots} == set(sweep.scope) == set(points[0].scope)
+    assert all(line.seeds == 1 for r in robots for line in r.follows.values()) and not any(
+        np.isnan(r.ahead) for r in robots
+    )
 
 
 @pytest.mark.parametrize("axes", [("settings", "width"), ("conditioning", "horizon"), ("newcomers", "horizon")])

@@ -10,9 +10,11 @@ from experiments.optima import as_good, chosen_by_others, find_optima
 from experiments.override import override
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
+from experiments.report.plots import plot_sweep
 from experiments.rows import LOSS, TRAINING, CurvePoint, curve, read_csv
 from experiments.study import TransferConfig
 from experiments.sweeps import lr
+from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import POINT, STANDARD, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff
@@ -68,6 +70,15 @@ def test_the_horizon_s_curves_are_of_trained_models(tmp_path):
     found = list(csv.DictReader(workspace.optima.open()))
     assert {row["role"] for row in found} == {POINT} and len({row["series"] for row in found}) == 2
     assert (workspace.figures / "lr_horizon.png").exists()
+
+
+@pytest.mark.parametrize("axis", ["lr", "lr_horizon"])
+def test_a_grid_of_which_every_trial_diverged_is_drawn(axis, tmp_path):
+    """A log scale of no number ended in a ValueError of matplotlib."""
+    workspace = finished_study(tmp_path, STUDY, axes=(axis,), broken={"": "diverged"})
+    (sweep,) = plan_sweeps(STUDY, (axis,))
+    plot_sweep(rows_of(workspace, [sweep]), sweep, tmp_path / "lr.png")
+    assert (tmp_path / "lr.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_smaller_trial_is_as_declared():
