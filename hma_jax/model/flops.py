@@ -7,20 +7,28 @@ it counts the body of a scan once.
 
 from __future__ import annotations
 
-from hma_jax.config import ModelConfig, TrainConfig
+from hma_jax.config import MaskingConfig, ModelConfig, TrainConfig
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.heads import TIME_FEATURES
 
 
-def forward_flops_per_window(config: ModelConfig, table: EmbodimentTable, teacher_forcing: bool = False) -> float:
-    """One forward pass over one window of T frames; with latents also the denoiser, as often as in training.
+def forward_flops_per_window(
+    config: ModelConfig, table: EmbodimentTable, masking: MaskingConfig = MaskingConfig()
+) -> float:
+    """One forward pass over one window of T frames; with latents also the denoisers, as often as in training.
 
-    With `teacher_forcing` it is a pass over T - 1 frames and, beside them, over the T - 1 that follow them.
+    With teacher forcing it is a pass over T - 1 frames and, beside them, over the T - 1 that follow them. What
+    `masking` does not predict is not computed. An action head without a denoiser is too small to count.
     """
     t, diffusion = config.frames, config.diffusion
-    said = t - 1 if teacher_forcing else t
-    denoiser = denoiser_flops(config, diffusion.repeats * said * config.tokens) if diffusion else 0.0
-    return pass_flops(config, table, 2 * said if teacher_forcing else t, t / 2, said) + denoiser
+    frames, said = (2 * (t - 1), t - 1) if masking.teacher_forcing else (t, t)
+    said = said if masking.predicts_frames else 0
+    denoisers = 0.0
+    if diffusion:
+        denoisers = denoiser_flops(config, diffusion.repeats * said * config.tokens)
+        if masking.predicts_actions:
+            denoisers += denoiser_flops(config, t, channels=table.action_width)
+    return pass_flops(config, table, frames, t / 2, said) + denoisers
 
 
 def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: float, said: int | None = None) -> float:
@@ -50,13 +58,13 @@ def pass_flops(config: ModelConfig, table: EmbodimentTable, frames: int, seen: f
     return 2.0 * (frames * shared + said * config.tokens * d * outputs)
 
 
-def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True) -> float:
-    """One evaluation of the denoiser on so many tokens.
+def denoiser_flops(config: ModelConfig, tokens: int, own_steps: bool = True, channels: int | None = None) -> float:
+    """One evaluation of the denoiser on so many tokens, or of that of other vectors with so many `channels`.
 
     `own_steps`: each token is at a step of its own, as in training. In sampling all are at the same one, and what
     is made of it once for all tokens and examples is not counted.
     """
-    d, w, c = config.width, config.diffusion.width, config.diffusion.token_channels
+    d, w, c = config.width, config.diffusion.width, channels or config.diffusion.token_channels
     blocks = config.diffusion.depth * 5 * w * w
     time = (TIME_FEATURES + w) * w if own_steps else 0
     return 2.0 * tokens * (time + (d + c) * w + blocks + 2 * w * w + 2 * w * c)
@@ -66,4 +74,4 @@ def train_flops_per_step(config: ModelConfig, table: EmbodimentTable, train: Tra
     """Forward and backward of the global batch: three times the forward pass, and once more for each round of an
     `own_past`."""
     passes = 3.0 + (train.masking.own_past_rounds if train.masking.own_past else 0)
-    return passes * train.batch * forward_flops_per_window(config, table, train.masking.teacher_forcing)
+    return passes * train.batch * forward_flops_per_window(config, table, train.masking)

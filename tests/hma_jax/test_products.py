@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,11 +11,12 @@ import pytest
 
 from hma_jax.config import ExecutionConfig, MaskingConfig
 from hma_jax.diagnostics.products import Product, count_products, total_flops
-from hma_jax.model.flops import train_flops_per_step
+from hma_jax.model.flops import forward_flops_per_window, train_flops_per_step
 from hma_jax.model.hma import declare_model
 from hma_jax.training.state import init_state
 from hma_jax.training.step import make_train_step
-from tests.tiny import TABLE, model_config, random_batch, train_config
+from hma_jax.training.validation import make_sums
+from tests.tiny import DIFFUSION, TABLE, model_config, random_batch, shallow_config, train_config
 
 A, B = jnp.zeros((2, 3, 5)), jnp.zeros((2, 5, 7))
 BATCHED = Product((2, 3, 5), (2, 5, 7), ((2,), (1,)), ((0,), (0,)), "float32")
@@ -62,3 +65,14 @@ def test_a_training_step_has_the_products_that_the_formula_counts(masking):
     found = total_flops(count_products(step, state, random_batch(0, model, 1)))
     # More than the formula: weights of attention within frames, always computed again. Less: frame 0 is not read out.
     assert 1.0 < found / train_flops_per_step(model, TABLE, train) < 1.1
+
+
+@pytest.mark.parametrize("setting", ["full", "policy"])
+def test_of_latents_the_denoisers_count_that_a_setting_trains(setting):
+    """Those of the frames are most of a step, and a policy does not run them."""
+    model, masking = shallow_config(diffusion=replace(DIFFUSION, width=128, depth=1)), MaskingConfig(setting=setting)
+    declared = declare_model(model, TABLE, ExecutionConfig(remat="none"))
+    batch = random_batch(0, model, 2) | {"valid": np.ones(2, bool)}
+    found = total_flops(count_products(make_sums(declared, TABLE, model, masking), declared.shapes(), batch, 0))
+    # Less: frame 0 of six is not read out. More: actions are multiplied in chunks of 32 values; these robots have 14.
+    assert 0.8 < found / (2 * forward_flops_per_window(model, TABLE, masking)) < 1.25
