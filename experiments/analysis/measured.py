@@ -28,6 +28,10 @@ PRIOR = 4.0
 """Observations that the pooled variance over seeds counts as, beside those of a point: three seeds say little."""
 
 
+class NoLevel(NotComparable):
+    """Seeds of robots of their own, of which nothing that has finished says how hard these are."""
+
+
 @dataclass(frozen=True)
 class Measured:
     """A loss in nats per token of n trials at positions `x` on K axes."""
@@ -141,7 +145,8 @@ def measure(
 ) -> Measured:
     """The losses of trials at `places` from their `tables` of windows, each over its own robots.
 
-    Raises NotComparable unless trials of the same robots were judged on the same windows.
+    Raises NotComparable unless trials of the same robots were judged on the same windows, and NoLevel where they are of
+    several robots that nothing makes comparable.
     """
     require(len(places) > 0, "no finished trial to measure")
     groups: dict[tuple[str, ...], list[int]] = defaultdict(list)
@@ -165,11 +170,11 @@ def measure(
 
 def _levelled(value: np.ndarray, x: np.ndarray, seed: np.ndarray) -> np.ndarray:
     """Values [n], those of each seed times a factor that gives all seeds one level, over the positions that all of them
-    have. Raises NotComparable where there is none."""
+    have. Raises NoLevel where there is none."""
     points = np.unique(x, axis=0, return_inverse=True)[1].ravel()
     shared = set.intersection(*(set(points[seed == s].tolist()) for s in np.unique(seed)))
     if not shared:
-        raise NotComparable("every seed was judged on other robots, and no position has a finished trial of each")
+        raise NoLevel("every seed was judged on other robots, and no position has a finished trial of each")
     logs, common = np.log(value), np.isin(points, list(shared))
     level = {s: logs[common & (seed == s)].mean() for s in np.unique(seed)}
     mean = np.mean(list(level.values()))

@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.analysis.fits import DRAWS, PowerFit, fit_power
 from experiments.analysis.isoflop import IsoFlop, fit_isoflop
-from experiments.analysis.measured import PRIOR, Measured, Place, measure
+from experiments.analysis.measured import PRIOR, Measured, NoLevel, Place, measure
 from experiments.running.provenance import Provenance
 from experiments.running.trial import Trial, drop_later_fields, trial_id
 from experiments.sweeps.sweep import POINT, Point, Sweep
@@ -51,7 +51,7 @@ class Fitted:
     """A curve with what was measured on it and its fit."""
 
     curve: Curve
-    measured: Measured | None  # None: nothing is finished
+    measured: Measured | None  # None: nothing is finished, or nothing that can be compared
     fit: PowerFit
 
 
@@ -98,7 +98,10 @@ def fit_curve(curve: Curve, windows: Mapping[str, WindowTable], draws: int = DRA
     places = curve.finished(windows)
     if not places:
         return Fitted(curve, None, PowerFit(curve.axes, (), f"no finished trial has a {LOSS} of its windows"))
-    measured = measure(curve.axes, places, windows, LOSS)
+    try:
+        measured = measure(curve.axes, places, windows, LOSS)
+    except NoLevel as error:  # until more trials have finished
+        return Fitted(curve, None, PowerFit(curve.axes, tuple(p.trial for p in places), str(error)))
     fit = fit_power(measured, draws, episodes=episodes)
     if measured.panel is None and not fit.refused:
         fit = replace(fit, doubts=(*fit.doubts, OTHER_ROBOTS))

@@ -84,21 +84,34 @@ def test_compute_is_no_power_of_the_width():
     assert [c.name for c in curves_of(plan_sweeps(study, study.axes), PROVENANCE)] == ["width"]
 
 
-@pytest.mark.parametrize("seeds", [(0,), (0, 1), (0, 1, 2)])
-def test_seeds_that_judge_other_robots_are_fitted_together(seeds):
-    """How hard their robots are is taken out, by position; the shape is the same for all of them."""
-    (curve,) = (c for c in curves_of(plan_sweeps(CPU_FULL, ("dilution",)), PROVENANCE))
+def robots_of_their_own():
+    """(the curve of `dilution`, windows of all its trials): three seeds, each of which judges other robots."""
+    (curve,) = curves_of(plan_sweeps(CPU_FULL, ("dilution",)), PROVENANCE)
     assert len({p.scope for p in curve.places}) == 3
     windows = {}
     for place in curve.places:
-        if place.seed in seeds:
-            hard = 1 + 0.3 * place.seed
-            loss = hard * (2 + (place.x[0] / 5) ** -0.7)
-            robots = np.repeat(place.scope, 2)
-            zeros = np.zeros(len(robots), int)
-            metrics = {"cross_entropy": np.full(len(robots), loss)}
-            windows[place.trial] = WindowTable(robots, np.tile([0, 1], len(place.scope)), zeros, zeros + 4, metrics)
-    fitted = fit_curve(curve, windows, draws=10)
+        hard = 1 + 0.3 * place.seed
+        loss = hard * (2 + (place.x[0] / 5) ** -0.7)
+        robots = np.repeat(place.scope, 2)
+        zeros = np.zeros(len(robots), int)
+        metrics = {"cross_entropy": np.full(len(robots), loss)}
+        windows[place.trial] = WindowTable(robots, np.tile([0, 1], len(place.scope)), zeros, zeros + 4, metrics)
+    return curve, windows
+
+
+def test_seeds_of_other_robots_without_a_common_position_are_no_curve_yet():
+    """A report of trials of which each position lacks one ended there."""
+    curve, windows = robots_of_their_own()
+    few = {p.trial: windows[p.trial] for p in curve.places if (p.x[0] > 10) == (p.seed == 0)}
+    fitted = fit_curve(curve, few, draws=10)
+    assert fitted.measured is None and "no position has a finished trial of each" in fitted.fit.refused
+
+
+@pytest.mark.parametrize("seeds", [(0,), (0, 1), (0, 1, 2)])
+def test_seeds_that_judge_other_robots_are_fitted_together(seeds):
+    """How hard their robots are is taken out, by position; the shape is the same for all of them."""
+    curve, windows = robots_of_their_own()
+    fitted = fit_curve(curve, {p.trial: windows[p.trial] for p in curve.places if p.seed in seeds}, draws=10)
     assert fitted.fit["alpha"].value == pytest.approx(0.7, abs=0.02)
     assert ("how hard these are is taken out" in " ".join(fitted.fit.doubts)) == (len(seeds) > 1)
 
