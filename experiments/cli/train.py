@@ -52,13 +52,11 @@ def train(
             their average where it keeps one, and has its architecture and tokenizer. Its other robots stay as they are.
         dry_run: Print parameters, FLOPs and expected time on the devices that it would use here, and stop.
     """
-    from hma_jax.training.runs import load_run
-
     if not dry_run:
         hosts.join()
-    trained = None if begin is None else load_run(begin, "auto")
+    run = one.directory() or asked.anywhere().out / "model"
+    trained = None if begin is None else _beginning(begin, run)
     setting = make_setting(asked) if trained is None else setting_of(begin, trained, asked)
-    run = one.directory() or setting.workspace.root / "model"
     if trained is not None:
         require_known(begin, trained, setting)
         require_another_place(begin, run)
@@ -241,6 +239,22 @@ def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
             soft_wrap=True,
         )
     return taken
+
+
+def _beginning(source: Path, run: Path) -> Run:
+    """The trained model in `source`. Where that is gone, what `run` has of it, if it began with one: a run needs no more
+    than that, and its own checkpoint, to go on."""
+    from hma_jax.training.runs import load_run
+
+    origin = None if source.exists() else _newest(run)[1].get("provenance", {}).get("origin")
+    if origin is None:
+        return load_run(source, "auto")
+    console.print(
+        f"note: {short(source)} is gone; {short(run)} goes on from its own checkpoint, and was not compared with it",
+        markup=False,
+        soft_wrap=True,
+    )
+    return dataclasses.replace(load_run(run), step=origin["step"], provenance=origin["provenance"])
 
 
 def _require_devices(setting: Setting) -> None:

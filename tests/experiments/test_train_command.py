@@ -218,6 +218,7 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
     source = tmp_path / "run"
     begun = tmp_path / "begun"
     options = ("--set", "train.steps=1", "--set", "train.optimizer.learning_rate=1e-9", "--run", str(begun))
+    options += ("--set", "train.optimizer.schedule=constant")
     train("--from", str(source), *options)  # the last --run counts
     before, after = load_run(source), load_run(begun)
     assert after.step == 1 and after.provenance["origin"]["step"] == 3
@@ -227,6 +228,14 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
     assert main(other) != 0
     said = capsys.readouterr().err
     assert "is another model than --set asks for (there -> asked for): model.width: 16 -> 24. Leave out" in said
+
+    shutil.rmtree(source)
+    said, *_ = train("--from", str(source), *options, "--set", "train.steps=2")
+    assert f"note: {source} is gone; {begun} goes on from its own checkpoint" in said
+    again = load_run(begun)
+    assert again.step == 2 and again.provenance == after.provenance
+    new = ["train", *where, "--run", str(tmp_path / "new"), "--from", str(source)]
+    assert main(new) != 0 and f"no checkpoints at {source}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["train", "adapt"])
