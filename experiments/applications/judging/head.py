@@ -32,6 +32,7 @@ from experiments.applications.policies.network import (
     init_mlp,
     lit,
     mlp,
+    moved,
     shrink_bytes,
 )
 from experiments.applications.policies.tasks import Task, held
@@ -88,14 +89,17 @@ class SuccessHead:
         size = self.config.encoder.size
         whole = (*images.shape[:-3], size, size, 3)
         small = [np.broadcast_to(shrink_bytes(x, size), whole) for x in (first, images)]
-        flat = np.stack(small, -4).reshape(-1, 2, size, size, 3)
+        return self.on_pairs(np.stack(small, -4).reshape(-1, 2, size, size, 3)).reshape(images.shape[:-3])
+
+    def on_pairs(self, seen: np.ndarray) -> np.ndarray:
+        """float32 [n] of pairs uint8 [n, 2, size, size, 3], as heads are trained on."""
         found = []
-        for at in range(0, len(flat), PIECE):
-            part = flat[at : at + PIECE]
+        for at in range(0, len(seen), PIECE):
+            part = seen[at : at + PIECE]
             padded = np.zeros((PIECE, *part.shape[1:]), np.uint8)
             padded[: len(part)] = part
             found.append(np.asarray(self._apply(self.params, padded))[: len(part)])
-        return np.concatenate(found).reshape(images.shape[:-3])
+        return np.concatenate(found)
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         """bool [...]: it is taken for reached."""
@@ -121,29 +125,33 @@ def train_head(
         for seen in (images, begun):
             seen[::RECONSTRUCTED] = reconstruct(seen[::RECONSTRUCTED])
     seen = np.stack([shrink_bytes(x, config.encoder.size) for x in (begun, images)], 1)
-    return fit_head(seen, labels, config, seed, report)
+    return fit_heads(seen, labels, config, seed, report)[config.fit.steps]
 
 
-def fit_head(
+def fit_heads(
     seen: np.ndarray,
     labels: np.ndarray,
     config: HeadConfig,
     seed: int = 0,
     report: Report = lambda done, total, note: None,
-) -> SuccessHead:
-    """From n pairs of frames uint8 [n, 2, size, size, 3], the episode's first and the present one, and whether the goal is
-    reached in the latter, bool [n]. Raises ConfigError where all have one label."""
+    shift: int = 0,
+) -> dict[int, SuccessHead]:
+    """{step: head} of every step of training that `config.fit` keeps, the last included.
+
+    From n pairs of frames uint8 [n, 2, size, size, 3], the episode's first and the present one, and whether the goal is
+    reached in the latter, bool [n]. Each time that a pair is seen both are moved by up to `shift` pixels, alike: of few
+    recordings it would otherwise learn by heart where things were. Raises ConfigError where all have one label."""
     require(bool(labels.any()) and not labels.all(), "a success head needs frames with and without success")
     weight = np.where(labels, 0.5 / labels.mean(), 0.5 / (1 - labels.mean())).astype(np.float32)
     data = {"images": seen, "label": labels.astype(np.float32), "weight": weight}
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
-        frames = lit(as_floats(data["images"][index]), key, config.light)
+        frames = lit(moved(as_floats(data["images"][index]), key, shift), key, config.light)
         errors = optax.sigmoid_binary_cross_entropy(apply_head(params, config, frames), data["label"][index])
         return jnp.mean(errors * data["weight"][index])
 
     kept = fit(init_head(config, seed), loss, data, len(seen), config.fit, seed, report)
-    return SuccessHead(config, kept[config.fit.steps])
+    return {step: SuccessHead(config, params) for step, params in kept.items()}
 
 
 def measure_head(head: SuccessHead, demos: Demonstrations, task: Task) -> dict[str, float]:
@@ -167,6 +175,12 @@ def worth_of(
         "episodes": float(len(successes)),
         "episode accuracy": float((by_head == successes).mean()),
     }
+
+
+def balanced_error(head: SuccessHead, seen: np.ndarray, labels: np.ndarray) -> float:
+    """Cross-entropy in nats of pairs [n, 2, size, size, 3], those with and those without success counted alike."""
+    sure = np.clip(np.where(labels, p := head.on_pairs(seen), 1 - p), 1e-6, 1).astype(np.float64)
+    return float(-(np.log(sure[labels]).mean() + np.log(sure[~labels]).mean()) / 2)
 
 
 def auroc(score: np.ndarray, label: np.ndarray) -> float:

@@ -137,6 +137,15 @@ def lit(frames: jax.Array, key: jax.Array, strength: float) -> jax.Array:
     return frames * (1 + gain) + offset
 
 
+def moved(frames: jax.Array, key: jax.Array, most: int) -> jax.Array:
+    """Frames [B, n, H, W, 3] of episodes each moved by up to `most` pixels, the same for its n; edges are repeated."""
+    if not most:
+        return frames
+    wide = jnp.pad(frames, ((0, 0), (0, 0), (most, most), (most, most), (0, 0)), mode="edge")
+    place = jax.random.randint(jax.random.fold_in(key, 1), (len(frames), 2), 0, 2 * most + 1)
+    return jax.vmap(lambda x, at: jax.lax.dynamic_slice(x, (0, at[0], at[1], 0), frames.shape[1:]))(wide, place)
+
+
 def as_floats(images: jax.Array) -> jax.Array:
     """uint8 [..., H, W, 3] to [-1, 1]."""
     return images.astype(jnp.float32) / 127.5 - 1

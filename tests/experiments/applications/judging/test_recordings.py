@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import json
 import re
+from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
-from data_pipelines.registry import get_spec
+from data_pipelines.registry import DatasetSpec, get_spec
+from experiments.applications.generating.trajectories import Outline, RldsTrajectories
 from experiments.applications.judging.agreement import agree, agree_with_counts
+from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
 from experiments.applications.judging.page import say_recorded
 from experiments.applications.judging.real import read_real
 from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
-from experiments.applications.policies.network import EncoderConfig
+from experiments.applications.policies.network import EncoderConfig, moved
 from experiments.cli.main import main
 from hma_jax.config import ConfigError
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
+from hma_jax.simulator.robots import Robot
+from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.applications.runs import make_run
 
@@ -159,6 +165,27 @@ def test_counts_that_are_none_are_named_to_the_line(tmp_path, text, message):
         read_real(path)
 
 
+def test_every_format_says_how_long_a_recording_is_and_whether_it_succeeded(tmp_path):
+    written = (
+        (
+            write_lerobot(tmp_path / "toy-arm", "v3.0", camera="image"),
+            DatasetSpec("toy_arm", "observation/top", ("action",), (3,), 10),
+        ),
+        (
+            write_robomimic(tmp_path / "image.hdf5", lengths=(5, 23)),
+            DatasetSpec("robomimic_lift", "observation/agentview", ("action",), (7,), 20),
+        ),
+        (write_rlds(tmp_path, SPEC, [5, 8]), SPEC),
+    )
+    for (place, spec), outlines in zip(
+        written, ([(6, True), (5, False)], [(3, True), (12, False)], [(3, False), (4, True)]), strict=True
+    ):
+        zeros = (0.0,) * spec.action_dim
+        recorded = RldsTrajectories(str(place), "train", spec, Robot(spec.name, 2, zeros, zeros, zeros), 8)
+        assert [recorded.outline(i) for i in range(2)] == [Outline(*one) for one in outlines]
+        assert len(recorded[0]) == outlines[0][0] and len(set(recorded.ids().tolist())) == len(recorded)
+
+
 def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():
     frames, reached = labelled(9, True, 2)
     assert frames.tolist() == [0, 1, 2, 3, 7, 8] and reached.tolist() == [False] * 4 + [True] * 2
@@ -166,6 +193,32 @@ def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():
     assert frames.tolist() == [0, 1, 2, 3, 4] and not reached.any()
     frames, reached = labelled(3, True, 2)
     assert frames.tolist() == [0, 1, 2] and reached.tolist() == [False, True, True]
+
+
+def test_a_pair_of_frames_is_moved_as_one():
+    frames = np.random.default_rng(0).random((32, 1, 8, 8, 3)).repeat(2, 1)
+    found = np.asarray(moved(frames, jax.random.key(0), 2))
+    np.testing.assert_array_equal(found[:, 0], found[:, 1])
+    same = (found[:, 0, 2:6, 2:6] == frames[:, 0, 2:6, 2:6].astype(np.float32)).all((1, 2, 3))
+    inside = [
+        (frame[y : y + 4, x : x + 4] == at[0, 2:6, 2:6]).all()
+        for frame, at in zip(frames[:, 0].astype(np.float32), found, strict=True)
+        for y in range(5)
+        for x in range(5)
+    ]
+    assert same.mean() < 0.3 and sum(inside) == 32
+    assert moved(frames, jax.random.key(0), 0) is frames
+
+
+def test_the_head_of_the_step_that_is_best_on_other_recordings_is_taken():
+    """Not the last one, which knows its own by heart."""
+    seen, labels = np.zeros((4, 2, 8, 8, 3), np.uint8), np.array([True, False, False, False])
+    heads = {
+        step: SimpleNamespace(on_pairs=lambda pairs, p=p: np.array(p, np.float32))
+        for step, p in ((50, (0.5, 0.5, 0.5, 0.5)), (60, (0.8, 0.3, 0.2, 0.1)), (70, (0.0, 0.0, 0.0, 0.0)))
+    }
+    errors = {step: balanced_error(head, seen, labels) for step, head in heads.items()}
+    assert min(errors, key=errors.get) == 60 and errors[50] == pytest.approx(np.log(2))
 
 
 def test_few_episodes_of_the_real_robot_leave_more_doubt_than_many():
