@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
@@ -17,6 +17,7 @@ from hma_jax.config import Weights
 from hma_jax.config.evaluation import SamplerKind
 
 if TYPE_CHECKING:
+    from hma_jax.config import DecodeConfig
     from hma_jax.training.runs import Run
 
 convert_app = SubcommandApp()
@@ -29,6 +30,10 @@ HELP = (
 Platform = Literal["cpu", "cuda", "rocm", "tpu"]
 
 RATES = "rates.toml"
+
+
+def _unless(usual: str) -> object:
+    return arg(help_behavior_hint=f"(default: as RUN/decode.json says, or {usual})")
 
 
 @convert_app.command(name="from-official")
@@ -137,10 +142,10 @@ def to_stablehlo(
     batch: int = 1,
     prompt: Annotated[int | None, arg(help_behavior_hint="(default: 4, or all but the last)")] = None,
     frames: Annotated[int | None, arg(help_behavior_hint="(default: the model's window)")] = None,
-    unmask_steps: Annotated[int, arg(name="unmask-steps")] = 2,
-    temperature: float = 0.0,
-    sampler_steps: Annotated[int, arg(name="sampler-steps")] = 100,
-    sampler: SamplerKind = "ddpm",
+    unmask_steps: Annotated[int | None, arg(name="unmask-steps"), _unless("2")] = None,
+    temperature: Annotated[float | None, _unless("0")] = None,
+    sampler_steps: Annotated[int | None, arg(name="sampler-steps"), _unless("100")] = None,
+    sampler: Annotated[SamplerKind | None, _unless("ddpm")] = None,
     platforms: tuple[Platform, ...] = ("cpu", "cuda", "tpu"),
     weights: Weights = "auto",
 ) -> None:
@@ -162,13 +167,12 @@ def to_stablehlo(
         platforms: Where the program can run.
         weights: The last weights, their moving average, or the average where there is one.
     """
-    from hma_jax.config import DecodeConfig, SamplerConfig
     from hma_jax.convert import ProgramConfig, require_free, write_stablehlo
     from hma_jax.training.runs import load_run
 
     require_free(out)
-    latents = SamplerConfig(sampler, sampler_steps, temperature)
-    decode = DecodeConfig(unmask_steps, temperature, sampler=latents)
+    frame = {"unmask_steps": unmask_steps, "temperature": temperature}
+    decode = _decode(run, frame, {"kind": sampler, "steps": sampler_steps, "temperature": temperature})
     loaded = load_run(run, weights)
     frames = loaded.model.frames if frames is None else frames
     prompt = min(ProgramConfig.prompt, frames - 1) if prompt is None else prompt
@@ -176,6 +180,18 @@ def to_stablehlo(
     write_stablehlo(loaded, out, config)
     _describe(loaded)
     wrote(out, then=f"read {_quoted(out / 'model.json')} for the program's inputs and outputs")
+
+
+def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> DecodeConfig:
+    """How the frames of a run are filled: as its decode.json says, or else as models are judged, but for what is asked
+    for (not None)."""
+    from hma_jax.config import DecodeConfig, SamplerConfig
+    from hma_jax.simulator.folder import DECODE, find_decode
+
+    usual = DecodeConfig(2, 0.0, sampler=SamplerConfig("ddpm", 100, 0.0))
+    found = find_decode(run) if (run / DECODE).exists() else usual
+    frame, latents = ({name: x for name, x in said.items() if x is not None} for said in (frame, latents))
+    return replace(found, **frame, sampler=replace(found.sampler, **latents))
 
 
 def _rates(run: Run) -> tuple[str, list[str]]:

@@ -14,9 +14,10 @@ from data_pipelines.registry import get_spec
 from data_pipelines.registry.toml_file import load_entries
 from experiments.cli.main import main
 from experiments.presets import PRESETS
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, DecodeConfig, SamplerConfig
 from hma_jax.convert.release_limits import require_official
 from hma_jax.convert.run_directory import fresh_state
+from hma_jax.simulator.folder import DECODE, save_decode
 from hma_jax.training.checkpoints import Checkpoints
 from hma_jax.training.runs import describe_run, load_run
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
@@ -41,8 +42,12 @@ def test_a_checkpoint_goes_through_every_format_and_back(tmp_path, capsys):
     before, after = (json.loads((folder / "config.json").read_text()) for folder in (CHECKPOINT, back))
     assert before == after
 
-    program = convert("to-stablehlo", again, "program", "--platforms", "cpu")
+    save_decode(DecodeConfig(3, 0.5, sampler=SamplerConfig("dpm++", 12, 0.5)), again / DECODE)
+    program = convert("to-stablehlo", again, "program", "--platforms", "cpu", "--sampler-steps", "10")
     about = json.loads((program / "model.json").read_text())
+    decode = about["program"]["decode"]  # of decode.json, as `hma play` has it, but for what is asked for
+    assert (decode["unmask_steps"], decode["temperature"]) == (3, 0.5)
+    assert (decode["sampler"]["kind"], decode["sampler"]["steps"]) == ("dpm++", 10)
     assert about["outputs"][0]["shape"] == [1, 1, 16]  # of a window of 3 frames 2 are given
     assert {path.name for path in program.iterdir()} == {"model.json", "model.safetensors", "model.stablehlo"}
 
