@@ -29,6 +29,20 @@ def test_few_episodes_need_t_and_windows_are_no_episodes():
     assert hits["normal"] < 0.92 * 400 and hits["windows"] < 0.75 * 400
 
 
+@pytest.mark.parametrize(("spread", "share", "holds"), [(0.0, 0.24, 0.93), (1.0, 0.39, 0.89)])
+def test_an_episode_of_most_windows_makes_intervals_narrow(spread, share, holds):
+    """As docs/statistics.md says: 24 windows are drawn among eight episodes, whose lengths differ by `spread` in the
+    logarithm; `share` is that of the episode with most, on average."""
+    rng, hits, shares = np.random.default_rng(0), [], []
+    for _ in range(2000):
+        length = np.exp(spread * rng.standard_normal(8))
+        episode = rng.choice(8, size=24, p=length / length.sum())
+        loss = rng.standard_normal(8)[episode] + 0.5 * rng.standard_normal(24)
+        hits.append(held(interval_of(mean_and_sem(loss, episode))))
+        shares.append(np.bincount(episode).max() / 24)
+    assert np.mean(shares) == pytest.approx(share, abs=0.01) and np.mean(hits) == pytest.approx(holds, abs=0.015)
+
+
 def test_the_mean_over_robots_holds_its_truth():
     """Three robots of four episodes, of which one scatters most: few degrees of freedom, and a wide interval."""
     hits = normal = 0
