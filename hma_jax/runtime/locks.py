@@ -161,7 +161,8 @@ def _leased(path: Path, holder: Holder | None, locked: bool) -> bool:
     now = path.with_name(f"{path.name}.{secrets.token_hex(4)}.now")
     try:
         now.touch(exist_ok=False)
-        return now.stat().st_mtime - path.stat().st_mtime < EXPIRES
+        # Either way: a time far ahead is of a clock that was set right since, and nobody renewed the lease after that.
+        return abs(now.stat().st_mtime - path.stat().st_mtime) < EXPIRES
     except FileNotFoundError:  # given back meanwhile, or all of it is removed
         return False
     finally:

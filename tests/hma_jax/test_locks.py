@@ -79,6 +79,17 @@ def test_a_lease_of_another_machine_holds_until_it_expires(tmp_path: Path):
     assert [p.name for p in tmp_path.iterdir()] == ["lock"]
 
 
+def test_a_lease_from_a_clock_that_was_ahead_is_over_as_well(tmp_path: Path):
+    """Of a machine that died before its clock was set right, or this one: it would be held for as long as it was ahead."""
+    path = tmp_path / "lock"
+    leave(path, age=-locks.EXPIRES + 5)
+    with pytest.raises(Held, match="process 7 on other"), exclusive(path, lease=True):
+        pass
+    leave(path, age=-locks.EXPIRES - 5)
+    with exclusive(path, lease=True):
+        pass
+
+
 def test_a_lock_of_this_machine_needs_no_expiry(tmp_path: Path):
     leave(tmp_path / "lock", age=0, machine=locks.machine())
     with exclusive(tmp_path / "lock", lease=True):
