@@ -17,7 +17,7 @@ from pathlib import Path
 from experiments.own_file import find_function
 from experiments.running.trial import Trial
 from experiments.study import Study
-from experiments.sweeps.sweep import Point, Sweep, judge_less
+from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, judge_less
 from experiments.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import from_dict, stable_hash, to_dict
@@ -109,7 +109,18 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
         require(numbered, f"{where}: position {p.x!r} of point {number} is no number; names are for make_ablation")
         named = not sweep.labels or p.x in range(len(sweep.labels))
         require(named, f"{where}: position {p.x:g} has no label; x counts into the {len(sweep.labels)} labels, from 0")
+        known = (POINT, CONTROL, STANDARD)
+        require(p.role in known, f"{where}: the role of point {number} has to be one of {known}, and is {p.role!r}")
         _require_trial(study, p.trial, p.scope or sweep.scope, f"{where}: the trial at {p.x:g}")
+    drawn = {bool(p.series) for p in sweep.points if p.role != CONTROL}
+    require(
+        len(drawn) < 2, f"{where}: some points have a series and others none, which no figure shows beside each other"
+    )
+    require(
+        not (sweep.labels and sweep.several),
+        f"{where} has labels and several series: an axis of names has one point a name and seed, so put what differs "
+        "into the names",
+    )
     places: dict[tuple[str, str, str], float] = {}
     for p in sweep.points if not sweep.labels else ():
         trained = replace(p.trial, measure_untrained=False)  # of the reference alone

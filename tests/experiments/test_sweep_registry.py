@@ -132,6 +132,20 @@ def plan(study):
 """
 
 
+EDITED = """
+from dataclasses import replace
+from experiments.sweeps import width
+def plan(study):
+    sweep = width.plan(study)
+    return replace(sweep, name="mine", points=(replace(sweep.points[0], {}), *sweep.points[1:]))
+"""
+LABELLED = """
+whole = plan
+def plan(study):
+    return replace(whole(study), labels=("as it is",), points=whole(study).points[:1])
+"""
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -156,6 +170,9 @@ def plan(study):
         ),
         (POINTS.format("reference_trial(study, 0)"), "point 1 has to be a Point with a Trial, and has a Trial"),
         (POINTS.format("Point('wide', reference_trial(study, 0))"), "position 'wide' of point 1 is no number"),
+        (EDITED.format("role='extra'"), "role of point 1 has to be one of .*'control'.*, and is 'extra'"),
+        (EDITED.format("series='long'"), "some points have a series and others none"),
+        (EDITED.format("x=0, series='long'") + LABELLED, "has labels and several series"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
         (TWICE, "returned 2 points at 8, point, seed 0; give each a position or a series of its own"),
     ],
