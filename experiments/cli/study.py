@@ -38,7 +38,8 @@ def sweep(
     """Run one axis: datasets, trajectories, width; settings, conditioning; lr; or one of your own, from its file.
 
     The first three are those of `hma study`, the next two its ablations; lr is the transfer of
-    learning rates between widths. A file says what varies as docs/own_axis.md shows.
+    learning rates between widths. Of the others docs/sweeps.md and docs/designs.md speak. A file says what varies as
+    docs/own_axis.md shows.
     Shares data and trials with other axes of the same --out.
 
     Args:

@@ -34,6 +34,7 @@ class Bench:
     width: Annotated[int | None, arg(metavar="D")] = None
     """Another width."""
     seed: int = 0
+    """Of weights and inputs."""
     out: Path = Path("runs/bench")
     """Directory for the record."""
 
