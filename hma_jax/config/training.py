@@ -57,7 +57,7 @@ class MaskingConfig:
     # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
     # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
     change_weight: float = 1.0
-    max_corrupt_rate: float = 0.2  # largest share of tokens that random ones replace
+    max_corrupt_rate: float = 0.2  # largest share of tokens that random ones replace; of ids alone, as the next two
     clean_rate_min: float = 0.2  # least share of tokens kept in the first frame after a clean prompt
     label_smoothing: float = 0.01  # share of the target that is spread evenly over all entries
     # DIFFERS: the release shows hidden actions to the blocks (`conditioning`, discrete variant)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from einops import rearrange
 
-from hma_jax.config import ModelConfig, TrainConfig, check_micro_batches, check_objective, require
+from hma_jax.config import MaskingConfig, ModelConfig, TrainConfig, check_micro_batches, check_objective, require
 from hma_jax.config.training import ActionLeak
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.params import Declared, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
 from hma_jax.objective.masking import Masked, mask_batch
@@ -56,6 +56,7 @@ def make_train_step(
         not set(config.only) - set(table.names),
         f"train.only names {', '.join(config.only)}; the embodiments are {', '.join(table.names)}",
     )
+    check_targets([entry for entry, trained in zip(table.entries, trained_E, strict=True) if trained], masking)
 
     def sums(params: Any, batch: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
         model = declared.merge(params)
@@ -121,6 +122,18 @@ def make_train_step(
         return TrainState(state.step + 1, params, opt_state, ema), metrics
 
     return step
+
+
+def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
+    """Raises ConfigError if nothing of these robots is predicted: every loss would be a mean over no target, 0."""
+    frames = masking.predicts_frames and any(robot.video_targets for robot in robots)
+    actions = masking.predicts_actions and any(robot.chunk for robot in robots)
+    predicted = "frames" if masking.predicts_frames else "actions"
+    require(
+        frames or actions,
+        f"train.masking.setting {masking.setting!r} predicts {predicted}, of which {robots[0].name} and all other robots "
+        "that are trained have none to learn from; choose another setting or other robots",
+    )
 
 
 def find_presence(

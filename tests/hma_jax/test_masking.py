@@ -292,6 +292,19 @@ def test_stems_and_modulation_learn_from_hidden_actions_that_leak(conditioning: 
     assert reaches == bool(presence.shared["actions_shown"]) == (conditioning != "concat" or leak == "all")
 
 
+@pytest.mark.parametrize(
+    "setting, only, what",
+    [("policy", "film", "actions"), ("inverse", "film", "actions"), ("forward", "blind", "frames")],
+)
+def test_robots_of_which_nothing_is_predicted_are_refused(setting: str, only: str, what: str):
+    """Training ended well, with losses of 0."""
+    config, masking = shallow_config(), MaskingConfig(setting=setting)
+    declared = declare_model(config, MIXED)
+    with pytest.raises(ConfigError, match=f"'{setting}' predicts {what}, of which {only} and all other robots"):
+        make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only,)))
+    make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only, "arm")))
+
+
 def test_only_the_named_robots_own_parameters_are_trained():
     config = shallow_config()
     declared, params = lively_params(config)
