@@ -48,8 +48,8 @@ def judge(
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.
-        robot: Which of its robots; it must have a true simulator (of the suite, or metaworld_drawer and others), or else
-            --recordings.
+        robot: Which of its robots; it must have a true simulator (of the suite, or metaworld_drawer and others) or
+            recordings.
         out: Where everything is written.
         task: The robot's own task; of the suite's robots also reaching the mark with the tool, or hovering
             with the tool above a puck.
@@ -140,7 +140,7 @@ def judge(
 
 
 def _say(summary: dict) -> None:
-    from experiments.applications.judging.page import NOTHING, say_beyond, say_recorded
+    from experiments.applications.judging.page import NOTHING, say_beyond, say_control, say_recorded
     from experiments.applications.judging.summary import shown
 
     columns = list(next(iter(summary["policies"].values())))
@@ -149,7 +149,7 @@ def _say(summary: dict) -> None:
         table.add_row(name, *(shown(rates[column]) for column in columns))
     console.print(table)
     found = summary["agreement"]
-    for said in (say_beyond(summary), say_recorded(summary["head"]), "" if found else NOTHING):
+    for said in (say_control(summary), say_beyond(summary), say_recorded(summary["head"]), "" if found else NOTHING):
         if said:
             console.print(said, markup=False, soft_wrap=True)
     if not found:

@@ -116,6 +116,14 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS, seed: i
     return dataclasses.replace(clustered, low=min(clustered.low, wilson.low), high=max(clustered.high, wilson.high))
 
 
+def mean_above(a_PM: np.ndarray, b_PM: np.ndarray, draws: int = DRAWS, seed: int = 0) -> Interval:
+    """By how much the success of P policies at M starts is higher in `a_PM` than in `b_PM`, both bool [P, M], on average;
+    over other policies and starts."""
+    apart = a_PM.astype(float) - b_PM
+    drawn = np.array([apart[np.ix_(rows, columns)].mean() for rows, columns in _resamples(*apart.shape, draws, seed)])
+    return _interval(float(apart.mean()), drawn, {"n": apart.size, "episodes": apart.shape[1]})
+
+
 def _resamples(policies: int, starts: int, draws: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Policies and starts, drawn with replacement."""
     rng = np.random.default_rng(seed)

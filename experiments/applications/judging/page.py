@@ -116,7 +116,7 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
         f"<p class=lead>{len(lines)} policies, {summary['starts']} starts, {summary['frames']} frames; an episode "
         f"succeeds when the goal is reached at {summary['hold']} frames in a row. In brackets intervals of 95 %.</p>",
         picture(out / "scatter.png", "success by policy"),
-        section("Success by policy", table(["policy", *columns], lines), f"<p>{html.escape(say_beyond(summary))}</p>"),
+        section("Success by policy", table(["policy", *columns], lines), *_doubts(summary)),
         _agreement(summary),
         _head(summary),
         section(f"The same start, {left} on the left, the model on the right", _clips(judged, *picks)),
@@ -131,11 +131,15 @@ def write_page(judged: Judged, summary: dict[str, Any], out: Path, command: str)
     return path
 
 
+def _doubts(summary: dict[str, Any]) -> list[str]:
+    return [f"<p><b>{html.escape(said)}</b></p>" for said in (say_control(summary), say_beyond(summary)) if said]
+
+
 NOTHING = (
     "Nothing outside the model was compared: there is no true simulator, and no counts of the real robot were given "
     "(--real). The rates above are those of the model and of a head that learnt what success looks like from recordings; "
-    "either may be wrong. A policy that does as well in the control, where another episode's actions are executed, does "
-    "not succeed by what it does."
+    "either may be wrong, of a policy that goes where no recording went most of all. A policy that does as well in the "
+    "control, where another episode's actions are executed, does not succeed by what it does."
 )
 
 
@@ -178,6 +182,18 @@ def _head(summary: dict[str, Any]) -> str:
         "The success head",
         f"<p>{said} {html.escape(say_recorded(measured))}</p><p>Episodes per second, this machine as loaded as it was: "
         f"{html.escape(rates)}.</p>",
+    )
+
+
+def say_control(summary: dict[str, Any]) -> str:
+    """In words, whether success in the model hangs on what policies do; "" where that shows."""
+    above = summary["above the control"]
+    if above["low"] > 0:
+        return ""
+    return (
+        "In the model policies succeed no more often than in the control, where another episode's actions are executed: by "
+        f"{shown(above)} on average over policies. Then the rates do not show what policies do, whatever they are compared "
+        "with, or all starts are alike: look at the clips."
     )
 
 

@@ -17,6 +17,7 @@ from experiments.applications.judging.agreement import (
     agree,
     agree_with_counts,
     count_interval,
+    mean_above,
     rate_interval,
     share,
 )
@@ -74,6 +75,7 @@ def summarise(judged: Judged, real: Mapping[str, Count] | None = None) -> dict[s
             }
             for name, found in _compare(judged, each, real).items()
         },
+        "above the control": _plain(mean_above(each[MODEL], each[CONTROL])),
         "episodes alike": _alike(each[MODEL], each[REFERENCE]) if REFERENCE in each else {},
         "head": judged.head.measured,
         "episodes per second": {world: round(1 / s, 3) for world, s in judged.seconds.items()},

@@ -12,10 +12,10 @@ import pytest
 
 from data_pipelines.registry import DatasetSpec, get_spec
 from experiments.applications.generating.trajectories import Outline, RldsTrajectories
-from experiments.applications.judging.agreement import agree, agree_with_counts
+from experiments.applications.judging.agreement import agree, agree_with_counts, mean_above
 from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
-from experiments.applications.judging.page import say_recorded
+from experiments.applications.judging.page import say_control, say_recorded
 from experiments.applications.judging.real import read_real
 from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
@@ -227,6 +227,18 @@ def test_few_episodes_of_the_real_robot_leave_more_doubt_than_many():
     spread = [found.over_starts["pearson"].high - found.over_starts["pearson"].low for found in (few, many)]
     assert few.measures["pearson"].mean == pytest.approx(many.measures["pearson"].mean) and spread[0] > 2 * spread[1]
     assert agree(learned, learned, draws=20).over_starts["pearson"].low == pytest.approx(1)
+
+
+def test_success_that_does_not_hang_on_what_policies_do_is_told():
+    rng = np.random.default_rng(0)
+    control, learned = rng.random((4, 30)) < 0.5, rng.random((4, 30)) < 0.5
+    same, better = (
+        mean_above(learned, control, draws=200),
+        mean_above(learned | (rng.random((4, 30)) < 0.6), control, draws=200),
+    )
+    assert same.low < 0 < same.high and 0 < better.low < better.mean < better.high
+    told = [say_control({"above the control": {"mean": x.mean, "low": x.low, "high": x.high}}) for x in (same, better)]
+    assert "no more often than in the control" in told[0] and told[1] == ""
 
 
 def test_a_head_that_is_no_better_than_always_saying_the_same_is_told():
