@@ -14,6 +14,7 @@ from experiments.report.plot_style import (
     MUTED,
     axis_of_points,
     count,
+    name_axis,
     plain_log,
     show_legend,
     show_nothing,
@@ -51,7 +52,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
             if len(series) > 1:
                 panel.set_title(ROLES[role], loc="left", fontsize=10)
     for column, metric in zip(panels.T, metrics, strict=True):
-        column[-1].set_xlabel(sweep.axis)
+        name_axis(column[-1], sweep.axis)
         if metric == "perplexity" and any(panel.containers for panel in column):
             plain_log(column[-1], column[-1].yaxis)
     show_tally(panels[0, -1], rows, sweep.name)

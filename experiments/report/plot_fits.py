@@ -15,7 +15,18 @@ from experiments.analysis.fits import LEVEL
 from experiments.analysis.isoflop import IsoFlop
 from experiments.analysis.predictions import Outcome
 from experiments.analysis.scaling import FLOPS, TRUNK, Fitted
-from experiments.report.plot_style import COLOURS, DEFAULT, INK, MUTED, STYLE, count, plain_log, save, show_legend
+from experiments.report.plot_style import (
+    COLOURS,
+    DEFAULT,
+    INK,
+    MUTED,
+    STYLE,
+    count,
+    name_axis,
+    plain_log,
+    save,
+    show_legend,
+)
 
 LINE, BAND = COLOURS["perplexity"], 0.16
 ABREAST = 3
@@ -63,7 +74,7 @@ def _draw_fit(panels: Sequence[Axes], fitted: Fitted, outcomes: Sequence[Outcome
     above.set_xscale("log")
     plain_log(above, above.yaxis)
     plain_log(below, below.xaxis, count)
-    below.set_xlabel(fitted.curve.axes[0])
+    name_axis(below, fitted.curve.axes[0])
     above.set_title(fitted.curve.name, loc="left", fontsize=10)
     above.legend(loc="best")
 

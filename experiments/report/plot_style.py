@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
@@ -136,6 +137,11 @@ def show_legend(figure: plt.Figure, panel: Axes) -> None:
         room = max(0.6 + 0.075 * len(label) for label in labels)  # inches of the longest one
         columns = max(1, min(len(labels), int(figure.get_figwidth() / room)))
         figure.legend(handles, labels, loc="outside upper center", ncols=columns)
+
+
+def name_axis(panel: Axes, name: str) -> None:
+    """Below the panel, in as many lines as it needs: a longer one would be cut off at the figure's edge."""
+    panel.set_xlabel(textwrap.fill(name, 44))
 
 
 def show_nothing(panel: Axes) -> None:

@@ -24,6 +24,7 @@ from experiments.report.plot_style import (
     axis_of_points,
     count,
     drawn_metrics,
+    name_axis,
     plain_log,
     save,
     show_control,
@@ -105,7 +106,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     show_tally(panel, rows, sweep.name)
-    panel.set_xlabel(sweep.axis + (" · trunk parameters" if sweep.name == "width" else ""))
+    name_axis(panel, sweep.axis + (" · trunk parameters" if sweep.name == "width" else ""))
     panel.set_ylabel(LABELS[metric])
 
 
