@@ -12,17 +12,21 @@ from hma_jax.config import require
 
 
 def find_function(path: Path, signature: str, what: str, page: str) -> Callable[..., Any]:
-    """The function of a file, which is run; `what` it has it for, and the `page` that says so, are of the messages. What
-    the file raises is its author's, and not caught. Raises ConfigError where there is no such file or function.
+    """The function of a file, which is run as `run_file` says. Raises ConfigError where there is no such function."""
+    found = vars(run_file(path, signature, what, page)).get(signature.partition("(")[0])
+    require(callable(found), f"{path}: has no function {signature} ({page})")
+    return found
+
+
+def run_file(path: Path, signature: str, what: str, page: str) -> types.ModuleType:
+    """The file, run as a module; `what` it has the function `signature` for, and the `page` that says so, are of the
+    message. What the file raises is its author's, and not caught. Raises ConfigError where there is no such file.
 
     Compiled anew each time: Python's cached bytecode cannot tell a file from what it was in the same second.
     """
-    name = signature.partition("(")[0]
     require(path.is_file(), f"{path}: no such file; {what} a Python file with {signature} ({page})")
-    module = types.ModuleType(f"{name}_{path.stem}")
+    module = types.ModuleType(f"{signature.partition('(')[0]}_{path.stem}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module  # dataclasses of the file look themselves up there
     exec(compile(path.read_bytes(), path, "exec"), vars(module))
-    found = getattr(module, name, None)
-    require(callable(found), f"{path}: has no function {signature} ({page})")
-    return found
+    return module

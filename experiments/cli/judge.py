@@ -53,7 +53,8 @@ def judge(
         out: Where everything is written.
         task: The robot's own task; of the suite's robots also reaching the mark with the tool, or hovering
             with the tool above a puck.
-        policies: Python file with policies(robot), policies of your own by name, which are judged too.
+        policies: Python file with policies(robot), policies of your own by name, which are judged too. A function
+            success(images, first) in it tells success in place of a trained head.
         recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether they
             succeeded: the head learns from them, and episodes begin as those that are held out.
         split: Of --recordings.

@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 from weakref import WeakKeyDictionary
 
 import jax
@@ -76,16 +76,38 @@ def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Arr
     return mlp(params["mlp"], encode(params["encoder"], config.encoder, beside(frames)))[:, 0]
 
 
+class Head(Protocol):
+    """Whoever tells from frames whether the goal is reached. `measured` is what it is worth on recorded episodes that it
+    was not trained on."""
+
+    measured: dict[str, float]
+
+    @property
+    def threshold(self) -> float: ...
+
+    def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`, which may have the
+        size 1 where `images` have frames of one episode, are those in which the episodes begin."""
+        ...
+
+    def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+        """bool [...]: it is taken for reached."""
+        ...
+
+
 class SuccessHead:
-    """A trained head. `measured` is what it is worth on recorded episodes that it was not trained on."""
+    """A `Head` that is a trained network."""
 
     def __init__(self, config: HeadConfig, params: Params, measured: Mapping[str, float] | None = None):
         self.config, self.params, self.measured = config, params, dict(measured or {})
         self._apply = jax.jit(lambda params, frames: jax.nn.sigmoid(apply_head(params, config, as_floats(frames))))
 
+    @property
+    def threshold(self) -> float:
+        return self.config.threshold
+
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """float32 [...] of images uint8 [..., H, W, 3]: that the goal is reached in each. `first`, which may have the
-        size 1 where `images` have frames of one episode, are those in which the episodes begin."""
+        """See `Head`."""
         size = self.config.encoder.size
         whole = (*images.shape[:-3], size, size, 3)
         small = [np.broadcast_to(shrink_bytes(x, size), whole) for x in (first, images)]
@@ -102,8 +124,7 @@ class SuccessHead:
         return np.concatenate(found)
 
     def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """bool [...]: it is taken for reached."""
-        return self.probabilities(images, first) > self.config.threshold
+        return self.probabilities(images, first) > self.threshold
 
 
 def train_head(
@@ -154,23 +175,23 @@ def fit_heads(
     return {step: SuccessHead(config, params) for step, params in kept.items()}
 
 
-def measure_head(head: SuccessHead, demos: Demonstrations, task: Task) -> dict[str, float]:
+def measure_head(head: Head, demos: Demonstrations, task: Task) -> dict[str, float]:
     """On recorded true frames: accuracy and AUROC of frames, and accuracy of whole episodes."""
     steps = demos.steps()
     score = head.probabilities(demos.images, demos.images[:, :1])
     frames, labels = score[steps[:, 0], steps[:, 1]], demos.reached[steps[:, 0], steps[:, 1]]
-    by_head = held(score > head.config.threshold, task.hold).any(1)
+    by_head = held(score > head.threshold, task.hold).any(1)
     return worth_of(head, frames, labels, by_head, demos.successes)
 
 
 def worth_of(
-    head: SuccessHead, frames: np.ndarray, labels: np.ndarray, by_head: np.ndarray, successes: np.ndarray
+    head: Head, frames: np.ndarray, labels: np.ndarray, by_head: np.ndarray, successes: np.ndarray
 ) -> dict[str, float]:
     """From probabilities [n] and labels of frames, and what the head says of episodes [N] beside what is true of them."""
     return {
         "frames": float(len(labels)),
         "positive": float(labels.mean()),
-        "frame accuracy": float(((frames > head.config.threshold) == labels).mean()),
+        "frame accuracy": float(((frames > head.threshold) == labels).mean()),
         "frame AUROC": auroc(frames, labels),
         "episodes": float(len(successes)),
         "episode accuracy": float((by_head == successes).mean()),
@@ -229,7 +250,7 @@ class HeadJudge:
     frames in a row. The environment says when episodes begin. Environments may share a judge: what it keeps is each
     simulator's own."""
 
-    def __init__(self, head: SuccessHead, hold: int = 1):
+    def __init__(self, head: Head, hold: int = 1):
         self.head, self.hold = head, hold
         self._begun: WeakKeyDictionary[AnySimulator, _Begun] = WeakKeyDictionary()
 

@@ -3,7 +3,7 @@
 OUT/judge.json           what is judged; another command does not go on in the same directory
 OUT/own_policies.py      the user's file, where there is one
 OUT/policies/NAME        checkpoints (`policies.files`)
-OUT/head                 the success head
+OUT/head                 the success head, or of a user's own what it was found to be worth
 OUT/rollouts/NAME.WORLD.npz   frames of all episodes
 OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
 """
@@ -11,6 +11,7 @@ OUT/outcomes.csv, agreement.json, scatter.png, judge.html, blind.html
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +21,12 @@ import numpy as np
 from experiments.applications.generating.trajectories import open_trajectories, require_layout
 from experiments.applications.judging.config import JudgeConfig, Step
 from experiments.applications.judging.head import DESCRIPTION as HEAD_DESCRIPTION
-from experiments.applications.judging.head import SuccessHead, load_head, save_head
+from experiments.applications.judging.head import Head, load_head, save_head
 from experiments.applications.judging.ladder import OWN_HEAD, find_policy, names, train_ladder
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED, TRUE, Outcome, judge_rollout
 from experiments.applications.judging.outside import Outside, TrueOutside
-from experiments.applications.judging.own_policies import load_policies, try_out
+from experiments.applications.judging.own_policies import load_own, try_out
+from experiments.applications.judging.own_success import OwnSuccess
 from experiments.applications.judging.recordings import Recordings
 from experiments.applications.judging.rollouts import Rollout, load_rollout, run, save_rollout
 from experiments.applications.made_with import claim, short_hash
@@ -40,7 +42,7 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 
-OWN_FILE = "own_policies.py"
+OWN_FILE, MEASURED = "own_policies.py", "measured.json"
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Judged:
     """What was found."""
 
     config: JudgeConfig
-    head: SuccessHead
+    head: Head
     policies: tuple[str, ...]
     own: tuple[str, ...]  # of these, the user's
     worlds: tuple[str, ...]
@@ -116,10 +118,10 @@ def _judge(
     for encoder in (config.ladder.encoder, config.head.encoder):
         require_multiples(*simulator.tokenizer.image_shape, encoder.size)
     policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads  # may refuse the ladder
-    users, about = {}, outside.about()
+    users, success, about = {}, None, outside.about()
     if own is not None:
-        users = load_policies(own, robot)
-        try_out(users, config.batch, simulator.tokenizer.image_shape)
+        users, success = load_own(own, robot)
+        try_out(users, success, config.batch, simulator.tokenizer.image_shape)
         about["contents of --policies"] = short_hash(own.read_bytes())
     policies += users
     others = [name for name in counted if name not in policies]
@@ -132,7 +134,7 @@ def _judge(
     taught = {"robot": robot.name, "task": config.task.name}
     with step("policies") as report:
         train_ladder(out / "policies", outside.demonstrations, config.ladder, config.seed, taught, lambda kind: report)
-    head = _find_head(out / "head", outside, simulator)
+    head = _find_head(out / "head", outside, simulator, success)
     starts = outside.starts()
     seeds = [config.seed + i for i in range(len(starts))]
     acting: dict[str, Policy] = dict(users)  # what was compiled for one world serves the next
@@ -154,7 +156,7 @@ def _judge(
 def _collect(
     out: Path,
     outside: Outside,
-    head: SuccessHead,
+    head: Head,
     policies: Sequence[str],
     own: tuple[str, ...],
     robot: Robot,
@@ -188,14 +190,22 @@ def _place(out: Path, name: str, world: str) -> Path:
     return out / "rollouts" / f"{name}.{world}.npz"
 
 
-def _find_head(directory: Path, outside: Outside, simulator: Simulator) -> SuccessHead:
-    if (directory / HEAD_DESCRIPTION).exists():
-        return load_head(directory)
+def _find_head(directory: Path, outside: Outside, simulator: Simulator, own: OwnSuccess | None) -> Head:
     tokenizer = simulator.tokenizer
 
     def reconstruct(images: np.ndarray) -> np.ndarray:
         return np.asarray(tokenizer.decode(tokenizer.encode(images)))
 
+    if own is not None:
+        kept = directory / MEASURED
+        if not kept.exists():
+            directory.mkdir(parents=True, exist_ok=True)
+            write_file(kept, json.dumps(outside.measure(own, reconstruct), indent=1) + "\n")
+        own.measured |= json.loads(kept.read_text())
+        return own
+    if (directory / HEAD_DESCRIPTION).exists():
+        return load_head(directory)
     head = outside.make_head(reconstruct)
+    head.measured |= outside.measure(head, reconstruct)
     save_head(head, directory)
     return head

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.applications.judging.head import SuccessHead
+from experiments.applications.judging.head import Head
 from experiments.applications.judging.rollouts import Rollout
 from experiments.applications.policies.tasks import AnyTask, held
 from experiments.applications.tables import write_table
@@ -38,7 +38,7 @@ class Outcome:
 
 def judge_rollout(
     rollout: Rollout,
-    head: SuccessHead,
+    head: Head,
     task: AnyTask,
     policy: str,
     world: str,

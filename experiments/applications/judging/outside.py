@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from experiments.applications.judging.config import JudgeConfig, Step
-from experiments.applications.judging.head import SuccessHead, measure_head, train_head
+from experiments.applications.judging.head import Head, SuccessHead, measure_head, train_head
 from experiments.applications.judging.outcomes import WORLDS
 from experiments.applications.judging.rollouts import make_starts
 from experiments.applications.policies.demonstrations import Demonstrations, join, record
@@ -45,7 +45,11 @@ class Outside(Protocol):
         ...
 
     def make_head(self, reconstruct: Reconstruct) -> SuccessHead:
-        """Trained, and measured on what it was not trained on."""
+        """Trained, and not measured yet."""
+        ...
+
+    def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
+        """What it is worth on episodes that no head is trained on."""
         ...
 
     def starts(self) -> list[Start]: ...
@@ -87,11 +91,15 @@ class TrueOutside:
         config, size, stride = self.config, self._size, self._robot.stride
         with self._step("record episodes for the success head"):
             known = head_recordings(config, size, stride, config.head_episodes, config.seed)
-            new = head_recordings(config, size, stride, max(config.head_episodes // 10, 12), config.seed + HELD_OUT)
         with self._step("train the success head") as report:
-            head = train_head(known, config.head, config.seed, reconstruct, report)
-        head.measured |= measure_head(head, new, config.task)
-        return head
+            return train_head(known, config.head, config.seed, reconstruct, report)
+
+    def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
+        del reconstruct  # rates of the true frames stand beside those of the model
+        config, episodes = self.config, max(self.config.head_episodes // 10, 12)
+        with self._step("record episodes to measure the success head on"):
+            new = head_recordings(config, self._size, self._robot.stride, episodes, config.seed + HELD_OUT)
+        return measure_head(head, new, config.task)
 
     def starts(self) -> list[Start]:
         return make_starts(self.config.task, self.config.starts, self._size, self._robot.stride)

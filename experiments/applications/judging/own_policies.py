@@ -1,4 +1,6 @@
-"""Policies of a user's own: `policies(robot)` of a Python file gives them by name. What they answer is checked."""
+"""Policies of a user's own: `policies(robot)` of a Python file gives them by name. What they answer is checked.
+
+The file may have a function `success` as well (`own_success`): it is run once for both."""
 
 from __future__ import annotations
 
@@ -11,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from experiments.applications.judging.ladder import OWN_HEAD, RANDOM
+from experiments.applications.judging.own_success import PAGE, OwnSuccess, success_of
 from experiments.applications.policies.cloning import ClonedPolicy
 from experiments.applications.policies.diffusion import DiffusionPolicy
 from experiments.applications.policies.policy import Policy
-from experiments.own_file import find_function
+from experiments.own_file import run_file
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 
-PAGE = "docs/judging.md"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 TAKEN = re.compile(rf"{RANDOM}|{OWN_HEAD}|({ClonedPolicy.kind}|{DiffusionPolicy.kind})-\d+")
 """Names of policies that are made here, whichever of them there are in a judgement."""
@@ -62,15 +64,18 @@ class CheckedPolicy:
         return actions
 
 
-def load_policies(path: Path, robot: Robot) -> dict[str, CheckedPolicy]:
-    """What `policies(robot)` of the file gives. Modules beside the file can be imported by it, as where it is a program.
+def load_own(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], OwnSuccess | None]:
+    """What `policies(robot)` of the file gives, and what it says of success, if it does. Modules beside the file can be
+    imported by it, as where it is a program.
 
     Raises ConfigError for another thing than policies, and for names that rollouts cannot be kept under.
     """
     beside = str(path.resolve().parent)
     if beside not in sys.path:
         sys.path.append(beside)  # behind all others: it hides none
-    found = find_function(path, "policies(robot)", "policies of your own are", PAGE)(robot)
+    file = run_file(path, "policies(robot)", "policies of your own are", PAGE)
+    require(callable(vars(file).get("policies")), f"{path}: has no function policies(robot) ({PAGE})")
+    found = file.policies(robot)
     where = f"{path}: policies(robot)"
     require(isinstance(found, dict), f"{where} must return a dict of policies by name, got {type(found).__name__}")
     require(bool(found), f"{where} returned no policy")
@@ -87,11 +92,15 @@ def load_policies(path: Path, robot: Robot) -> dict[str, CheckedPolicy]:
     lower = [name.lower() for name in found]
     twice = [name for name in found if lower.count(name.lower()) > 1]
     require(not twice, f"{where}: {', '.join(twice)} would be the same files where case does not count; rename one")
-    return {name: CheckedPolicy(policy, robot, f"{path}: policy {name!r}") for name, policy in found.items()}
+    checked = {name: CheckedPolicy(policy, robot, f"{path}: policy {name!r}") for name, policy in found.items()}
+    return checked, success_of(file)
 
 
-def try_out(policies: dict[str, CheckedPolicy], batch: int, shape: tuple[int, int]) -> None:
-    """Asks each for an action on black images: what would stop it later stops it before anything is made."""
+def try_out(policies: dict[str, CheckedPolicy], success: OwnSuccess | None, batch: int, shape: tuple[int, int]) -> None:
+    """Shows each black images: what would stop it later stops it before anything is made."""
+    black = np.zeros((batch, *shape, 3), np.uint8)
+    if success is not None:
+        success.probabilities(black, black)
     for policy in policies.values():
         policy.reset(seeds=range(batch))
-        policy.act(np.zeros((batch, *shape, 3), np.uint8))
+        policy.act(black)

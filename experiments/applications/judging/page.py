@@ -137,7 +137,7 @@ def _doubts(summary: dict[str, Any]) -> list[str]:
 
 NOTHING = (
     "Nothing outside the model was compared: there is no true simulator, and no counts of the real robot were given "
-    "(--real). The rates above are those of the model and of a head that learnt what success looks like from recordings; "
+    "(--real). The rates above are those of the model and of who tells success in its frames; "
     "either may be wrong, of a policy that goes where no recording went most of all. A policy that does as well in the "
     "control, where another episode's actions are executed, does not succeed by what it does."
 )
@@ -173,7 +173,8 @@ def _agreement(summary: dict[str, Any]) -> str:
 def _head(summary: dict[str, Any]) -> str:
     measured = summary["head"]
     said = (
-        f"On {measured['episodes']:.0f} recorded {'' if 'successes' in measured else 'true '}episodes that it was not "
+        f"{'That of the file with the policies. ' if summary['own success'] else ''}"
+        f"On {measured['episodes']:.0f} recorded {'' if 'successes' in measured else 'true '}episodes that no head was "
         f"trained on: accuracy of frames {measured['frame accuracy']:.3f}, AUROC {measured['frame AUROC']:.3f}, accuracy of "
         f"episodes {measured['episode accuracy']:.3f}."
     )
@@ -198,19 +199,23 @@ def say_control(summary: dict[str, Any]) -> str:
 
 
 def say_recorded(measured: dict[str, float]) -> str:
-    """In words, what a head that learnt from recordings of success and failure says of those held out; "" of another."""
+    """In words, what a head says of recordings of success and failure that are held out; "" where there are none."""
     if "successes" not in measured:
         return ""
     n, good = round(measured["episodes"]), round(measured["successes"])
     told = round(measured["successes told"]), round(measured["failures told"])
     accuracy, usual = count_interval(sum(told), n), max(good, n - good) / n
     doubt = "" if accuracy.low > usual else " By these few it is not known to be better: do not trust the rates."
+    learnt = (
+        f"It learnt from {measured['learnt from']:.0f} recordings, {measured['successes among them']:.0f} of them successes; "
+        if "learnt from" in measured
+        else "Of the recordings "
+    )
     return (
         f"It tells {told[0]} of {good} successes and {told[1]} of {n - good} failures: {accuracy.mean:.2f} "
         f"({accuracy.low:.2f} to {accuracy.high:.2f}) of all, {measured['episode accuracy, decoded']:.2f} when they are "
-        f"shown as the model's tokenizer draws them. To call every one the same would be right in {usual:.2f}.{doubt} It learnt "
-        f"from {measured['learnt from']:.0f} recordings, {measured['successes among them']:.0f} of them successes; left out were "
-        f"{measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short."
+        f"shown as the model's tokenizer draws them. To call every one the same would be right in {usual:.2f}.{doubt} {learnt}"
+        f"left out were {measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short."
     )
 
 

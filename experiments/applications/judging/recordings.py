@@ -18,7 +18,7 @@ from data_pipelines.sampling.order import hash64, stream_seed
 from experiments.applications.generating.source import confined
 from experiments.applications.generating.trajectories import Trajectories, describe
 from experiments.applications.judging.config import JudgeConfig, Step
-from experiments.applications.judging.head import SuccessHead, balanced_error, fit_heads, worth_of
+from experiments.applications.judging.head import Head, SuccessHead, balanced_error, fit_heads, worth_of
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED
 from experiments.applications.judging.outside import Reconstruct
 from experiments.applications.policies.demonstrations import Demonstrations
@@ -123,7 +123,11 @@ class Recordings:
             heads = fit_heads(*learnt, kept, self.config.seed, report, round(SHIFT * config.encoder.size))
         errors = {step: balanced_error(head, *tuning) for step, head in heads.items()}
         best = min(errors, key=errors.__getitem__)
-        heads[best].measured |= self._measure(heads[best], reconstruct) | {"steps": float(best)}
+        heads[best].measured |= {
+            "steps": float(best),
+            "learnt from": float(len(self.learnt)),
+            "successes among them": float(self._success[self.learnt].sum()),
+        }
         return heads[best]
 
     def _pairs(self, i: int, reconstruct: Reconstruct) -> tuple[np.ndarray, np.ndarray]:
@@ -137,9 +141,9 @@ class Recordings:
         seen[decoded] = reconstruct(flat).reshape(seen[decoded].shape)
         return shrink_bytes(seen, self.config.head.encoder.size), label
 
-    def _measure(self, head: SuccessHead, reconstruct: Reconstruct) -> dict[str, float]:
-        """What the head is worth on the recordings that are held out, from first to last frame; also as the model's
-        tokenizer shows them, which is how it sees those of the model."""
+    def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
+        """From first to last frame of the recordings that are held out; also as the model's tokenizer shows them, which is
+        how it sees those of the model."""
         hold, successes = self.config.task.hold, self._success[self.held_out]
         scores, labels, said, said_decoded = [], [], [], []
         for i in self.held_out:
@@ -147,7 +151,7 @@ class Recordings:
             chosen, label = labelled(len(images), bool(self._success[i]), hold)
             for shown, found in ((images, said), (reconstruct(images), said_decoded)):
                 probability = head.probabilities(shown, shown[:1])
-                found.append(held(probability[None, 1:] > head.config.threshold, hold).any())
+                found.append(held(probability[None, 1:] > head.threshold, hold).any())
                 if shown is images:
                     scores.append(probability[chosen])
                     labels.append(label)
@@ -157,8 +161,6 @@ class Recordings:
             "successes told": float(by_head[successes].sum()),
             "failures told": float((~by_head[~successes]).sum()),
             "episode accuracy, decoded": float((np.array(said_decoded) == successes).mean()),
-            "learnt from": float(len(self.learnt)),
-            "successes among them": float(self._success[self.learnt].sum()),
             **self._left_out,
         }
 

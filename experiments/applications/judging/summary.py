@@ -23,6 +23,7 @@ from experiments.applications.judging.agreement import (
 )
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
+from experiments.applications.judging.own_success import OwnSuccess
 from experiments.applications.judging.real import Count
 from hma_jax.runtime.files import write_file
 
@@ -66,6 +67,7 @@ def summarise(judged: Judged, real: Mapping[str, Count] | None = None) -> dict[s
         "starts": judged.config.starts,
         "policies": rates,
         "own": list(judged.own),
+        "own success": isinstance(judged.head, OwnSuccess),
         "actions beyond the range": {name: round(share, 4) for name, share in judged.beyond.items()},
         "compared with": REAL if real else REFERENCE if REFERENCE in each else None,
         "agreement": {

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.applications.judging.own_policies import CheckedPolicy, load_policies, try_out
+from experiments.applications.judging.own_policies import CheckedPolicy, load_own, try_out
+from experiments.applications.judging.own_success import OwnSuccess
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
 
@@ -37,19 +38,48 @@ def policies(robot):
 def test_policies_of_a_file_are_found_by_name_with_what_lies_beside_it(tmp_path):
     (tmp_path / "helper_of_policies.py").write_text("VALUE = 0.5")
     (tmp_path / "mine.py").write_text(FILE)
-    found = load_policies(tmp_path / "mine.py", ROBOT)
-    assert list(found) == ["still", "Onward-2"]
-    try_out(found, 2, (8, 8))
+    found, success = load_own(tmp_path / "mine.py", ROBOT)
+    assert list(found) == ["still", "Onward-2"] and success is None
+    try_out(found, success, 2, (8, 8))
     actions = found["Onward-2"].act(np.zeros((2, 8, 8, 3), np.uint8))
     assert actions.dtype == np.float32 and actions.tolist() == [[0.5] * 3] * 2
     assert list(found["still"].policy.seeds) == [0, 1]
 
 
+def test_success_of_a_file_is_asked_of_frames_beside_the_first_of_their_episodes(tmp_path):
+    path = tmp_path / "mine.py"
+    text = "def policies(robot): return {'a': A}\nclass A:\n def reset(episodes=None, seeds=None): 0\n def act(images): 0\n"
+    path.write_text(text + "def success(images, first): return images.mean((1, 2, 3)) > first.mean((1, 2, 3))\n")
+    _, success = load_own(path, ROBOT)
+    images = np.arange(600, dtype=np.uint8).reshape(2, 300, 1, 1, 1) * np.ones((1, 1, 4, 4, 3), np.uint8)
+    found = success.reached(images, images[:, 10:11])
+    assert found.shape == (2, 300) and (found == (images > images[:, 10:11])[..., 0, 0, 0]).all()
+    path.write_text(text + "success = 3\n")
+    with pytest.raises(ConfigError, match=r"mine.py: success is no function success\(images, first\)"):
+        load_own(path, ROBOT)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("0.5", r"float64 \[\]"),
+        ("[1, 0]", r"int64 \[2\]"),
+        ("[0.5, float('nan')]", r"in \[0, 1\]; it gave \[nan\]"),
+        ("[0.5, 1.5]", r"in \[0, 1\]; it gave \[1.5\]"),
+        ("[[0.5], [0.5, 0.5]]", "it gave what is no array"),
+    ],
+)
+def test_success_that_is_no_probability_of_each_image_is_refused(given, said):
+    success = OwnSuccess(lambda images, first: eval(given), "mine.py")
+    with pytest.raises(ConfigError, match=rf"mine.py: success\(images, first\) must give \[2\].*{said}"):
+        try_out({}, success, 2, (8, 8))
+
+
 def test_the_policies_of_the_page_are_some(tmp_path):
     page = (Path(__file__).parents[4] / "docs" / "judging.md").read_text()
     (tmp_path / "my_policies.py").write_text(page.split("```python\n")[1].split("```")[0])
-    found = load_policies(tmp_path / "my_policies.py", ROBOT)
-    try_out(found, 2, (8, 8))
+    found, success = load_own(tmp_path / "my_policies.py", ROBOT)
+    try_out(found, success, 2, (8, 8))
     bright = np.full((1, 8, 8, 3), 255, np.uint8)
     assert {name: policy.act(bright).tolist() for name, policy in found.items()} == {
         "timid": [[0] * 3],
@@ -82,7 +112,7 @@ def test_what_is_no_file_of_policies_is_refused_by_file_function_and_name(tmp_pa
     if text is not None:
         path.write_text(text)
     with pytest.raises(ConfigError, match=message) as error:
-        load_policies(path, ROBOT)
+        load_own(path, ROBOT)
     assert str(error.value).startswith(str(path))
 
 

@@ -119,6 +119,18 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     assert "agreement with real robot" in said(capsys)
 
 
+def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp_path, capsys, few_draws):
+    file, out = tmp_path / "told.py", tmp_path / "out"
+    file.write_text(POLICIES + "\n\ndef success(images, first):\n    return np.ones(len(images), bool)\n")
+    for _ in range(2):  # what is finished is found again
+        assert judge(study, out, "--frames", "3", "--policies", str(file)) == 0
+        assert "It tells 2 of 2 successes and 0 of 2 failures" in said(capsys)
+    assert [path.name for path in (out / "head").iterdir()] == ["measured.json"]
+    assert all(o.success for o in read_outcomes(out / "outcomes.csv"))
+    page = (out / "judge.html").read_text()
+    assert "That of the file with the policies." in page and "It learnt from" not in page
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

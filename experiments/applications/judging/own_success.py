@@ -1,0 +1,61 @@
+"""Success as a user's own file tells it: `success(images, first)`, in place of a head that is trained here."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable
+
+import numpy as np
+
+from hma_jax.config import ConfigError, require
+
+PAGE, NAME = "docs/judging.md", "success"
+PIECE = 256
+"""Frames that are looked at in one call."""
+
+
+class OwnSuccess:
+    """A `Head` by a user's function. `measured` is what it is worth on recordings, once that is known."""
+
+    threshold = 0.5
+
+    def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], where: str):
+        """`where`: the file, for messages."""
+        self._function, self._where = function, where
+        self.measured: dict[str, float] = {}
+
+    def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+        """See `Head`. Raises ConfigError for anything but a number between 0 and 1, or a truth value, for each image."""
+        shape = images.shape[-3:]
+        seen, begun = (x.reshape(-1, *shape) for x in (images, np.broadcast_to(first, images.shape)))
+        pieces = [slice(at, at + PIECE) for at in range(0, len(seen), PIECE)]
+        return np.concatenate([self._asked(seen[piece], begun[piece]) for piece in pieces]).reshape(images.shape[:-3])
+
+    def reached(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+        return self.probabilities(images, first) > self.threshold
+
+    def _asked(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
+        given = self._function(images.copy(), first.copy())
+        wanted = (
+            f"{self._where}: {NAME}(images, first) must give [{len(images)}], for each image how probable it is that the "
+            "goal is reached, or whether it is"
+        )
+        try:
+            found = np.asarray(given)
+        except ValueError as error:  # lists of different lengths
+            raise ConfigError(f"{wanted}; it gave what is no array ({error})") from error
+        kind = np.issubdtype(found.dtype, np.floating) or found.dtype == bool
+        require(found.shape == (len(images),) and kind, f"{wanted}; it gave {found.dtype} {list(found.shape)}")
+        values = found.astype(np.float32)
+        inside = (values >= 0) & (values <= 1)  # of what is no number, too
+        require(bool(inside.all()), f"{wanted}, in [0, 1]; it gave {values[~inside][:1]}")
+        return values
+
+
+def success_of(file: types.ModuleType) -> OwnSuccess | None:
+    """What a user's file says of success, or None where it says nothing. Raises ConfigError for what is no function."""
+    function = vars(file).get(NAME)
+    if function is None:
+        return None
+    require(callable(function), f"{file.__file__}: {NAME} is no function {NAME}(images, first) ({PAGE})")
+    return OwnSuccess(function, str(file.__file__))
