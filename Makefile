@@ -43,7 +43,7 @@ EXACT_LOG = $(VENV)/exact.log
 
 test: $(VENV)/installed-test
 	@echo "beside these tests, those of equal numbers run in a process of their own"; \
-	nice env XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT) >$(EXACT_LOG) 2>&1 & exact=$$!; \
+	nice -n 19 env XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT) >$(EXACT_LOG) 2>&1 & exact=$$!; \
 	$(PYTEST) $(PER_CORE) -m "not exact and not slow" && others=0 || others=$$?; \
 	wait $$exact && found=0 || found=$$?; \
 	echo "tests of equal numbers:"; cat $(EXACT_LOG); \
