@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import stdtr
 
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.analysis.paired import require_same_windows
@@ -74,6 +75,13 @@ def beyond(rows: Iterable[Controlled], metric: str, errors: float = ENOUGH) -> t
     """(robots whose metric is more than `errors` standard errors above that of a deaf model, robots that have it)."""
     own = [row for row in rows if row.metric == metric]
     return sum(row.errors > errors for row in own), len(own)
+
+
+def by_chance(rows: Iterable[Controlled], metric: str, errors: float = ENOUGH) -> float:
+    """How many of these robots a deaf model has there on average: few episodes make a rough standard error, so that it is
+    Student's t, with as many degrees of freedom as episodes less one."""
+    freedom = [row.episodes - 1 for row in rows if row.metric == metric and row.episodes > 1]
+    return float(stdtr(freedom, -errors).sum())
 
 
 def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, role: str) -> Sequence[Controlled]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments.analysis.controllability import Controlled, beyond, controllability
+from experiments.analysis.controllability import Controlled, beyond, by_chance, controllability
 from experiments.report.pieces import pm, table
 from experiments.rows import OVERALL, CurvePoint, Row, curve, of_sweep
 from experiments.running.provenance import Provenance
@@ -139,8 +139,11 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
 
 def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool) -> str:
     lines = [line for robot in robots for line in robot.follows.values()]
-    counted = {m: beyond(lines, m) for m in follows}
-    parts = [f"{FOLLOWS[m].split(' (')[0]} of {more} among {of}" for m, (more, of) in counted.items()]
+    counted = {m: (*beyond(lines, m), by_chance(lines, m)) for m in follows}
+    parts = [
+        f"{FOLLOWS[m].split(' (')[0]} of {more} among {of} (chance: {deaf:.1f})"
+        for m, (more, of, deaf) in counted.items()
+    ]
     order = next((FOLLOWS[m].split(" (")[0] for m in ORDER if m in follows), "")
     said = f"Sorted by how many standard errors the {order} lies above zero. " if order else ""
     said += f"Beyond two standard errors lie the {', the '.join(parts)} robots. " if parts else ""

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from experiments.analysis.controllability import beyond, controllability
+from experiments.analysis.controllability import beyond, by_chance, controllability
 from experiments.suite.explained import read_table
 from tests.experiments.analysis.worlds import judged
 
@@ -36,6 +36,16 @@ def test_robots_beyond_two_errors_are_counted_against_what_a_deaf_model_has():
         assert beyond(deaf, metric) == (0, robots)
     assert all(row.errors == 0 for row in deaf if row.metric != "retrieval")
     assert {row.deaf for row in deaf if row.metric == "retrieval"} == {1 / 16}
+
+
+def test_a_deaf_model_has_as_many_robots_beyond_as_is_said():
+    found, said, rng = 0, 0.0, np.random.default_rng(3)
+    for _ in range(100):
+        table = judged(rng, robots=6, episodes=4)
+        rows = controllability({0: replace(table, metrics={"delta_psnr": table.metrics["cross_entropy"]})})
+        found, said = found + beyond(rows, "delta_psnr")[0], said + by_chance(rows, "delta_psnr")
+    assert said == pytest.approx(100 * 6 * 0.0697, rel=1e-3)
+    assert found == pytest.approx(said, abs=3 * said**0.5)
 
 
 def test_rounding_is_no_control():
