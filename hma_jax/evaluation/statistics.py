@@ -76,26 +76,38 @@ def _exponential(value: float, losses: Any) -> Estimate:
         return Estimate(value, value * estimate_mean(losses).influence)
 
 
-def stat_of(estimate: Estimate, episode_n: Any = None) -> Stat:
-    """An estimate with its standard error; `episode_n` says which episode each window is of.
+class Clusters(NamedTuple):
+    """Which episode each of n windows is of, numbered from 0 to `count` - 1."""
+
+    which: np.ndarray  # int [n]
+    count: int
+
+
+def clusters_of(episode_n: Any) -> Clusters:
+    """From episode numbers of any kind."""
+    names, which = np.unique(np.asarray(episode_n), return_inverse=True)
+    return Clusters(which, len(names))
+
+
+def stat_of(estimate: Estimate, clusters: Clusters | None = None) -> Stat:
+    """An estimate with its standard error; `clusters` says which episode each window is of.
 
     sem^2 = G / (G - 1) sum_g (sum_{i in g} u_i)^2 / n^2 over G episodes g, with influences u. G / (G - 1) is
     the correction for few episodes. nan with one episode: its windows cannot say how episodes differ.
-    Without `episode_n` every value is an episode of its own, which is the usual standard error.
+    Without `clusters` every value is an episode of its own, which is the usual standard error.
     """
     u, n = estimate.influence, len(estimate.influence)
-    if episode_n is not None:
-        require(n == len(episode_n), f"{n} values but {len(episode_n)} episode numbers")
-        _, which = np.unique(np.asarray(episode_n), return_inverse=True)
-        u = np.bincount(which, weights=u)
+    if clusters is not None:
+        require(n == len(clusters.which), f"{n} values but {len(clusters.which)} episode numbers")
+        u = np.bincount(clusters.which, weights=u)
     groups = len(u)
     sem = math.sqrt(groups / (groups - 1) * float(np.sum(u**2))) / n if groups > 1 else math.nan
-    return Stat(estimate.value, sem, n, 0 if episode_n is None else groups)
+    return Stat(estimate.value, sem, n, 0 if clusters is None else groups)
 
 
 def mean_and_sem(values: Any, episode_n: Any = None) -> Stat:
-    """Mean of a 1-D collection with its standard error (`stat_of`)."""
-    return stat_of(estimate_mean(values), episode_n)
+    """Mean of a 1-D collection with its standard error (`stat_of`); `episode_n` says which episode each value is of."""
+    return stat_of(estimate_mean(values), None if episode_n is None else clusters_of(episode_n))
 
 
 def stratified(stats: Iterable[Stat], weights: Iterable[float] | None = None) -> Stat:

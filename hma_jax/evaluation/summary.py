@@ -14,9 +14,11 @@ from hma_jax.evaluation.controllability import OPTIONAL
 from hma_jax.evaluation.statistics import (
     Estimate,
     Stat,
+    clusters_of,
     estimate_corpus_perplexity,
     estimate_mean,
     estimate_perplexity,
+    mean_and_sem,
     stat_of,
     stratified,
 )
@@ -58,7 +60,8 @@ def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
     found = {}
     for name in windows.datasets:
         own = windows.of(name)
-        found[name] = {m: stat_of(e, own.episode) for m, e in _estimates(own, perplexity_group).items()}
+        clusters = clusters_of(own.episode)
+        found[name] = {m: stat_of(e, clusters) for m, e in _estimates(own, perplexity_group).items()}
         found[name] |= _of_some(own, own.metrics)
     return Summary(found)
 
@@ -77,7 +80,8 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
         mine = a.of(name)
         other = b.of(name).matched_to(mine)
         ours, theirs = (_estimates(x, perplexity_group) for x in (mine, other))
-        found[name] = {m: stat_of(e.minus(theirs[m]), mine.episode) for m, e in ours.items() if m in theirs}
+        clusters = clusters_of(mine.episode)
+        found[name] = {m: stat_of(e.minus(theirs[m]), clusters) for m, e in ours.items() if m in theirs}
         both = [m for m in OPTIONAL if m in mine.metrics and m in other.metrics]
         found[name] |= _of_some(mine, {m: mine.metrics[m] - other.metrics[m] for m in both})
     return Summary(found)
@@ -98,4 +102,4 @@ def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray]) -> dict[st
     """Means of the optional metrics in `columns`, of the windows that have them."""
     known = {metric: ~np.isnan(columns[metric]) for metric in OPTIONAL if metric in columns}
     there = {metric: which for metric, which in known.items() if which.any()}
-    return {m: stat_of(estimate_mean(columns[m][which]), windows.episode[which]) for m, which in there.items()}
+    return {m: mean_and_sem(columns[m][which], windows.episode[which]) for m, which in there.items()}

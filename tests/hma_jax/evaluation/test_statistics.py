@@ -9,6 +9,7 @@ from hma_jax.config import ConfigError
 from hma_jax.evaluation.statistics import (
     Estimate,
     Stat,
+    clusters_of,
     estimate_corpus_perplexity,
     estimate_mean,
     estimate_perplexity,
@@ -70,7 +71,7 @@ def test_the_error_of_a_difference_is_known_though_both_models_find_the_same_win
     for seed in range(300):
         values, episode = episodes_of_windows(seed)
         better = values + 0.1 + 0.1 * np.random.default_rng(seed + 1000).normal(size=len(values))
-        difference = stat_of(estimate_mean(better).minus(estimate_mean(values)), episode)
+        difference = stat_of(estimate_mean(better).minus(estimate_mean(values)), clusters_of(episode))
         held += abs(difference.mean - 0.1) < 1.96 * difference.sem
         narrow += difference.sem < 0.2 * mean_and_sem(values, episode).sem
     assert held >= 0.9 * 300 and narrow == 300
@@ -97,7 +98,7 @@ def test_a_dataset_of_one_episode_takes_the_scatter_of_the_others():
 
 def test_perplexity_has_an_error_even_when_all_windows_form_one_group():
     losses, episode = [1.0, 1.2, 0.8], [0, 0, 1]
-    one, many = (stat_of(estimate_perplexity(losses, group), episode) for group in (4, 1))
+    one, many = (stat_of(estimate_perplexity(losses, group), clusters_of(episode)) for group in (4, 1))
     assert one.mean == pytest.approx(math.e) and (one.n, one.episodes) == (3, 2)
     assert one.sem == pytest.approx(math.e * mean_and_sem(losses, episode).sem)
     assert many.mean > one.mean
@@ -107,7 +108,7 @@ def test_corpus_perplexity_error_is_the_delta_method():
     """Against the scatter of the perplexity itself over samples."""
     drawn = [2 + 0.3 * episodes_of_windows(seed, 60)[0] for seed in range(300)]
     errors = [
-        stat_of(estimate_corpus_perplexity(2 + 0.3 * values), episode).sem
+        stat_of(estimate_corpus_perplexity(2 + 0.3 * values), clusters_of(episode)).sem
         for values, episode in (episodes_of_windows(seed, 60) for seed in range(300))
     ]
     assert np.mean(errors) == pytest.approx(np.std([np.exp(x.mean()) for x in drawn]), rel=0.15)
@@ -123,4 +124,4 @@ def test_numbers_that_do_not_belong_together_are_refused():
     with pytest.raises(ConfigError, match="no values"):
         mean_and_sem([])
     with pytest.raises(ConfigError, match="3 values but 2 episode numbers"):
-        stat_of(Estimate(0.0, np.zeros(3)), [1, 2])
+        stat_of(Estimate(0.0, np.zeros(3)), clusters_of([1, 2]))
