@@ -13,8 +13,13 @@ from hma_jax.config import require
 
 def find_function(path: Path, signature: str, what: str, page: str) -> Callable[..., Any]:
     """The function of a file, which is run as `run_file` says. Raises ConfigError where there is no such function."""
-    found = vars(run_file(path, signature, what, page)).get(signature.partition("(")[0])
-    require(callable(found), f"{path}: has no function {signature} ({page})")
+    return function_of(run_file(path, signature, what, page), signature, page)
+
+
+def function_of(file: types.ModuleType, signature: str, page: str) -> Callable[..., Any]:
+    """A function of a file that was run. Raises ConfigError where it has none of that name."""
+    found = vars(file).get(signature.partition("(")[0])
+    require(callable(found), f"{file.__file__}: has no function {signature} ({page})")
     return found
 
 

@@ -13,11 +13,10 @@ from tyro.extras import SubcommandApp
 from experiments.presets import get_preset
 from experiments.progress import console
 from experiments.wrote import wrote
-from hma_jax.config import Weights
+from hma_jax.config import DecodeConfig, SamplerConfig, Weights
 from hma_jax.config.evaluation import SamplerKind
 
 if TYPE_CHECKING:
-    from hma_jax.config import DecodeConfig
     from hma_jax.training.runs import Run
 
 convert_app = SubcommandApp()
@@ -32,7 +31,11 @@ Platform = Literal["cpu", "cuda", "rocm", "tpu"]
 RATES = "rates.toml"
 
 
-def _unless(usual: str) -> object:
+PLAIN = DecodeConfig(sampler=SamplerConfig(temperature=0.0))
+"""How exported programs fill frames where decode.json does not say it: as models are judged, without noise."""
+
+
+def _unless(usual: float | str) -> object:
     return arg(help_behavior_hint=f"(default: as RUN/decode.json says, or {usual})")
 
 
@@ -142,10 +145,10 @@ def to_stablehlo(
     batch: int = 1,
     prompt: Annotated[int | None, arg(help_behavior_hint="(default: 4, or all but the last)")] = None,
     frames: Annotated[int | None, arg(help_behavior_hint="(default: the model's window)")] = None,
-    unmask_steps: Annotated[int | None, arg(name="unmask-steps"), _unless("2")] = None,
-    temperature: Annotated[float | None, _unless("0")] = None,
-    sampler_steps: Annotated[int | None, arg(name="sampler-steps"), _unless("100")] = None,
-    sampler: Annotated[SamplerKind | None, _unless("ddpm")] = None,
+    unmask_steps: Annotated[int | None, arg(name="unmask-steps"), _unless(PLAIN.unmask_steps)] = None,
+    temperature: Annotated[float | None, _unless(PLAIN.temperature)] = None,
+    sampler_steps: Annotated[int | None, arg(name="sampler-steps"), _unless(PLAIN.sampler.steps)] = None,
+    sampler: Annotated[SamplerKind | None, _unless(PLAIN.sampler.kind)] = None,
     platforms: tuple[Platform, ...] = ("cpu", "cuda", "tpu"),
     weights: Weights = "auto",
 ) -> None:
@@ -183,13 +186,10 @@ def to_stablehlo(
 
 
 def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> DecodeConfig:
-    """How the frames of a run are filled: as its decode.json says, or else as models are judged, but for what is asked
-    for (not None)."""
-    from hma_jax.config import DecodeConfig, SamplerConfig
+    """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, but for what is asked for (not None)."""
     from hma_jax.simulator.folder import DECODE, find_decode
 
-    usual = DecodeConfig(2, 0.0, sampler=SamplerConfig("ddpm", 100, 0.0))
-    found = find_decode(run) if (run / DECODE).exists() else usual
+    found = find_decode(run) if (run / DECODE).exists() else PLAIN
     frame, latents = ({name: x for name, x in said.items() if x is not None} for said in (frame, latents))
     return replace(found, **frame, sampler=replace(found.sampler, **latents))
 

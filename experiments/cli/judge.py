@@ -94,7 +94,7 @@ def judge(
         return
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
-    rungs = (6, 3) if recordings is None else (0, 0)
+    rungs = (LadderConfig.cloned, LadderConfig.diffusion) if recordings is None else (0, 0)
     cloned, diffusion = (n if m is None else m for n, m in zip(rungs, (cloned, diffusion), strict=True))
     if recordings is None:
         for flag, value in (("--real", real), ("--registry", registry)):

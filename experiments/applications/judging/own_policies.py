@@ -17,10 +17,11 @@ from experiments.applications.judging.own_success import PAGE, OwnSuccess, succe
 from experiments.applications.policies.cloning import ClonedPolicy
 from experiments.applications.policies.diffusion import DiffusionPolicy
 from experiments.applications.policies.policy import Policy
-from experiments.own_file import run_file
+from experiments.own_file import function_of, run_file
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 
+SIGNATURE = "policies(robot)"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 TAKEN = re.compile(rf"{RANDOM}|{OWN_HEAD}|({ClonedPolicy.kind}|{DiffusionPolicy.kind})-\d+")
 """Names of policies that are made here, whichever of them there are in a judgement."""
@@ -73,10 +74,9 @@ def load_own(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], OwnSuc
     beside = str(path.resolve().parent)
     if beside not in sys.path:
         sys.path.append(beside)  # behind all others: it hides none
-    file = run_file(path, "policies(robot)", "policies of your own are", PAGE)
-    require(callable(vars(file).get("policies")), f"{path}: has no function policies(robot) ({PAGE})")
-    found = file.policies(robot)
-    where = f"{path}: policies(robot)"
+    file = run_file(path, SIGNATURE, "policies of your own are", PAGE)
+    found = function_of(file, SIGNATURE, PAGE)(robot)
+    where = f"{path}: {SIGNATURE}"
     require(isinstance(found, dict), f"{where} must return a dict of policies by name, got {type(found).__name__}")
     require(bool(found), f"{where} returned no policy")
     for name in found:

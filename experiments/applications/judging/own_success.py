@@ -7,17 +7,18 @@ from collections.abc import Callable
 
 import numpy as np
 
+from experiments.applications.judging.head import PIECE, HeadConfig
+from experiments.own_file import function_of
 from hma_jax.config import ConfigError, require
 
 PAGE, NAME = "docs/judging.md", "success"
-PIECE = 256
-"""Frames that are looked at in one call."""
+SIGNATURE = f"{NAME}(images, first)"
 
 
 class OwnSuccess:
     """A `Head` by a user's function. `measured` is what it is worth on recordings, once that is known."""
 
-    threshold = 0.5
+    threshold = HeadConfig.threshold
 
     def __init__(self, function: Callable[[np.ndarray, np.ndarray], np.ndarray], where: str):
         """`where`: the file, for messages."""
@@ -37,7 +38,7 @@ class OwnSuccess:
     def _asked(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
         given = self._function(images.copy(), first.copy())
         wanted = (
-            f"{self._where}: {NAME}(images, first) must give [{len(images)}], for each image how probable it is that the "
+            f"{self._where}: {SIGNATURE} must give [{len(images)}], for each image how probable it is that the "
             "goal is reached, or whether it is"
         )
         try:
@@ -54,8 +55,6 @@ class OwnSuccess:
 
 def success_of(file: types.ModuleType) -> OwnSuccess | None:
     """What a user's file says of success, or None where it says nothing. Raises ConfigError for what is no function."""
-    function = vars(file).get(NAME)
-    if function is None:
+    if not hasattr(file, NAME):
         return None
-    require(callable(function), f"{file.__file__}: {NAME} is no function {NAME}(images, first) ({PAGE})")
-    return OwnSuccess(function, str(file.__file__))
+    return OwnSuccess(function_of(file, SIGNATURE, PAGE), str(file.__file__))

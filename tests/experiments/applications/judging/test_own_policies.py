@@ -55,7 +55,7 @@ def test_success_of_a_file_is_asked_of_frames_beside_the_first_of_their_episodes
     found = success.reached(images, images[:, 10:11])
     assert found.shape == (2, 300) and (found == (images > images[:, 10:11])[..., 0, 0, 0]).all()
     path.write_text(text + "success = 3\n")
-    with pytest.raises(ConfigError, match=r"mine.py: success is no function success\(images, first\)"):
+    with pytest.raises(ConfigError, match=r"mine.py: has no function success\(images, first\)"):
         load_own(path, ROBOT)
 
 
