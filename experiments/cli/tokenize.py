@@ -108,12 +108,12 @@ def _freeze(setting: Setting) -> None:
 
 def _finish(setting: Setting) -> None:
     workspace = setting.workspace
-    show_store(workspace)
+    show_store(workspace, setting.study.rate)
     wrote(workspace.store, workspace.manifest, then=setting.command("train"))
 
 
-def show_store(workspace: Workspace) -> None:
-    """What the token store holds, per dataset."""
+def show_store(workspace: Workspace, rate: float | None) -> None:
+    """What the token store holds, per dataset, and the stride of a study at `rate` Hz (None: native)."""
     import numpy as np
 
     from data_pipelines.errors import without_advice
@@ -125,18 +125,18 @@ def show_store(workspace: Workspace) -> None:
     table = tidy_table(title, "dataset", "train", "held out", "lost", "frames", *lengths, "Hz", "stride")
     for name in store.names:
         manifest = store.manifest(name)
-        steps = manifest.train.steps
+        steps = np.asarray(manifest.train.steps)
         table.add_row(
             name,
             f"{len(steps)}",
             f"{len(manifest.val.steps)}",
             f"{manifest.lost}",
             f"{manifest.train.native_frames + manifest.val.native_frames}",
-            f"{min(steps)}",
+            f"{steps.min()}",
             f"{np.median(steps):g}",
-            f"{max(steps)}",
+            f"{steps.max()}",
             f"{manifest.spec.hz:g}",
-            f"{manifest.spec.stride}",
+            f"{manifest.spec.stride_at(rate)}",
         )
     console.print(table)
     for name in store.names:

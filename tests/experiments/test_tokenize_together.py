@@ -8,18 +8,21 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from data_pipelines.publishing.claims import claim
 from data_pipelines.tokens import part_maker
+from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli.main import main
+from experiments.cli.tokenize import show_store
 from experiments.preparing import sources
 from experiments.progress import Pace
 from experiments.running.workspace import Workspace
 from experiments.setting import StudyArguments, make_setting
-from tests.data_pipelines.fakes import write_rlds
+from tests.data_pipelines.fakes import FakeTokenizer, write_rlds
 from tests.data_pipelines.tokens.job_process import contents
 from tests.experiments.test_cli_errors import ARM, BASE, LENGTHS, SMOKE, idle_training  # noqa: F401
 
@@ -153,6 +156,15 @@ def test_store_of_an_older_format_is_made_again_when_asked_for(data, tmp_path, c
     assert "manifest format 1; this reads 2" in said and "--replace tokens" in said
     assert main([*arguments, "--replace", "tokens"]) == 0
     assert contents(tmp_path / "tokens") == before
+
+
+@pytest.mark.parametrize(("rate", "stride"), [(2.0, "5"), (5.0, "2"), (None, "1")])
+def test_the_stride_that_is_told_is_the_studys(rate, stride, tmp_path, capsys):
+    spec = replace(ARM, hz=10.0, rate=None)
+    tokenize_dataset(spec, write_rlds(tmp_path, spec, LENGTHS), FakeTokenizer(), tmp_path / "tokens", rate=rate)
+    show_store(Workspace(tmp_path), rate)
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if spec.name in line]
+    assert line.split()[-2:] == ["10", stride]
 
 
 def test_time_left_does_not_count_what_was_there_before():
