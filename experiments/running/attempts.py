@@ -26,6 +26,7 @@ from typing import Any
 
 from data_pipelines.publishing.claims import Claim, claim, living_claim
 from experiments.running.ledger import FAILED, FINISHED, LOST, MISSING, PREEMPTED, RUNNING, Ledger
+from hma_jax.runtime.exits import Exit
 from hma_jax.runtime.files import write_file
 
 JOB, STARTED, PROGRESS = "job.json", "started.json", "progress.json"
@@ -109,6 +110,8 @@ def outcome(directory: Path, ended: Ended) -> State:
         return State(PREEMPTED, ended.why)
     if number == signal.SIGKILL:
         return State(LOST, f"its process was ended by SIGKILL (out of memory?); {log}")
+    if ended.code == Exit.LOST:
+        return State(LOST, f"its files could not be written (is the disk full?); {log}")
     if number:
         return State(FAILED, f"its process was ended by {signal.Signals(number).name}; {log}")
     return State(FAILED, f"its process ended with exit code {ended.code} and no result; {log}")

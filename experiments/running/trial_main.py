@@ -12,6 +12,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -24,8 +25,8 @@ LOOK_EVERY = 30.0
 
 
 def main(directory: Path) -> int:
-    """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; STOPPED or INTERRUPTED: the
-    next attempt goes on from here."""
+    """FAILED: see failure.json, also where it diverged; REFUSED: the sources changed; LOST: its files could not be
+    written; STOPPED or INTERRUPTED: the next attempt goes on from here."""
     enter_child()  # before anything imports JAX
     try:
         with terminated_like_interrupted(), attempt(directory) as held:
@@ -34,6 +35,9 @@ def main(directory: Path) -> int:
             return _run(directory, held.lost)
     except KeyboardInterrupt as request:
         return exit_of_interrupt(request)
+    except OSError:  # before there was anything to record it with
+        _print_traceback()
+        return Exit.LOST
 
 
 def _run(directory: Path, lost: Callable[[], bool]) -> int:
@@ -44,7 +48,7 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
 
     from data_pipelines.errors import DataError
     from experiments.running.job import read_job
-    from experiments.running.ledger import DIVERGED, FAILED
+    from experiments.running.ledger import DIVERGED, FAILED, LOST
     from experiments.running.newcomers import begin_from_trial
     from experiments.running.provenance import inputs_of, record_start
     from experiments.running.run_trial import run_trial
@@ -75,12 +79,19 @@ def _run(directory: Path, lost: Callable[[], bool]) -> int:
         print(error, file=sys.stderr)
         return Exit.STOPPED
     except Exception as error:  # the boundary of the process: every failure becomes a record
-        traceback.print_exc()
+        _print_traceback()
         known = isinstance(error, (ConfigError, DataError, DivergedError))
         message = str(error) if known else f"{type(error).__name__}: {error}"
-        state = DIVERGED if isinstance(error, DivergedError) else FAILED
-        write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
-        return Exit.FAILED
+        lost = isinstance(error, OSError)  # a disk that is full or gone is no fault of the trial
+        state = LOST if lost else DIVERGED if isinstance(error, DivergedError) else FAILED
+        with suppress(OSError):  # the same disk, most likely: then the code says it alone
+            write_file(directory / FAILURE, json.dumps({"state": state, "message": message}))
+        return Exit.LOST if lost else Exit.FAILED
+
+
+def _print_traceback() -> None:
+    with suppress(OSError):  # output.txt lies on the disk that may be full
+        traceback.print_exc()
 
 
 class TakenOver(Exception):

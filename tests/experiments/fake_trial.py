@@ -16,7 +16,7 @@ from experiments.running.children import enter_child
 from experiments.running.launchers.local import LocalLauncher
 from experiments.running.ledger import Ledger
 from experiments.running.runner import Job, run_missing
-from hma_jax.runtime.exits import exit_of_interrupt, terminated_like_interrupted
+from hma_jax.runtime.exits import Exit, exit_of_interrupt, terminated_like_interrupted
 
 THREE = [Job(f"t{i}", f"trial {i}", {"steps": 8, "seconds": 0.05, "end": "result"}) for i in range(3)]
 
@@ -53,6 +53,8 @@ def count_to_the_end(directory: Path) -> int:
             raise SystemExit("no such luck")
         case "none":
             return 0
+        case "full disk" if killed:
+            return Exit.LOST
         case end if end.startswith("SIG") and killed:
             os.kill(os.getpid(), signal.Signals[end])
     (directory / "result.json").write_text(json.dumps({"count": job["steps"]}))

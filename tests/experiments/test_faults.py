@@ -18,6 +18,7 @@ from experiments.analysis.tables import read_side
 from experiments.cli.main import main
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
+from experiments.running.attempts import Ended, outcome
 from experiments.running.shared_runs import ALONE
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
@@ -28,6 +29,7 @@ from hma_jax.training.reading import find_damage, list_steps
 from hma_jax.training.runs import load_model, load_run
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.test_cli_errors import ARM, LENGTHS, SMOKE, idle_training  # noqa: F401
+from tests.full_disk import full_disk
 
 STEPS = ("--set", "tokenizer_train.steps=4", "--set", "train.steps=4")
 
@@ -111,15 +113,33 @@ def test_a_trial_that_is_asked_to_stop_while_it_evaluates_says_so(tmp_path, monk
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(10)
 
-    inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
-    (tmp_path / "job.json").write_text(json.dumps({"provenance": inputs}))
-    monkeypatch.setattr("experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, ALONE))
+    write_job(tmp_path, monkeypatch)
     monkeypatch.setattr(trials, "run_trial", asked)
     before = signal.getsignal(signal.SIGTERM)
     try:
         assert trial_main.main(tmp_path) == Exit.STOPPED
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+def write_job(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a trial of nothing."""
+    inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
+    (directory / "job.json").write_text(json.dumps({"provenance": inputs}))
+    monkeypatch.setattr("experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, ALONE))
+
+
+# --- A full disk -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("room", [0, 400], ids=["not a byte", "enough to say so"])
+def test_a_trial_on_a_full_disk_is_lost_not_failed_so_that_the_same_command_goes_on(room, tmp_path, monkeypatch):
+    write_job(tmp_path, monkeypatch)
+    with full_disk(room):
+        assert trial_main.main(tmp_path) == Exit.LOST  # its provenance.json takes more
+    state = outcome(tmp_path, Ended(Exit.LOST))
+    assert state.event == "lost"
+    assert ("provenance.json" if room else "is the disk full?") in state.message
 
 
 # --- Not finite ------------------------------------------------------------------------------

@@ -73,9 +73,10 @@ def test_failures_are_recorded_and_the_sweep_goes_on(tmp_path):
     assert "no such luck" in (tmp_path / "trials/crash/output.txt").read_text()
 
 
-@pytest.mark.parametrize(("end", "state"), [("SIGKILL", "lost"), ("SIGTERM", "preempted")])
+@pytest.mark.parametrize(("end", "state"), [("SIGKILL", "lost"), ("SIGTERM", "preempted"), ("full disk", "lost")])
 def test_a_trial_that_is_killed_goes_on_from_where_it_was(tmp_path, end, state):
-    """The kernel's out-of-memory killer, or a machine that is taken away: nothing is wrong with the trial."""
+    """The kernel's out-of-memory killer, a machine that is taken away, a disk that is full: nothing is wrong with the
+    trial."""
     assert run(tmp_path, [job("a", end, steps=3)])["a"].event == "finished"
     assert starts(tmp_path, "a") == [0, 3]
     assert events(tmp_path, "a") == ["running", state, "running", "finished"]
