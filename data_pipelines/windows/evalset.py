@@ -6,8 +6,9 @@ Owns the choice of windows, its file, and their batches. Measures nothing.
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,10 @@ class EvalManifest:
         """Datasets without a window, and why."""
         return {d.dataset: d.reason for d in self.datasets if not d.windows}
 
+    def thinned(self, most: int) -> EvalManifest:
+        """The same with at most so many windows of each dataset, of as many episodes as can be."""
+        return replace(self, datasets=tuple(replace(d, windows=spread(d.windows, most)) for d in self.datasets))
+
     def save(self, path: str | Path) -> None:
         """Writes JSON with its own hash; whole or not at all. ConfigError if it cannot be written."""
         path = Path(path)
@@ -86,6 +91,24 @@ class EvalManifest:
         if found != stated:  # of what the file says: one of an earlier version lacks fields
             raise DataError(f"{path}: its contents do not match its hash {stated}: it was changed. {advice}")
         return manifest
+
+
+def spread(frozen: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, int], ...]:
+    """So many of the windows (episode, start), of as many episodes as can be: errors are clustered by episode.
+
+    One of each comes before a second one of any, and where there are too many episodes, every so many-th is taken:
+    neighbours share a scene or a day.
+    """
+    seen: defaultdict[int, int] = defaultdict(int)
+    rounds: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)  # a window of each episode that has one left
+    for window in frozen:
+        rounds[seen[window[0]]].append(window)
+        seen[window[0]] += 1
+    chosen: list[tuple[int, int]] = []
+    for windows in rounds.values():
+        taken = min(len(windows), count - len(chosen))
+        chosen += [windows[i * len(windows) // taken] for i in range(taken)]
+    return tuple(sorted(chosen))
 
 
 def freeze_manifest(

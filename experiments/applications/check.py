@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import numpy as np
 from data_pipelines.sampling.splits import count_held_out
 from data_pipelines.tokens.manifest import JobSettings
 from data_pipelines.tokens.store import TokenStore
-from data_pipelines.windows.evalset import EvalManifest, eval_batches
+from data_pipelines.windows.evalset import EvalManifest, eval_batches, spread
 from experiments.running.run_trial import Materials, open_materials
 from experiments.running.workspace import Workspace
 from experiments.setting import command_words
@@ -115,17 +113,6 @@ def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int
     return f"{robot} has {judged} episodes to be judged; what actions do is told from at least {FEWEST}. {why}"
 
 
-def spread(frozen: Sequence[tuple[int, int]], count: int) -> tuple[tuple[int, int], ...]:
-    """So many of the windows (episode, start), of as many episodes as can be: errors are clustered by episode. One of
-    each comes before a second of any."""
-    of_episode = Counter[int]()
-    ranked = []
-    for window in frozen:
-        ranked.append((of_episode[window[0]], window))
-        of_episode[window[0]] += 1
-    return tuple(sorted(window for _, window in sorted(ranked)[:count]))
-
-
 def _hold_out_more(settings: JobSettings, episodes: int) -> str:
     """How to have FEWEST of so many held out."""
     for share, more in ((settings.max_val_fraction, ""), (0.5, " --set store.max_val_fraction=0.5")):
@@ -150,8 +137,7 @@ def _check(
     windows: int,
     spoil: Spoil,
 ) -> list[Effect]:
-    chosen = [replace(d, windows=spread(d.windows, windows)) for d in manifest.datasets]
-    batches = list(eval_batches(store, model.table, replace(manifest, datasets=tuple(chosen)), BATCH, (robot.name,)))
+    batches = list(eval_batches(store, model.table, manifest.thinned(windows), BATCH, (robot.name,)))
     valid = np.concatenate([batch["valid"] for batch in batches])
     width, chunk = model.table.action_width, robot.stride * robot.action_dim
     flat = np.concatenate([batch["actions"] for batch in batches])[..., :chunk]

@@ -145,15 +145,16 @@ def train_trial(
 def validation_batches(
     trial: Trial, materials: Materials, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
 ) -> Iterator[dict[str, Any]]:
-    """Some frozen windows of each evaluated dataset: one batch as large as in training, this process's rows."""
+    """Some frozen windows of each evaluated dataset, of as many episodes as can be: one batch as large as in training,
+    this process's rows."""
     from data_pipelines.windows.evalset import eval_batches
     from hma_jax.runtime.rows import own_rows
 
-    own = own_rows(execution.mesh, trial.train.batch)
-    for name in trial.evaluated:
-        for whole in eval_batches(materials.store, table, materials.manifest, trial.train.batch, (name,)):
+    batch = trial.train.batch
+    own, some = own_rows(execution.mesh, batch), materials.manifest.thinned(batch)
+    for name in trial.evaluated:  # one without windows has no batch
+        for whole in eval_batches(materials.store, table, some, batch, (name,)):
             yield {key: whole[key][own] for key in ("tokens", "actions", "embodiment", "valid", "real") if key in whole}
-            break  # the next dataset; one without windows has no batch
 
 
 def evaluate_on(

@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.windows.evalset import freeze_manifest
 from experiments.cli.begin import setting_of, strangers
 from experiments.cli.main import main
 from experiments.presets import get_preset
@@ -29,6 +31,7 @@ from hma_jax.training.claim import locked_run
 from hma_jax.training.reading import list_steps
 from hma_jax.training.runs import load_run
 from tests.data_pipelines.fakes import write_rlds
+from tests.data_pipelines.windows.test_evalset import small_store
 from tests.experiments.test_cli_errors import ARM, BASE, SMOKE, idle_training  # noqa: F401
 from tests.hma_jax.convert.fakes import DISCRETE, make_checkpoint
 
@@ -373,3 +376,14 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     other = replace(trained, provenance={"tokenizer": "another"})
     with pytest.raises(ConfigError, match="trained on tokens of tokenizer another, .*; add --tokenizer"):
         setting_of(beside, other, asked)
+
+
+def test_held_out_loss_is_of_as_many_episodes_as_a_batch_takes(tmp_path):
+    """Of the first windows it would be that of one long episode and its neighbours."""
+    store = small_store(tmp_path, lengths=(40,) * 16, min_val=4)
+    manifest, table = freeze_manifest(store, ("toy",), 4, 64, 0), store.embodiment_table(["toy"])
+    materials = SimpleNamespace(store=store, manifest=manifest)
+    trial = SimpleNamespace(train=SimpleNamespace(batch=4), evaluated=("toy",))
+    (batch,) = trials.validation_batches(trial, materials, table)
+    assert batch["valid"].all()
+    assert len(set((batch["tokens"][:, 0, 0] // 256).tolist())) == 4  # ids say which episode a frame is of

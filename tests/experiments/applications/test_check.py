@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from data_pipelines.windows.evalset import freeze_manifest
-from experiments.applications.check import choose_robots, shortage, spread
+from experiments.applications.check import choose_robots, shortage
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -35,12 +35,6 @@ def test_too_few_episodes_are_told_with_what_took_them(episodes, min_val, frozen
     manifest = freeze_manifest(store, ("toy",), 4, frozen, 0)
     found = shortage(store, manifest, "toy", windows, Path("runs/a"))
     assert said in found if said else found is None
-
-
-def test_windows_are_of_as_many_episodes_as_can_be():
-    frozen = [(0, 0), (0, 4), (0, 8), (1, 4), (3, 0), (3, 8)]
-    assert spread(frozen, 3) == ((0, 0), (1, 4), (3, 0)) and spread(frozen, 4) == ((0, 0), (0, 4), (1, 4), (3, 0))
-    assert spread(frozen, 9) == tuple(frozen)
 
 
 def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path):
