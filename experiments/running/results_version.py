@@ -16,6 +16,14 @@ OF_SOME = {
     "robots without actions have no error of predicted actions": {"model.action_heads": True},
     "stems learn from hidden actions that leak into blocks": {"train.masking.action_leak": "conditioning"},
     "stems learn from hidden actions that leak": {"train.masking.action_leak": "all"},
+    "an own past is drawn after hidden actions that leak into blocks": {
+        "train.masking.teacher_forcing": True,
+        "train.masking.action_leak": "conditioning",
+    },
+    "an own past is drawn after hidden actions that leak": {
+        "train.masking.teacher_forcing": True,
+        "train.masking.action_leak": "all",
+    },
     "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
     "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
 }

@@ -91,6 +91,10 @@ class MaskingConfig:
             self.teacher_forcing or not self.own_past,
             "masking.own_past replaces frames of the past that masking.teacher_forcing shows: set that too",
         )
+        require(
+            self.own_past > 0 or self.own_past_rounds == 1,
+            f"masking.own_past_rounds {self.own_past_rounds} draws what masking.own_past asks for, which is 0: set that too",
+        )
 
     @property
     def predicts_frames(self) -> bool:

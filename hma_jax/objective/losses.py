@@ -110,8 +110,8 @@ def masked_loss(
     if masking.teacher_forcing:
         past = masked.inputs[:, :-1]
         if masking.own_past:
-            given = actions_BTU, embodiment_B, hidden, masking.own_past, masking.own_past_rounds, key_B, slice_B
-            past = draw_own_past(model, past, *given)
+            drawn = masking.own_past, masking.own_past_rounds, key_B, slice_B, masking.action_leak
+            past = draw_own_past(model, past, actions_BTU, embodiment_B, hidden, *drawn)
         inputs = past, masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
         out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
     else:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from hma_jax.config.training import ActionLeak
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose
 from hma_jax.model.hma import HMA
@@ -27,6 +28,7 @@ def draw_own_past(
     rounds: int,
     key_B: jax.Array,
     slice_B: jax.Array,
+    leak: ActionLeak = "none",
 ) -> jax.Array:
     """Ids `before` [B, T - 1, S], frames from the second on replaced with probability `greatest_share` u, u uniform in
     [0, 1) of each example, by ids drawn from the model's own distribution at temperature 1, in so many `rounds`.
@@ -48,7 +50,8 @@ def draw_own_past(
     ids_key_B, own_BT = jax.vmap(choose_frames)(key_B)
     past = before
     for number in range(rounds):
-        said = look_beside(model, past, past, masked, actions_BTU, embodiment_B, hidden_BT, slice_B=slice_B).said
+        shown = actions_BTU, embodiment_B, hidden_BT
+        said = look_beside(model, past, past, masked, *shown, leak=leak, slice_B=slice_B).said
         said = jax.lax.stop_gradient(said[:, :-1])  # of frames 1 .. T-2; nothing follows the last one
         # The first round draws what it draws where it is the only one.
         keys = jax.vmap(lambda key, n=number: jax.random.fold_in(key, n))(ids_key_B) if number else ids_key_B

@@ -1,5 +1,6 @@
 """A past that the model drew itself: which frames it replaces, and with what."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError, MaskingConfig
+from hma_jax.config.training import ActionLeak
 from hma_jax.generation.teacher import next_frame_outputs
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import compose, factorise
@@ -91,3 +93,30 @@ def test_it_needs_a_past_that_is_shown():
         MaskingConfig(own_past=0.5)
     with pytest.raises(ConfigError, match="own_past_rounds must be at least 1, got 0"):
         MaskingConfig(own_past_rounds=0)
+    with pytest.raises(ConfigError, match="own_past_rounds 3 draws what masking.own_past asks for, which is 0"):
+        MaskingConfig(teacher_forcing=True, own_past_rounds=3)
+
+
+def test_it_is_drawn_after_hidden_actions_where_these_leak_to_the_model(monkeypatch):
+    """As the frames that follow it are predicted."""
+    monkeypatch.setattr(own_past, "drawing", lambda *_: likeliest)
+    config = shallow_config(action_heads=False)
+    declared, params = lively_params(config, scale=0.5)
+    batch = random_batch(0, config, 8)
+    tokens, given = jnp.asarray(batch["tokens"]), (batch["actions"], batch["embodiment"])
+    hidden, keys = jnp.ones(tokens.shape[:2], bool), noise_keys(jax.random.key(0), 8)
+
+    @partial(jax.jit, static_argnums=1)
+    def past(hidden: jax.Array | None, leak: ActionLeak) -> jax.Array:
+        drawn = 1.0, 1, keys, given[1], leak
+        return draw_own_past(declared.merge(params), tokens[:, :-1], *given, hidden, *drawn)
+
+    np.testing.assert_array_equal(past(hidden, "all"), past(None, "none"))
+    assert (past(hidden, "none") != past(None, "none")).any()
+
+    seen = []
+    monkeypatch.setattr(losses, "draw_own_past", lambda model, past, *asked: seen.append(asked[-1]) or past)
+    masking = replace(OWN, setting="passive", action_leak="all")
+    masked = mask_batch(jax.random.key(0), tokens, given[1], config, masking, TABLE)
+    jax.eval_shape(lambda: losses.masked_loss(declared.merge(params), masked, tokens, *given, masking, keys).tokens)
+    assert seen == ["all"]
