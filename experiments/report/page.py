@@ -169,7 +169,8 @@ def _headline(
 
 
 def _at_default(rows: Sequence[Row], sweep: Sweep, metric: str, role: str = POINT) -> CurvePoint | None:
-    return next((p for p in curve(rows, sweep.name, metric, role) if p.x == sweep.reference_x), None)
+    points = curve(rows, sweep.name, metric, role, drawn=sweep.drawn)
+    return next((p for p in points if p.x == sweep.reference_x), None)
 
 
 def _curves(

@@ -81,7 +81,7 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
 
 def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     """One curve with standard errors, every seed's point, and the reference lines."""
-    points = curve(rows, sweep.name, metric)
+    points = curve(rows, sweep.name, metric, drawn=sweep.drawn)
     colour = COLOURS[metric]
     if points:
         xs = [p.x for p in points]
@@ -98,7 +98,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
         _x_axis(panel, points, sweep)
     else:
         show_nothing(panel)
-    show_control(panel, curve(rows, sweep.name, metric, CONTROL))
+    show_control(panel, curve(rows, sweep.name, metric, CONTROL, drawn=sweep.drawn))
     if metric == "perplexity":
         plain_log(panel, panel.yaxis)
         for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve

@@ -105,7 +105,7 @@ def _growth(sweep: Sweep, rows: Sequence[Growth]) -> str:
 def _columns(sweep: Sweep, rows: Sequence[Row]) -> dict[str, dict[float, CurvePoint]]:
     """{metric: {x: point}} of the metrics that there are."""
     metrics = drawn_metrics(rows, [sweep.name])
-    return {m: {p.x: p for p in curve(rows, sweep.name, m)} for m in metrics}
+    return {m: {p.x: p for p in curve(rows, sweep.name, m, drawn=sweep.drawn)} for m in metrics}
 
 
 def _series(sweep: Sweep, rows: Sequence[Row], name: str, changes: Sequence[Change]) -> str:
@@ -169,7 +169,7 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
     for metric in columns:
         head += [HEADINGS[metric], "to the default"]
     judged = "all variants are judged on the same windows"
-    if any(p.scope for p in sweep.points):
+    if sweep.drawn:
         judged = "each seed judges robots of its own, all variants on the same windows of these"
     return table([*head, "seeds"], lines) + (
         f"<p>Bold: the default. Errors are standard errors over seeds, as in the figure: {judged}, so that windows do "

@@ -61,6 +61,12 @@ class Sweep:
         """Whether x says how much of something there is, on one curve or several: what a law can be fitted to."""
         return not self.labels and not self.base
 
+    @property
+    def drawn(self) -> bool:
+        """Whether seeds are judged on robots of their own: their windows differ."""
+        places = {(p.x, p.series, p.role) for p in self.points}
+        return len({(p.x, p.series, p.role, p.scope) for p in self.points}) > len(places)
+
     def label(self, x: float) -> str:
         """The name of `x`; '' on an axis of numbers."""
         return self.labels[int(x)] if self.labels else ""

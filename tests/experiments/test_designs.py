@@ -81,6 +81,10 @@ def test_judged_robots_are_others_for_every_seed_and_each_of_another_family():
         assert len({FAMILY[name] for name in judged}) == len(judged) == 5 and not silent & set(judged)
 
 
+def test_the_axes_are_known_whose_seeds_are_judged_on_other_windows():
+    assert {name for name, sweep in SWEEPS.items() if sweep.drawn} == {"dilution", "transfer", "newcomers"}
+
+
 def test_sets_of_robots_are_nested_and_hold_the_judged():
     for seed in CPU_FULL.seeds:
         sets = [set(draw_mixture(CPU_FULL, seed, n)) for n in (5, 10, 20, 40)]

@@ -109,6 +109,20 @@ def test_curve_joins_seeds_and_windows(drawn):
     assert both.sem == pytest.approx(math.sqrt(spread + 0.04 / 3))
 
 
+def test_errors_of_robots_drawn_for_every_seed_count_their_windows_once(drawn, tmp_path, monkeypatch):
+    """What windows do to the mean of a seed is within the spread over seeds, if they are others for each."""
+    rows, sweep = rows_of(drawn, [plan_width(STUDY)]), plan_width(STUDY)
+    one, several = curve(rows, "width", "perplexity", drawn=True)
+    assert several.sem == several.seed_sem > 0 and one.sem == curve(rows, "width", "perplexity")[0].sem > 0
+    kept = []
+    monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
+    points = [replace(p, scope=STUDY.dataset_names()[p.trial.train.seed :]) for p in sweep.points]
+    plots.plot_sweep(rows, replace(sweep, points=tuple(points)), tmp_path / "width.png")
+    bars = {c.get_label(): c for c in kept[0].axes[0].containers}["mean ± s.e."]
+    low, high = bars.lines[2][0].get_segments()[1][:, 1]
+    assert high - low == pytest.approx(2 * several.seed_sem)
+
+
 def test_control_and_untrained_stay_off_the_curve(drawn):
     rows = rows_of(drawn, [plan_width(STUDY)])
     assert curve(rows, "width", "delta_psnr", "control")[0].mean == pytest.approx(1.0)  # 0 + 1 + 2 over 3
