@@ -26,7 +26,7 @@ from data_pipelines.tokens.row_sample import Spread
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.config.training import ActionScale
-from hma_jax.model.embodiments import Embodiment
+from hma_jax.model.embodiments import DEAD_STD, Embodiment
 
 FILE = "manifest.json"
 SPLITS = ("train", "val")
@@ -186,8 +186,8 @@ class Manifest:
         """The model's view of this dataset's actions at `rate`. `moments` and `spread` are of the actions that count,
         if those are not all of the train split's.
 
-        By `quantiles`, a value that is one number from 1 % to 99 % and yet varies is measured by its
-        extremes. Raises DataError for a manifest of a version that kept no quantiles.
+        By `quantiles`, a value that from 1 % to 99 % is one number, or one and its rounding (`DEAD_STD`), and yet
+        varies is measured by its extremes. Raises DataError for a manifest of a version that kept no quantiles.
         """
         return self._embodiment(self.stride_at(rate), moments, scale, spread)
 
@@ -225,7 +225,7 @@ class Manifest:
                 "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
         pairs = zip(spread.quantiles[0], spread.quantiles[-1], spread.low, spread.high, strict=True)
-        chosen = [(a, b) if b > a else (least, most) for a, b, least, most in pairs]
+        chosen = [(a, b) if (b - a) / 2 > DEAD_STD else (least, most) for a, b, least, most in pairs]
         return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 
     def hash(self) -> str:

@@ -24,6 +24,7 @@ OF_SOME = {
         "train.masking.teacher_forcing": True,
         "train.masking.action_leak": "all",
     },
+    "what rounding leaves is no scale of actions": {"train.action_scale": "quantiles"},
     "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
     "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
 }
