@@ -183,6 +183,7 @@ class Study:
         check_objective(self.model, self.train.masking)
         check_micro_batches(self.train.batch, self.execution.accumulate)
         check_decoding(self.model, self.eval.decode)  # as the evaluation would, which comes after training
+        self.eval.check_images(self.tokenizer.image_shape)
         require(not self.train.seed, f"train.seed: a trial has one of seeds; set seeds={self.train.seed}")
         for name in ("tau", "flops_per_second"):
             require(getattr(self, name) > 0, f"{name} must be positive, got {getattr(self, name):g}")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 DEFAULT = Path("comparison.csv")
 
-SHOWN = ("cross_entropy", "diffusion_loss", "action_nats", "psnr", "delta_psnr", "counterfactual_gain")
+SHOWN = ("cross_entropy", "diffusion_loss", "action_nats", "psnr", "lpips", "delta_psnr", "counterfactual_gain")
 """Metrics in the table, as far as both have them; the CSV has all."""
 
 

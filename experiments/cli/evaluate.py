@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from hma_jax.training.runs import Run
 
 SHOWN = (
-    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "delta_psnr", "action_nats", "retrieval",
-    "counterfactual_gain", "action_error", "action_gain",
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "lpips", "delta_psnr", "action_nats",
+    "retrieval", "counterfactual_gain", "action_error", "action_gain",
 )  # fmt: skip
 """Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all, and
 windows.parquet those of every window."""

@@ -21,6 +21,7 @@ from experiments.preparing.windows import freeze_windows, require_same_windows
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import Study
+from hma_jax.evaluation.lpips import require_lpips
 from hma_jax.training.claim import require_plain
 
 
@@ -41,6 +42,8 @@ def prepare(
     again in its place. `batch` and `threads` as in `make_store`. Raises ConfigError or DataError.
     """
     require_plain(workspace.root)
+    if study.eval.lpips:
+        require_lpips()  # before all that the evaluation comes after
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
     if tokenizer is None:

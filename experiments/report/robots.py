@@ -21,7 +21,7 @@ from hma_jax.evaluation.windows import WindowTable
 
 COLUMNS = {
     "perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)", "psnr_copy": "copying (dB)",
-    "ssim": "SSIM",
+    "ssim": "SSIM", "lpips": "LPIPS", "lpips_copy": "LPIPS of copying",
 }  # fmt: skip
 FOLLOWS = {
     "action_nats": "action-nats", "retrieval": "retrieval", "delta_psnr": "ΔPSNR (dB)",

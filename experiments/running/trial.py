@@ -87,6 +87,7 @@ LATER: dict[str, Any] = {
     "train.optimizer.matrices": "adamw",
     "train.masking.change_weight": 1.0,
     "train.masking.own_past_rounds": 1,
+    "eval.lpips": False,
 }
 """Fields that came after trials were published, by their path (`train.masking.own_past`), with the value that all had
 before: they name a trial where they have another. A new field of `Trial` or of a configuration within it is added here,

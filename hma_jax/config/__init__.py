@@ -6,7 +6,7 @@ computed; paths, clocks and verbosity belong to the code that calls. `json` read
 """
 
 from hma_jax.config.base import ConfigError, require
-from hma_jax.config.evaluation import DecodeConfig, EvalConfig, SamplerConfig, check_decoding
+from hma_jax.config.evaluation import SMALLEST_LPIPS_IMAGE, DecodeConfig, EvalConfig, SamplerConfig, check_decoding
 from hma_jax.config.execution import Dtype, ExecutionConfig, MeshConfig
 from hma_jax.config.model import Conditioning, DiffusionConfig, ModelConfig, MupConfig
 from hma_jax.config.pretrained_tokenizers import (
@@ -30,6 +30,7 @@ from hma_jax.config.training import (
 )
 
 __all__ = [
+    "SMALLEST_LPIPS_IMAGE",
     "AnyTokenizerConfig",
     "Conditioning",
     "ConfigError",

@@ -10,6 +10,9 @@ from hma_jax.config.model import ModelConfig
 
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
 
+SMALLEST_LPIPS_IMAGE = 31
+"""Pixels along a side of which the last layers of LPIPS's network still see one position."""
+
 
 @dataclass(frozen=True)
 class SamplerConfig:
@@ -93,6 +96,7 @@ class EvalConfig:
     other_actions: int = 15  # of other episodes, that the true ones are told from; 0: neither action-nats nor retrieval
     batch: int = 32  # windows at a time
     perplexity_group: int = 4  # windows per exp(mean), as in the official evaluation
+    lpips: bool = False  # also by LPIPS over AlexNet, whose weights are the extra `lpips`; images of 31 pixels or more
     seed: int = 0  # of the choice of windows and of all draws
 
     def __post_init__(self):
@@ -108,6 +112,14 @@ class EvalConfig:
     def first_predicted(self) -> int:
         """The first frame of a window that is compared."""
         return self.prompt_frames if self.context == "generated" else 1
+
+    def check_images(self, shape: tuple[int, int]) -> None:
+        """Raises ConfigError for images of `shape` (height, width) that cannot be judged as asked."""
+        require(
+            not self.lpips or min(shape) >= SMALLEST_LPIPS_IMAGE,
+            f"eval.lpips needs images of at least {SMALLEST_LPIPS_IMAGE} x {SMALLEST_LPIPS_IMAGE} pixels, the tokenizer "
+            f"makes {shape[0]} x {shape[1]}",
+        )
 
 
 def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:

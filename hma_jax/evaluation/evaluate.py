@@ -19,6 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.images import Decode, Decoder, Sample, image_metrics, make_clips
+from hma_jax.evaluation.lpips import load_lpips
 from hma_jax.evaluation.protocol import Predicted, make_predictor
 from hma_jax.evaluation.summary import Summary, summarise
 from hma_jax.evaluation.windows import WindowTable, join
@@ -36,6 +37,9 @@ ARRAYS = ("tokens", "actions", "embodiment", "episode", "start", "images")
 
 PERHAPS = ("real", "action_mean", "action_std", "other_actions", "other_valid", "other_images", "other_seen")
 """And this, where a batch has it."""
+
+Judges = tuple[Params, Params | None]
+"""Parameters of the tokenizer, which makes images of tokens, and of `lpips`, where it is asked for."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +70,14 @@ def evaluate(
     and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is
     what the model was trained for. `progress` is told the windows done so far. With several processes
     (`runtime.processes`) all call this with the same batches, and each gets the whole result. Raises ConfigError if
-    there is no window, or for a model whose predictions are not finite.
+    there is no window, for a model whose predictions are not finite, or as `lpips.load_lpips`.
     """
     mesh = make_mesh(execution.mesh)
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
     declared = declare_model(model, table, execution)
     weights = lay_out(params, param_shardings(declared, mesh, execution.mesh))
-    decoder_weights = lay_out(tokenizer.params, NamedSharding(mesh, PartitionSpec()))
+    judges = (tokenizer.params, load_lpips() if config.lpips else None)
+    judges = lay_out(judges, NamedSharding(mesh, PartitionSpec()))
 
     def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted]]]:
         for batch in batches:
@@ -81,7 +86,7 @@ def evaluate(
             arrays = (*ARRAYS, *(name for name in PERHAPS if name in batch))
             on_devices = _put({name: batch[name] for name in arrays}, groups * rows, mesh)
             with jax.set_mesh(mesh):
-                found = evaluator(weights, decoder_weights, on_devices)
+                found = evaluator(weights, judges, on_devices)
             yield batch, found
 
     tables: list[WindowTable] = []
@@ -114,8 +119,8 @@ def make_evaluator(
     execution: ExecutionConfig,
     decode: Decode,
     piece: int,
-) -> Callable[[Params, Params, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted]]:
-    """A jitted f(parameters, those of the tokenizer, batch with images) -> (metrics {name: [B]}, Predicted).
+) -> Callable[[Params, Judges, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted]]:
+    """A jitted f(parameters, Judges, batch with images) -> (metrics {name: [B]}, Predicted).
 
     Runs under `jax.set_mesh`. Of B windows `plan_groups` says how many are in memory at a time; B is a
     multiple of that. Raises ConfigError as `make_predictor`.
@@ -124,22 +129,22 @@ def make_evaluator(
     predict = make_predictor(model, table, config, setting, execution)
 
     def compare(
-        params: Params, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None, Any]
+        judges: Judges, predicted: Predicted, recorded: tuple[jax.Array, jax.Array | None, Any]
     ) -> dict[str, jax.Array]:
-        images, real, others = recorded
-        return image_metrics(decode, piece, params, predicted, images, config, real, others)
+        (decoder_params, lpips_params), (images, real, others) = judges, recorded
+        return image_metrics(decode, piece, decoder_params, predicted, images, config, real, others, lpips_params)
 
-    def evaluate_group(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
+    def evaluate_group(params: Params, judges: Judges, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
         metrics, predicted = predict(params, batch)
         others = (batch["other_images"], batch["other_seen"]) if "other_images" in batch else None
         recorded = batch["images"], batch.get("real"), others
-        compared = _on_each_device(compare, mesh)(decoder_params, predicted, recorded)
+        compared = _on_each_device(compare, mesh)(judges, predicted, recorded)
         return metrics | compared, predicted
 
-    def evaluate_batch(params: Params, decoder_params: Params, batch: dict[str, jax.Array]):
+    def evaluate_batch(params: Params, judges: Judges, batch: dict[str, jax.Array]):
         groups, _ = plan_groups(len(batch["tokens"]), execution.windows_at_once, batch_ways(mesh))
-        return in_groups(lambda rows: evaluate_group(params, decoder_params, rows), batch, groups)
+        return in_groups(lambda rows: evaluate_group(params, judges, rows), batch, groups)
 
     return jax.jit(evaluate_batch, out_shardings=NamedSharding(mesh, PartitionSpec()))
 

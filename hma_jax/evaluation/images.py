@@ -11,6 +11,7 @@ import numpy as np
 
 from hma_jax.config import EvalConfig, require
 from hma_jax.evaluation.controllability import counterfactual
+from hma_jax.evaluation.lpips import lpips
 from hma_jax.evaluation.metrics import last_frames, mean_over_frames, psnr, ssim
 from hma_jax.evaluation.protocol import Predicted
 from hma_jax.model.params import Params
@@ -47,9 +48,11 @@ def image_metrics(
     config: EvalConfig,
     real_BT: jax.Array | None = None,
     others: tuple[jax.Array, jax.Array] | None = None,
+    lpips_params: Params | None = None,
 ) -> dict[str, jax.Array]:
     """Per window [B], over the frames that are `real_BT` (None: all are); `images` are those recorded, uint8
-    [B, T, height, width, 3]. `others` are other_images and other_seen of a batch that has them.
+    [B, T, height, width, 3]. `others` are other_images and other_seen of a batch that has them. `lpips_params` are
+    those of `lpips.load_lpips`, where images are judged by it too.
 
     `finite`, bool [B], says whether the tokens are numbers at all: images of latents that are not mean
     nothing.
@@ -75,15 +78,19 @@ def image_metrics(
     of_last = psnr(jnp.concatenate([shown_last, random_last], axis=1), _beside(last, 1 + random_last.shape[1]))
     of_last = jax.lax.optimization_barrier(of_last)
     psnr_last, psnr_random = of_last[:, 0], of_last[:, 1:]
+    copied = jnp.broadcast_to(before, future.shape)
     found = {
         "psnr": mean_over_frames(psnr(shown, future), real),
         "psnr_last": psnr_last,
         "psnr_random": psnr_random.mean(1),
         "delta_psnr": (psnr_last[:, None] - psnr_random).mean(1),
-        "psnr_copy": mean_over_frames(psnr(jnp.broadcast_to(before, future.shape), future), real),
+        "psnr_copy": mean_over_frames(psnr(copied, future), real),
         "ssim": mean_over_frames(ssim(shown, future), real),
         "finite": _finite(tokens[:, :made], real) & _finite(predicted.random_last, None),
     }
+    if lpips_params is not None:
+        found["lpips"] = mean_over_frames(lpips(lpips_params, shown, future), real)
+        found["lpips_copy"] = mean_over_frames(lpips(lpips_params, copied, future), real)
     if predicted.other is not None:
         truth, seen = others
         found["finite"] &= _finite(predicted.other, real)
