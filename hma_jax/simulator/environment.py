@@ -28,7 +28,7 @@ from hma_jax.simulator.starts import Start
 
 ID = "HMA/Robot-v0"
 MAX_STEPS = 200
-"""Frames after which an episode is truncated, unless told otherwise."""
+"""Frames after which an episode is truncated, unless `gymnasium.make` or `make_vec` are told other `max_episode_steps`."""
 
 
 def action_space(robot: Robot) -> gymnasium.spaces.Box:
@@ -42,7 +42,7 @@ def observation_space(simulator: AnySimulator) -> gymnasium.spaces.Box:
 
 
 class _Task:
-    """What both environments need: a simulator, one of its robots, where its episodes start and how they end."""
+    """What both environments need: a simulator, one of its robots, where its episodes start and who judges them."""
 
     def __init__(
         self,
@@ -52,19 +52,18 @@ class _Task:
         simulator: AnySimulator | None,
         starts: Sequence[Start] | None,
         judge: Judge,
-        max_steps: int,
         options: dict[str, Any],
     ):
         require((run is None) != (simulator is None), "an environment needs either `run` or `simulator`")
-        require(max_steps >= 1, f"an episode has at least 1 step, got max_steps={max_steps}")
+        require("max_steps" not in options, "max_steps: the length of an episode is Gymnasium's max_episode_steps")
         told = ", ".join(options)
         require(run is not None or not options, f"{told}: options of loading a `run`; a given simulator is as it is")
         if simulator is None:
             simulator = Simulator.load(run, episodes=episodes, **options)
         require(
             getattr(simulator, "rate", "model") == "model",
-            "an environment's steps, which `max_steps` and judges count, are frames of the model, not native actions: "
-            "a simulator of rate='model' is needed",
+            "an environment's steps, which `max_episode_steps` and judges count, are frames of the model, not native "
+            "actions: a simulator of rate='model' is needed",
         )
         require(len(simulator) == episodes, f"a simulator of {episodes} episodes is needed, not of {len(simulator)}")
         if starts is None:
@@ -76,10 +75,15 @@ class _Task:
             "some (docs/simulator.md)",
         )
         robot = names[0] if robot is None else robot
-        self.simulator, self.judge, self.max_steps = simulator, judge, max_steps
+        self.simulator, self.judge = simulator, judge
         require(robot in names, f"no start of robot {robot!r}; there are starts of {', '.join(names)}")
         self.robot = simulator.robots[robot]
         self.starts = [start for start in starts if start.robot == robot]
+
+    def at_its_rate(self, metadata: dict[str, Any]) -> dict[str, Any]:
+        """With frames per second of the robot's own time, for whoever films it, where that is known."""
+        rate = self.robot.hz / self.robot.stride
+        return metadata | ({"render_fps": int(rate) if rate.is_integer() else rate} if rate else {})
 
     def begin(
         self, rngs: Sequence[np.random.Generator], episodes: Sequence[int], options: dict[str, Any] | None
@@ -100,7 +104,8 @@ class _Task:
 
 
 class RobotEnv(gymnasium.Env):
-    """One episode of one robot. A step is a frame of the model: the action is held for it.
+    """One episode of one robot. A step is a frame of the model: the action is held for it. What truncates episodes
+    is Gymnasium's `TimeLimit`, which `gymnasium.make` puts around it.
 
     `reset(options={"start": i})` begins at that start, otherwise at a drawn one. Rewards and ends are the `judge`'s.
     `info["clipped"]` names action dimensions whose value lay outside the range.
@@ -116,31 +121,26 @@ class RobotEnv(gymnasium.Env):
         simulator: AnySimulator | None = None,
         starts: Sequence[Start] | None = None,
         judge: Judge = no_judge,
-        max_steps: int = MAX_STEPS,
         render_mode: str | None = None,
         **options: Any,
     ):
         """`options` are those of `Simulator.load`. Raises ConfigError."""
-        self._task = _Task(1, run, robot, simulator, starts, judge, max_steps, options)
-        self.render_mode = render_mode
+        self._task = _Task(1, run, robot, simulator, starts, judge, options)
+        self.render_mode, self.metadata = render_mode, self._task.at_its_rate(self.metadata)
         self.action_space = action_space(self._task.robot)
         self.observation_space = observation_space(self._task.simulator)
-        self._steps = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        self._steps = 0
         return self._task.begin([self.np_random], [0], options)[0].copy(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         simulator = self._task.simulator
         image = simulator.step([action])[0].copy()
-        self._steps += 1
         rewards, done = self._task.judge(simulator)
-        info = {"clipped": simulator.clipped[0]}
-        return image, float(rewards[0]), bool(done[0]), self._steps >= self._task.max_steps, info
+        return image, float(rewards[0]), bool(done[0]), False, {"clipped": simulator.clipped[0]}
 
     def render(self) -> np.ndarray | None:
         return self._task.simulator.images[0].copy() if self.render_mode == "rgb_array" else None
@@ -165,15 +165,15 @@ class RobotVectorEnv(VectorEnv):
         simulator: AnySimulator | None = None,
         starts: Sequence[Start] | None = None,
         judge: Judge = no_judge,
-        max_steps: int = MAX_STEPS,
-        max_episode_steps: int | None = None,
+        max_episode_steps: int = MAX_STEPS,
         render_mode: str | None = None,
         **options: Any,
     ):
-        """As `RobotEnv`. `max_episode_steps` is what `gymnasium.make_vec` calls `max_steps`."""
-        max_steps = max_steps if max_episode_steps is None else max_episode_steps
-        self._task = _Task(num_envs, run, robot, simulator, starts, judge, max_steps, options)
-        self.num_envs, self.render_mode = num_envs, render_mode
+        """As `RobotEnv`; episodes are truncated after `max_episode_steps`."""
+        require(max_episode_steps >= 1, f"an episode has at least 1 step, got max_episode_steps={max_episode_steps}")
+        self._task = _Task(num_envs, run, robot, simulator, starts, judge, options)
+        self.num_envs, self.render_mode, self._longest = num_envs, render_mode, max_episode_steps
+        self.metadata = self._task.at_its_rate(self.metadata)
         self.single_action_space = action_space(self._task.robot)
         self.single_observation_space = observation_space(self._task.simulator)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -223,7 +223,7 @@ class RobotVectorEnv(VectorEnv):
             self._task.begin([self._rngs[b] for b in which], which, None)
         self._steps = np.where(again, 0, self._steps + 1)
         terminated = done & ~again
-        truncated = ~again & (self._steps >= self._task.max_steps)
+        truncated = ~again & (self._steps >= self._longest)
         self._over = terminated | truncated
         return simulator.images.copy(), np.where(again, 0.0, rewards), terminated, truncated, {"clipped": clipped}
 
@@ -235,4 +235,5 @@ gymnasium.register(
     ID,
     entry_point="hma_jax.simulator.environment:RobotEnv",
     vector_entry_point="hma_jax.simulator.environment:RobotVectorEnv",
+    max_episode_steps=MAX_STEPS,
 )

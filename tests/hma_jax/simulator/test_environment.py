@@ -1,6 +1,7 @@
 """Gymnasium's view of a simulator."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,28 @@ gymnasium = pytest.importorskip("gymnasium", reason="needs the extra `simulator`
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
 from hma_jax.config import ConfigError  # noqa: E402
-from hma_jax.simulator.environment import ID, RobotEnv, RobotVectorEnv  # noqa: E402
+from hma_jax.simulator.environment import ID, MAX_STEPS, RobotEnv, RobotVectorEnv  # noqa: E402
 from tests.hma_jax.simulator.small import ROBOTS, simulator, start  # noqa: E402
 
 STARTS = [start(robot, 2, seed) for robot in (0, 1) for seed in range(3)]
 NAME = f"hma_jax.simulator.environment:{ID}"
+
+
+class Still:
+    """In place of a simulator, for what hangs on no frame."""
+
+    def __init__(self, episodes: int):
+        self.images, self.robots = np.zeros((episodes, 8, 8, 3), np.uint8), {"arm": ROBOTS[1]}
+        self.clipped = [()] * episodes
+
+    def __len__(self):
+        return len(self.images)
+
+    def reset(self, starts, *, seeds, episodes):
+        return self.images
+
+    def step(self, actions):
+        return self.images
 
 
 def make(**options):
@@ -49,13 +67,36 @@ def test_a_seed_gives_the_same_episode_and_another_seed_another():
 
 
 def test_an_episode_ends_by_its_judge_or_its_length():
-    env = make(max_steps=3)
+    env = make(max_episode_steps=3)
     env.reset(seed=0)
     ends = [env.step(env.action_space.sample())[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
     env = make(judge=lambda sim: (np.full(1, 2.5), np.full(1, True)))
     env.reset(seed=0)
     assert env.step(env.action_space.sample())[1:3] == (2.5, True)
+
+
+def test_an_episode_is_as_long_as_gymnasium_is_told_and_not_shorter():
+    """Also one longer than those that nothing is told of."""
+    for told, longest in (({"max_episode_steps": MAX_STEPS + 1}, MAX_STEPS + 1), ({}, MAX_STEPS)):
+        alone, several = (
+            made(NAME, simulator=Still(count.get("num_envs", 1)), starts=STARTS, robot="arm", **told, **count)
+            for made, count in ((gymnasium.make, {}), (gymnasium.make_vec, {"num_envs": 2}))
+        )
+        for env in (alone, several):
+            env.reset(seed=0)
+            cut = [np.all(env.step(env.action_space.sample())[3]) for _ in range(longest)]
+            assert cut == [False] * (longest - 1) + [True]
+    with pytest.raises(ConfigError, match="max_steps: the length of an episode is Gymnasium's max_episode_steps"):
+        make(max_steps=3)
+
+
+@pytest.mark.parametrize(("hz", "stride", "rate"), [(0.0, 1, 4), (6.0, 1, 6), (5.0, 2, 2.5)])
+def test_films_are_in_the_robot_s_own_time(hz, stride, rate):
+    sim = Still(1)
+    sim.robots = {"arm": replace(ROBOTS[1], hz=hz, stride=stride, dimensions=())}
+    for env in (RobotEnv, RobotVectorEnv):
+        assert env(simulator=sim, starts=STARTS, robot="arm").metadata["render_fps"] == rate
 
 
 def test_a_judge_is_told_of_episodes_that_begin():
@@ -87,7 +128,9 @@ def test_a_clipped_action_is_said():
 
 
 def test_the_vector_environment_begins_episodes_anew_when_they_end():
-    env = gymnasium.make_vec(NAME, num_envs=3, simulator=simulator(episodes=3), starts=STARTS, robot="arm", max_steps=2)
+    env = gymnasium.make_vec(
+        NAME, num_envs=3, simulator=simulator(episodes=3), starts=STARTS, robot="arm", max_episode_steps=2
+    )
     env.action_space.seed(0)
     first, _ = env.reset(seed=1)
     assert first.shape == (3, 8, 8, 3) and env.unwrapped._task.simulator.counts == (2, 2, 2)
@@ -120,7 +163,7 @@ def vector(episodes: int = 3, **options):
 
 def test_each_episode_of_a_vector_may_have_its_own_seed():
     """It is then what the environment alone shows with that seed, also where it begins anew."""
-    env, seeds, low = vector(max_steps=1), [5, 9, 5], np.stack([np.array(ROBOTS[1].low, np.float32)] * 3)
+    env, seeds, low = vector(max_episode_steps=1), [5, 9, 5], np.stack([np.array(ROBOTS[1].low, np.float32)] * 3)
     shown = [env.reset(seed=seeds)[0], env.step(low)[0], env.step(low)[0]]
     for b, seed in enumerate(seeds[:2]):
         alone = RobotEnv(simulator=simulator(), starts=STARTS, robot="arm")
@@ -134,7 +177,7 @@ def test_each_episode_of_a_vector_may_have_its_own_seed():
 
 
 def test_a_part_of_a_vector_begins_anew_where_a_mask_says_so():
-    env, mask = vector(max_steps=3), np.array([False, True, False])
+    env, mask = vector(max_episode_steps=3), np.array([False, True, False])
     env.reset(seed=0)
     before = env.step(np.stack([env.single_action_space.low] * 3))[0]
     images, _ = env.reset(options={"reset_mask": mask, "start": 2})
@@ -147,12 +190,9 @@ def test_a_part_of_a_vector_begins_anew_where_a_mask_says_so():
             env.reset(options={"reset_mask": unusable})
 
 
-def test_a_vector_s_length_may_be_told_in_gymnasium_s_word():
-    env = gymnasium.make_vec(
-        NAME, num_envs=2, simulator=simulator(episodes=2), starts=STARTS, robot="arm", max_episode_steps=3
-    )
-    env.reset(seed=0)
-    assert [env.step(env.action_space.sample())[3].all() for _ in range(3)] == [False, False, True]
+def test_a_vector_of_episodes_without_a_step_is_refused():
+    with pytest.raises(ConfigError, match="at least 1 step, got max_episode_steps=0"):
+        vector(max_episode_steps=0)
 
 
 @pytest.mark.parametrize("start_", ["x", None, 1.5, 3, -1])
@@ -174,7 +214,6 @@ def test_native_actions_are_no_steps_of_an_environment():
         ({"robot": "base"}, "no start of robot 'base'; there are starts of pusher, arm"),
         ({"starts": []}, "there is no start to begin at"),
         ({"run": "somewhere"}, "either `run` or `simulator`"),
-        ({"max_steps": 0}, "at least 1 step"),
     ],
 )
 def test_what_cannot_be_made_is_said(options: dict, message: str):

@@ -12,7 +12,7 @@ from tests.hma_jax.simulator.small import simulator, start  # noqa: E402
 pytestmark = pytest.mark.slow
 STARTS = [start(1, 2, seed) for seed in range(3)]
 NAME = f"hma_jax.simulator.environment:{ID}"
-OPTIONS = {"starts": STARTS, "robot": "arm", "max_steps": 4}
+OPTIONS = {"starts": STARTS, "robot": "arm", "max_episode_steps": 4}
 
 
 def brightness(sim) -> tuple[np.ndarray, np.ndarray]:
