@@ -30,6 +30,9 @@ from hma_jax.simulator.robots import Robot
 MOST_FRAMES = 3000
 """Of a recording, which is kept in memory: it ends there."""
 
+SHOWN = 2.0
+"""Frames per second of a video of a robot whose own time is not known."""
+
 ENLARGED = 4
 """Times that a frame's sides are longer in the video."""
 
@@ -67,16 +70,17 @@ class Recording:
         del self._images[max(keep, 0) :], self._chunks[max(keep - 1, 0) :]
 
     @property
-    def rate(self) -> float:
-        """Frames per second of the robot's own time; 2 where it is not known."""
-        return self.robot.hz / self.robot.stride or 2.0
+    def rate(self) -> float | None:
+        """Frames per second of the robot's own time; None where it is not known."""
+        return self.robot.hz / self.robot.stride or None
 
     def video(self) -> bytes:
-        """MP4, enlarged, in the robot's own time."""
-        return encode_video(self._images, self.rate)
+        """MP4, enlarged, in the robot's own time as far as it is known."""
+        return encode_video(self._images, self.rate or SHOWN)
 
     def dataset(self) -> bytes:
-        """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it."""
+        """A zip of <robot>_played/1.0.0: one episode, a step per frame with the chunk that was executed after it.
+        metadata.json says the rate where it is known."""
         name = f"{self.robot.name}_played"
         height, width = self._images[0].shape[:2]
         chunk = self.robot.stride * self.robot.action_dim
@@ -98,7 +102,7 @@ class Recording:
             write_info(
                 place, name=name, features=features, lengths=[1], size=len(record),
                 description=f"One episode of {self.robot.name}, played by hand in a learned simulator.",
-                metadata={"hz": self.rate, "stride": self.robot.stride, "generated": True},
+                metadata={**({"hz": self.rate} if self.rate else {}), "stride": self.robot.stride, "generated": True},
                 module="experiments.applications.play",
             )  # fmt: skip
             return _zipped(Path(folder))

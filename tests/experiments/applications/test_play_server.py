@@ -25,10 +25,12 @@ from data_pipelines.sources.rlds.dataset import RldsDataset
 from experiments.applications.play import crowd as crowd_module
 from experiments.applications.play import server
 from experiments.applications.play.crowd import REPLIES, Visitor
+from experiments.applications.play.recording import Recording
 from experiments.applications.play.turn import Seat
 from experiments.cli.main import main
 from hma_jax.config import require
 from hma_jax.runtime.exits import Exit
+from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving
 from tests.hma_jax.simulator.small import simulator
 
@@ -491,6 +493,14 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
         np.testing.assert_array_equal(actions[:, 0], np.float32([0.5, 0.5, 0.45, 0.0]))
 
     serving(test)
+
+
+@pytest.mark.parametrize(("hz", "said"), [(10.0, 5.0), (0.0, None)])
+def test_a_recording_says_its_rate_where_it_is_known(hz, said):
+    recording = Recording(Robot("arm", 2, (0.0,), (1.0,), (0.0,), hz=hz))
+    recording.add(np.zeros((8, 8, 3), np.uint8), np.zeros((2, 1)), np.zeros((8, 8, 3), np.uint8))
+    metadata = json.loads(zipfile.ZipFile(io.BytesIO(recording.dataset())).read("arm_played/1.0.0/metadata.json"))
+    assert metadata.get("hz") == said
 
 
 def _episodes(directory):
