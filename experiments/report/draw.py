@@ -17,6 +17,7 @@ from experiments.sweeps.registry import AXES, KEPT, plan_sweeps
 from experiments.sweeps.sweep import Sweep, unique_trials
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError
+from hma_jax.runtime.outputs import make_directory
 
 if TYPE_CHECKING:
     from experiments.report.numbers import Numbers
@@ -117,6 +118,7 @@ def draw_again(out: Path) -> None:
 
     workspace = Workspace(out.absolute())
     record = load_record(workspace)
+    make_directory(workspace.root, option=None)
     if workspace.trials.exists() or not workspace.results.exists():
         draw(workspace, record)
         return

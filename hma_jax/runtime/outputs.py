@@ -9,10 +9,10 @@ from pathlib import Path
 from hma_jax.config import ConfigError
 
 
-def make_directory(directory: Path, option: str = "--out") -> None:
+def make_directory(directory: Path, option: str | None = "--out") -> None:
     """Makes `directory`, if it is not there, and sees that files can be written in it.
 
-    Raises ConfigError otherwise; `option` is what the user chose it with.
+    Raises ConfigError otherwise; `option` is what the user chose it with, None where it is what the command is about.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -22,11 +22,11 @@ def make_directory(directory: Path, option: str = "--out") -> None:
         raise unwritable(directory, error, option) from error
 
 
-def unwritable(directory: Path, error: OSError, option: str = "--out") -> ConfigError:
+def unwritable(directory: Path, error: OSError, option: str | None = "--out") -> ConfigError:
     """That `directory` cannot be made or written in: which directory above it, or which file, is in the way."""
     there = next(p for p in (directory, *directory.parents) if os.path.exists(p))
     what = f"nothing can be written in {there}" if there.is_dir() else f"{there} is a file"
+    advice = f"choose another {option}, in" if option else "copy it to"
     return ConfigError(
-        f"cannot write to {directory}: {what} ({error.strerror}); choose another {option}, in a directory where you "
-        "may write"
+        f"cannot write to {directory}: {what} ({error.strerror}); {advice} a directory where you may write"
     )

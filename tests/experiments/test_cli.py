@@ -1,5 +1,7 @@
 """The command line: one message and the right exit code for every mistake, fast and full help."""
 
+import errno
+import os
 import shlex
 import subprocess
 import sys
@@ -19,6 +21,7 @@ from experiments.running.workspace import Workspace, load_record, save_record
 from experiments.setting import StudyArguments, make_setting
 from experiments.sweeps.draws import draw_judged
 from hma_jax.config import ConfigError
+from hma_jax.runtime import outputs
 from tests.experiments.fakes import PROVENANCE, finished_study, record_of
 
 COMMANDS = ("", "study", "sweep", "data", "data suite", "data list", "data inspect", "tokenizer",
@@ -148,6 +151,17 @@ def test_report_is_drawn_again_from_disk(tmp_path, capsys):
     save_record(workspace, record_of())
     assert main(["report", str(tmp_path)]) == 0
     assert "report.html" in capsys.readouterr().out and workspace.report.exists()
+
+
+def test_a_report_that_cannot_be_written_names_no_option_that_there_is_not(tmp_path, monkeypatch, capsys):
+    def read_only(dir: Path) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(dir))
+
+    save_record(finished_study(tmp_path), record_of())
+    monkeypatch.setattr(outputs.tempfile, "TemporaryFile", read_only)
+    assert main(["report", str(tmp_path)]) == 2
+    said = f"nothing can be written in {tmp_path} (Read-only file system); copy it to a directory where you may write"
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["report", "fit"])
