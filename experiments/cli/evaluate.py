@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,6 +20,7 @@ from hma_jax.config.json import from_dict, to_strict_json
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
+    from data_pipelines.tokens.store import TokenStore
     from experiments.running.run_trial import Materials
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.runs import Run
@@ -92,6 +94,12 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
+    if elsewhere := trained_on_other_tokens(trained, names, materials.store):
+        console.print(
+            f"note: {few(elsewhere)}: the model was trained on other tokens than lie here, so that it may have seen "
+            "episodes that are held out here; the --out that it was trained in holds out those that it has not",
+            soft_wrap=True,
+        )
     made_from = describe_evaluation(trained, names, materials, setting.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)
@@ -136,6 +144,19 @@ def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
     if not set(config.datasets) <= set(materials.store.names):
         return []
     return list(select_windows(materials.store, config).mixture.dropped)
+
+
+def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStore) -> list[str]:
+    """Those of `names` that a model, or the one it goes on from, was trained on and not, as far as can be told, with the
+    tokens of `store`: another choice of held-out episodes is another store."""
+    found: list[str] = []
+    provenance = trained.provenance
+    while "loader" in provenance:
+        datasets = provenance["loader"]["datasets"]
+        same = set(datasets) <= set(store.names) and store.hash(datasets) == provenance["store"]
+        found += [] if same else [name for name in names if name in datasets]
+        provenance = provenance.get("origin", {}).get("provenance", {})
+    return found
 
 
 def require_prepared(setting: Setting) -> None:

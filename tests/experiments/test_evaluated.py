@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from experiments.cli.evaluate import trained_on_other_tokens
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
 from hma_jax.config import ConfigError, EvalConfig, TrainConfig
 from hma_jax.config.json import to_dict
 from hma_jax.evaluation.windows import FILE, WindowTable
+from tests.data_pipelines.windows.test_evalset import small_store
 
 
 def made_from(step: int = 3, windows: int = 2, name: str = "arm", **changed) -> MadeFrom:
@@ -75,3 +77,16 @@ def test_results_that_do_not_say_what_they_are_of_are_known_by_their_windows(tmp
         require_same_evaluation(tmp_path, made_from(windows=5))
     with pytest.raises(ConfigError, match="with drawer"):
         require_same_evaluation(tmp_path, made_from(name="drawer"))
+
+
+def test_other_tokens_than_a_model_was_trained_on_are_told(tmp_path):
+    """Where more is held out, some of it was trained on. What a model goes on from was trained, too."""
+    few, more = (small_store(tmp_path / f"{n}", lengths=(20,) * 8, min_val=n) for n in (1, 2))
+    seen = set(few.manifest("toy").train.episodes) & set(more.manifest("toy").val.episodes)
+    assert len(seen) == 1
+    provenance = {"loader": {"datasets": ["toy"]}, "store": few.hash(["toy"])}
+    for run in (provenance, {"loader": {"datasets": []}, "store": few.hash([]), "origin": {"provenance": provenance}}):
+        trained = SimpleNamespace(provenance=run)
+        assert trained_on_other_tokens(trained, ["toy", "arm"], few) == []
+        assert trained_on_other_tokens(trained, ["toy", "arm"], more) == ["toy"]
+    assert trained_on_other_tokens(SimpleNamespace(provenance={"official": {}}), ["toy"], few) == []
