@@ -21,15 +21,15 @@ def judge(
     task: Literal["own", "reach", "hover"] = "own",
     policies: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
     recordings: Annotated[str | None, arg(metavar="DATASET"), UNSET] = None,
-    split: str = "train",
+    split: Annotated[str | None, UNSET] = None,
     registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
     real: Annotated[Path | None, arg(metavar="CSV"), UNSET] = None,
     starts: int = 50,
     batch: Annotated[int | None, UNSET] = None,
     frames: Annotated[int | None, UNSET] = None,
     hold: Annotated[int | None, UNSET] = None,
-    demonstrations: int = 3000,
-    steps: int = 6000,
+    demonstrations: Annotated[int | None, UNSET] = None,
+    steps: Annotated[int | None, UNSET] = None,
     head_episodes: int = 3000,
     head_steps: int = 6000,
     cloned: Annotated[int | None, UNSET] = None,
@@ -57,7 +57,7 @@ def judge(
             success(images, first) in it tells success in place of a trained head.
         recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether they
             succeeded: the head learns from them, and episodes begin as those that are held out.
-        split: Of --recordings.
+        split: Of --recordings. Default: train.
         registry: TOML file with entries of your own.
         real: What came of policies on the real robot, with --recordings: columns policy, successes, episodes.
         starts: Held-out episodes at whose beginning every policy starts; of --recordings at most as many as are held out.
@@ -65,8 +65,8 @@ def judge(
         frames: Of an episode, instead of the task's, or of what nine of ten recorded successes needed.
         hold: Frames in a row at the goal that make a success, instead of the task's, or of 2 of --recordings, whose
             successes are taken to have reached it at their last ones.
-        demonstrations: Episodes of the scripted expert that the policies are trained on.
-        steps: Of training of each kind of policy.
+        demonstrations: Episodes of the scripted expert that the policies are trained on. Default: 3000.
+        steps: Of training of each kind of policy. Default: 6000.
         head_episodes: Recorded episodes that the success head is trained on; of --recordings at most so many are taken.
         head_steps: Of training of the success head.
         cloned: Checkpoints of behaviour cloning, 0 for none. Default: 6, with --recordings none.
@@ -94,16 +94,21 @@ def judge(
         return
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
-    rungs = (LadderConfig.cloned, LadderConfig.diffusion) if recordings is None else (0, 0)
-    cloned, diffusion = (n if m is None else m for n, m in zip(rungs, (cloned, diffusion), strict=True))
+    of_expert = {"--demonstrations": demonstrations, "--steps": steps, "--cloned": cloned, "--diffusion": diffusion}
+    usual = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
     if recordings is None:
-        for flag, value in (("--real", real), ("--registry", registry)):
+        for flag, value in (("--real", real), ("--registry", registry), ("--split", split)):
             require(value is None, f"{flag} is of robots without a true simulator: give --recordings, or leave it out")
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
         require(task == "own", f"--task {task} is of robots with a true simulator, not of --recordings")
-        require(cloned == diffusion == 0, "recordings have no expert to clone: leave --cloned and --diffusion out")
+        vain = [flag for flag, n in of_expert.items() if n not in (None, 0)]
+        require(not vain, f"recordings have no expert to clone: leave {', '.join(vain)} out")
+        usual[2:] = 0, 0
+        split = split or "train"
         judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold)
+    of_expert = {flag: n if m is None else m for n, (flag, m) in zip(usual, of_expert.items(), strict=True)}
+    demonstrations, steps, cloned, diffusion = of_expert.values()
     config = JudgeConfig(
         judged_task,
         starts,
@@ -126,11 +131,10 @@ def judge(
     draw_scatter(summary, out / "scatter.png")
     given: dict[str, Any] = {
         "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
-        "--recordings": recordings, "--split": recordings and split, "--registry": registry, "--real": real,
+        "--recordings": recordings, "--split": split, "--registry": registry, "--real": real,
         "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
-        "--hold": judged.config.task.hold, "--demonstrations": demonstrations, "--steps": steps,
-        "--head-episodes": head_episodes, "--head-steps": head_steps, "--cloned": cloned, "--diffusion": diffusion,
-        "--seed": seed, "--out": out,
+        "--hold": judged.config.task.hold, **(of_expert if recordings is None else {}),
+        "--head-episodes": head_episodes, "--head-steps": head_steps, "--seed": seed, "--out": out,
     }  # fmt: skip
     said = [x for flag, value in given.items() if value is not None for x in (flag, value)]
     page = write_page(judged, summary, out, command("judge", run, *said))

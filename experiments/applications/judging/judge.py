@@ -115,12 +115,14 @@ def _judge(
     counted: Sequence[str] = (),
 ) -> Judged:
     config = outside.config
-    for encoder in (config.ladder.encoder, config.head.encoder):
-        require_multiples(*simulator.tokenizer.image_shape, encoder.size)
     policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads  # may refuse the ladder
     users, success, about = {}, None, outside.about()
     if own is not None:
         users, success = load_own(own, robot)
+    encoders = [config.ladder.encoder] * bool(config.ladder.cloned + config.ladder.diffusion)
+    for encoder in encoders + [config.head.encoder] * (success is None):
+        require_multiples(*simulator.tokenizer.image_shape, encoder.size)
+    if own is not None:
         try_out(users, success, config.batch, simulator.tokenizer.image_shape)
         about["contents of --policies"] = short_hash(own.read_bytes())
     policies += users

@@ -98,6 +98,7 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     assert (head["unknown"], head["too short"]) == (0, 1)
     assert (head["episodes"], head["successes"], head["learnt from"], head["successes among them"]) == (4, 2, 15, 7)
     page = (out / "judge.html").read_text()
+    assert "--split train" in page and not any(flag in page for flag in ("--demonstrations", "--steps", "--cloned"))
     assert "Nothing outside the model was compared" in page and "true" not in page.split("<h1>")[1].split("<pre>")[
         0
     ].replace("true simulator", "")
@@ -119,7 +120,10 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     assert "agreement with real robot" in said(capsys)
 
 
-def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp_path, capsys, few_draws):
+def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp_path, capsys, few_draws, monkeypatch):
+    monkeypatch.setattr(
+        EncoderConfig.__init__, "__defaults__", (32, (4, 4, 4), 8)
+    )  # a head could not look at 8 x 8 pixels
     file, out = tmp_path / "told.py", tmp_path / "out"
     file.write_text(POLICIES + "\n\ndef success(images, first):\n    return np.ones(len(images), bool)\n")
     for _ in range(2):  # what is finished is found again
@@ -135,7 +139,8 @@ def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp
     ("more", "message"),
     [
         (("--task", "reach"), "--task reach is of robots with a true simulator"),
-        (("--cloned", "2"), "recordings have no expert to clone"),
+        (("--cloned", "2"), "recordings have no expert to clone: leave --cloned out"),
+        (("--steps", "9", "--demonstrations", "9"), "no expert to clone: leave --demonstrations, --steps out"),
         (("--split", "val"), "no split 'val'"),
         (("--hold", "7"), "of 20 recordings 0 succeeded and 0 failed (0 do not say, 20 have less than the 10 frames"),
         (("--frames", "0"), "--frames must be at least 1, got 0"),
@@ -149,6 +154,13 @@ def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_pat
     assert judge(study, tmp_path / "out", *more) == 2
     assert message in said(capsys, error=True)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("flag", ["--real", "--registry", "--split"])
+def test_what_is_of_recordings_is_refused_without_them(tmp_path, capsys, flag):
+    asked = ["--robot", "pusher_sand", "--out", str(tmp_path / "out"), flag, "x"]
+    assert main(["judge", str(tmp_path / "model"), *asked]) == 2
+    assert f"{flag} is of robots without a true simulator: give --recordings" in said(capsys, error=True)
 
 
 def test_counts_of_policies_that_are_not_judged_are_refused(study, tmp_path, capsys):
