@@ -9,6 +9,8 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 from matplotlib.transforms import Bbox
 
@@ -26,6 +28,12 @@ CLIPS = 6
 """Episodes that are shown."""
 
 OWN_COLOUR = "#2f7d4f"
+
+CORNERS = ((4, 4), (-4, 4), (4, -4), (-4, -4))
+"""Where a name may stand beside its point, in printer's points."""
+
+NEAR = 7
+"""Pixels from another policy's point within which a name could be taken for that one's."""
 
 MANY_BEYOND = 0.1
 """A policy of which more than this share of actions is clipped may mean them in other units."""
@@ -51,10 +59,10 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
         figure, panels = plt.subplots(
             1, len(upwards), figsize=(4.8 * len(upwards), 4.7), sharex=True, sharey=True, squeeze=False
         )
-        labels: list[list[Annotation]] = []
+        labels: list[dict[str, Annotation]] = []
         for panel, column in zip(panels[0], upwards, strict=True):
             panel.plot([0, 1], [0, 1], color=MUTED, linewidth=1, zorder=1)
-            words = []
+            words = {}
             for name, rates in summary["policies"].items():
                 x, y = rates[across], rates[column]
                 if x["mean"] is None:  # nobody counted it
@@ -69,29 +77,37 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
                     x["mean"], y["mean"], xerr=np.maximum(spread[0], 0), yerr=np.maximum(spread[1], 0), fmt="o",
                     color=colour, elinewidth=0.8, markersize=5,
                 )  # fmt: skip
-                at = (x["mean"], y["mean"])
-                left = x["mean"] > 0.85  # there is no room on the right
-                words.append(panel.annotate(
-                    name, at, (-4 if left else 4, 4), textcoords="offset points", fontsize=7, color=INK,
-                    ha="right" if left else "left",
-                ))  # fmt: skip
+                words[name] = panel.annotate(
+                    name, (x["mean"], y["mean"]), CORNERS[0], textcoords="offset points", fontsize=7, color=INK,
+                    path_effects=[withStroke(linewidth=2, foreground="white")],  # lines of intervals run below it
+                    in_layout=False,
+                )  # fmt: skip
             panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), title=titles[column], xlabel=AXES[across])
             labels.append(words)
         panels[0, 0].set_ylabel("success in the model, by the head")
         figure.tight_layout()
         figure.canvas.draw()
-        for words in labels:
-            thin_out(words)
+        for panel, words in zip(panels[0], labels, strict=True):
+            place(sorted(words.values(), key=lambda word: word.get_text() not in summary["own"]), panel)
         save(figure, path)
 
 
-def thin_out(words: Sequence[Annotation]) -> None:
-    """Hides what would be written over another word; the table has all names."""
+def place(words: Sequence[Annotation], panel: Axes) -> None:
+    """Moves each name to a corner of its point where it comes near no other point and covers no name before it, and hides
+    it where there is none: the table has all names."""
+    points = panel.transData.transform([word.xy for word in words])
     kept: list[Bbox] = []
-    for word in words:
-        box = word.get_window_extent()
-        word.set_visible(not any(box.overlaps(other) for other in kept))
-        kept += [box] if word.get_visible() else []
+    for word, own in zip(words, points, strict=True):
+        taken = kept + [Bbox(at + [[-NEAR], [NEAR]]) for at in points if (at != own).any()]
+        for across, up in CORNERS:
+            word.xyann = across, up
+            word.set(ha="left" if across > 0 else "right", va="bottom" if up > 0 else "top")
+            box = word.get_window_extent()
+            if all(map(panel.bbox.contains, *box.corners().T)) and not any(map(box.overlaps, taken)):
+                kept.append(box)
+                break
+        else:
+            word.set_visible(False)
 
 
 def say_beyond(summary: dict[str, Any]) -> str:

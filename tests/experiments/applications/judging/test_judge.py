@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from experiments.applications.judging.head import HeadConfig, HeadJudge, load_he
 from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, read_outcomes, write_outcomes
-from experiments.applications.judging.page import draw_scatter, say_beyond, write_page
+from experiments.applications.judging.page import draw_scatter, place, say_beyond, write_page
 from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
 from experiments.applications.policies.learning import FitConfig
@@ -175,6 +176,29 @@ def test_table_summary_and_page(judged, few_draws):
     draw_scatter(summary, out / "scatter.png")
     page = write_page(found, summary, out, "hma judge").read_text()
     assert page.count("<figure") == 4 and "cloned-3" in page and "http" not in page
+
+
+def test_a_name_in_the_figure_is_beside_its_own_policy_alone():
+    """Where rates lie close, a name stands at another corner of its point; without a free one the table has to do."""
+    rates = {
+        "mine": (0.98, 0.84),
+        "first": (0.98, 0.86),
+        "second": (0.96, 0.86),
+        "alone": (0.2, 0.3),
+        "twin": (0.2, 0.3),
+    }
+    figure, panel = plt.subplots(figsize=(4.8, 4.7))
+    panel.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+    words = {name: panel.annotate(name, at, (4, 4), textcoords="offset points") for name, at in rates.items()}
+    figure.canvas.draw()
+    place(list(words.values()), panel)
+    boxes = {name: word.get_window_extent() for name, word in words.items() if word.get_visible()}
+    assert {"mine", "alone", "twin"} <= set(boxes), "those that come first have the places"
+    for name, box in boxes.items():
+        assert panel.bbox.containsx(box.x0) and panel.bbox.containsx(box.x1)
+        assert not any(box.overlaps(other) for one, other in boxes.items() if one != name)
+        assert not any(box.contains(*panel.transData.transform(at)) for at in rates.values())
+    plt.close(figure)
 
 
 def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path):
