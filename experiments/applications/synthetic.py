@@ -32,6 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_pipelines.publishing.files import remove
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
 from experiments.applications import FIRST
 from experiments.applications.generating.conditions import (
@@ -92,6 +93,8 @@ OUT = Path("runs/synthetic")
 JUDGED_ON = "held_out"
 """The name of the recordings that nobody is trained on, beside those of `KINDS`."""
 
+UNDER_WAY = "under_way"
+
 SECOND = "without_actions.json"
 """What names the second control's model, in OUT."""
 
@@ -102,7 +105,7 @@ def make_data(
     lessons: Lessons, simulator: Simulator, out: Path, blind: Simulator | None = None
 ) -> dict[str, Demonstrations]:
     """The trajectories as recorded, generated, and generated under shuffled actions, and by a `blind` model if there is
-    one; made once, kept in `out`."""
+    one; made once, kept in `out`, the batches of a kind that is under way in `out`/UNDER_WAY."""
     kinds = (*KINDS, BLIND_KIND) if blind else KINDS
     sets, given = {kind: out / f"{kind}.npz" for kind in (*kinds, JUDGED_ON)}, lessons.settings.given
     if not sets["recorded"].exists():
@@ -112,22 +115,33 @@ def make_data(
     acted = dict.fromkeys(kinds, recorded.actions) | {"shuffled": others_actions(recorded)}
     for kind in kinds[1:]:
         if not sets[kind].exists():
-            made_by = blind if kind == BLIND_KIND else simulator
+            made_by, under_way = blind if kind == BLIND_KIND else simulator, out / UNDER_WAY / kind
             with step(f"replay actions: {kind}") as update:
-                images = imagine(made_by, lessons.robot, replace(recorded, actions=acted[kind]), given, update)
+                asked = replace(recorded, actions=acted[kind])
+                images = imagine(made_by, lessons.robot, asked, given, under_way, update)
             save_demonstrations(replace(recorded, images=images), sets[kind])
+    remove(out / UNDER_WAY)
     if not sets[JUDGED_ON].exists():
         save_demonstrations(lessons.record_held_out(), sets[JUDGED_ON])
     return {kind: load_demonstrations(path) for kind, path in sets.items()}
 
 
-def imagine(simulator: Simulator, robot: Robot, demos: Demonstrations, given: int, update: Report) -> np.ndarray:
-    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under its actions."""
+def imagine(
+    simulator: Simulator, robot: Robot, demos: Demonstrations, given: int, kept: Path, update: Report
+) -> np.ndarray:
+    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under its actions. Every batch
+    is kept in the directory `kept`, and found there again."""
+    kept.mkdir(parents=True, exist_ok=True)
     trajectories, images = as_trajectories(demos, robot), np.zeros_like(demos.images)
     for first in range(0, len(demos), len(simulator)):
-        rows = range(first, min(first + len(simulator), len(demos)))
-        for i, made in zip(rows, replay(simulator, robot, [trajectories[i] for i in rows], rows, given), strict=True):
-            images[i, : len(made)] = made
+        rows, path = range(first, min(first + len(simulator), len(demos))), kept / f"{first}.npz"
+        if path.exists():
+            images[first : rows.stop] = load_demonstrations(path).images
+        else:
+            made = replay(simulator, robot, [trajectories[i] for i in rows], rows, given)
+            for i, frames in zip(rows, made, strict=True):
+                images[i, : len(frames)] = frames
+            save_demonstrations(replace(demos, images=images).take(rows), path)
         update(rows.stop, len(demos), "trajectories")
     return images
 

@@ -103,6 +103,24 @@ def recordings(tmp_path_factory):
     return str(directory)
 
 
+def made_where_it_was_stopped(lessons, simulator, out: Path, monkeypatch) -> dict[str, Demonstrations]:
+    """What `make_data` gives where a kill came upon its second batch; the first is not made again."""
+    replay, made = synthetic.replay, []
+
+    def stopped(_, __, trajectories, rows, ___):
+        made.append(list(rows))
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return replay(_, __, trajectories, rows, ___)
+
+    monkeypatch.setattr(synthetic, "replay", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        make_data(lessons, simulator, out)
+    data = make_data(lessons, simulator, out)
+    assert made == [[0, 1], [2, 3], [2, 3], [4], [0, 1], [2, 3], [4]] and not (out / synthetic.UNDER_WAY).exists()
+    return data
+
+
 def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordings, tmp_path, monkeypatch):
     encoder = EncoderConfig(size=8, channels=(4, 4, 4), hidden=8)
     monkeypatch.setattr(synthetic, "BcConfig", partial(BcConfig, encoder=encoder))
@@ -112,7 +130,7 @@ def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordin
         open_trajectories(recordings, split, robot, {}, simulator.tokenizer, tmp_path)[0] for split in ("train", "val")
     )
     lessons = RecordedLessons(Training(trajectories=5, seeds=(0,), steps=2, given=2), robot, train, val)
-    data = make_data(lessons, simulator, tmp_path)
+    data = made_where_it_was_stopped(lessons, simulator, tmp_path, monkeypatch)
     recorded, generated = data["recorded"], data["generated"]
     for i in range(5):
         length = len(train[i])
@@ -146,8 +164,8 @@ def test_the_second_control_is_a_model_without_actions_which_shows_the_same_unde
     images, acted = rng.integers(0, 256, (2, 4, 8, 8, 3), np.uint8), rng.uniform(-1, 1, (2, 4, 2)).astype(np.float32)
     demos = Demonstrations(images, acted, 4 * ones, np.ones((2, 4), bool), ones > 0, ones)
     shown = [
-        synthetic.imagine(blind, robot, replace(demos, actions=a), 1, lambda *_: None)
-        for a in (acted, others_actions(demos))
+        synthetic.imagine(blind, robot, replace(demos, actions=a), 1, tmp_path / str(i), lambda *_: None)
+        for i, a in enumerate((acted, others_actions(demos)))
     ]
     np.testing.assert_array_equal(*shown)
     assert (shown[0][:, 1:] != images[:, 1:]).any()
