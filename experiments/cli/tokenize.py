@@ -15,6 +15,7 @@ from experiments.progress import console, tidy_table
 from experiments.running.workspace import Busy, Workspace
 from experiments.setting import Setting, StudyArguments, make_setting, short
 from experiments.wrote import wrote
+from hma_jax.config import require
 
 
 def tokenize(
@@ -45,6 +46,8 @@ def prepare_together(
     """Everything up to training. If another command prepares the same directory, takes part in its tokenising."""
     from experiments.preparing.pipeline import prepare
 
+    for option, value in (("--batch", batch), ("--threads", threads)):  # before a tokenizer is trained for hours
+        require(value is None or value >= 1, f"{option} must be at least 1, got {value}")
     with ExitStack() as stack:
         try:
             stack.enter_context(setting.workspace.locked())

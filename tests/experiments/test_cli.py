@@ -76,6 +76,8 @@ def test_help_needs_no_jax():
         (["tokenizer", "pixels", "--out", "{file}"], 2, "{file} exists already"),
         (["tokenizer", "pixels", "--out", "{empty}/t", "--patch", "7"], 2, "64 is not a multiple of 7"),
         (["tokenize", "--preset", "smoke", "--tokenizer", "{empty}"], 2, "hma tokenizer import"),
+        (["tokenize", "--preset", "smoke", "--out", "{empty}", "--batch", "0"], 2, "--batch must be at least 1, got 0"),
+        (["tokenize", "--preset", "smoke", "--out", "{empty}", "--threads", "-3"], 2, "--threads must be at least 1"),
         (["convert", "from-official", "{empty}", "--out", "{empty}/run"], 2, "{empty}/config.json"),
         (["convert", "to-official", "{empty}", "--out", "{empty}/x"], 2, "{empty}/checkpoints"),
         (["convert", "from-safetensors", "{empty}", "--out", "{empty}/x"], 2, "{empty}/model.json"),
