@@ -61,7 +61,7 @@ def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, 
     """Groups of two or more that are probably one recording, each in the order given."""
     if not episodes:
         return []
-    rows = np.nan_to_num(np.concatenate([e.actions for e in episodes]))
+    rows = _finite(np.concatenate([e.actions for e in episodes]))
     scale = rows.std(axis=0)
     alive = scale > 1e-6
     groups: list[list[Fingerprint]] = []
@@ -75,10 +75,15 @@ def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, 
     return [tuple(group) for group in groups if len(group) > 1]
 
 
+def _finite(actions: np.ndarray) -> np.ndarray:
+    """0 in the place of what is no number: one infinite value would make all others of its column alike."""
+    return np.nan_to_num(actions, nan=0.0, posinf=0.0, neginf=0.0)
+
+
 def _same(a: Fingerprint, b: Fingerprint, scale: np.ndarray, alive: np.ndarray) -> bool:
     if a.steps != b.steps or len(a.pictures) != len(b.pictures):
         return False
-    moves = np.abs(np.nan_to_num(a.actions) - np.nan_to_num(b.actions))[:, alive]
+    moves = np.abs(_finite(a.actions) - _finite(b.actions))[:, alive]
     if (moves > SAME_ACTIONS * scale[alive]).any():
         return False
     if not alive.any() and not (a.pictures.std(axis=(1, 2)) > SAME_PICTURE).any():

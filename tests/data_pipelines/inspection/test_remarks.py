@@ -188,5 +188,13 @@ def test_a_recording_is_known_again_compressed_and_smaller():
     assert [e.index for e in group] == [0, 1, 2]
 
 
+@pytest.mark.filterwarnings("error")
+def test_an_infinite_value_makes_no_episodes_alike():
+    actions = np.random.default_rng(0).normal(size=(4, 16, 1))
+    actions[3, 5] = np.inf
+    pictures = np.zeros((2, 16, 16))  # of a fixed camera
+    assert find_duplicates([Fingerprint("train", i, 16, pictures, one) for i, one in enumerate(actions)]) == []
+
+
 def test_real_episodes_are_not_taken_for_each_other():
     assert find_duplicates(inspect_dataset(REAL_DATA).fingerprints) == []
