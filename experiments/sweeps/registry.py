@@ -138,6 +138,8 @@ def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str)
     except (TypeError, ValueError) as error:  # ConfigError is a ValueError
         raise ConfigError(f"{where} has a setting of a wrong kind ({error})") from error
     require(same, f"{where} has a setting of a wrong kind: a list where a tuple belongs, or a number that is none")
+    for one in trial.with_source():
+        _require_fits(study, one, where)
     known = {name for one in trial.with_source() for name in one.datasets}
     for names, of, what in (
         (known, study.all_names(), "is trained on {}, which the study does not have"),
@@ -146,6 +148,25 @@ def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str)
     ):
         without = [name for name in names if name not in of]
         require(not without, f"{where} {what.format(few(without))}")
+
+
+def _require_fits(study: Study, trial: Trial, where: str) -> None:
+    """Raises ConfigError for a trial that a study of its settings would be refused for, and for one that is to be
+    judged on other windows than those that the study freezes."""
+    own = {name: getattr(trial, name) for name in ("model", "eval", "tau", "rate", "weighed")}
+    try:
+        replace(study, train=replace(trial.train, seed=0), **own)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    for what, here, there in (
+        ("rate", trial.rate, study.rate),
+        ("eval.windows_per_dataset", trial.eval.windows_per_dataset, study.eval.windows_per_dataset),
+    ):
+        require(
+            here == there,
+            f"{where} has {what} {here}, and all trials of a study are judged on the same windows, which are frozen for "
+            f"{there}: compare two studies with --set {what}=... and an --out of their own",
+        )
 
 
 def _require_distinct(sweep: Sweep, where: str) -> None:

@@ -168,6 +168,16 @@ def plan(study):
             OWN.format("replace(trial, datasets=('toto',), evaluated=('toto',)) if x == 1 else trial"),
             "trained on toto, wh",
         ),
+        (OWN.format("replace(trial, tau=x - 1.0 if x == 1 else trial.tau)"), "trial at 1: tau must be positive, got 0"),
+        (
+            OWN.format("replace(trial, model=replace(trial.model, factor_vocab=5 + x)) if x == 1 else trial"),
+            "trial at 1: model.factor_vocab is 6 but the tokenizer makes",
+        ),
+        (OWN.format("replace(trial, rate=float(x)) if x == 1 else trial"), "has rate 1.0, and all .* frozen for 2.0"),
+        (
+            OWN.format("replace(trial, eval=replace(trial.eval, windows_per_dataset=x)) if x == 1 else trial"),
+            "has eval.windows_per_dataset 1, and all trials of a study",
+        ),
         (POINTS.format("reference_trial(study, 0)"), "point 1 has to be a Point with a Trial, and has a Trial"),
         (POINTS.format("Point('wide', reference_trial(study, 0))"), "position 'wide' of point 1 is no number"),
         (EDITED.format("role='extra'"), "role of point 1 has to be one of .*'control'.*, and is 'extra'"),
