@@ -36,7 +36,8 @@ def make_remarks(
     duplicates: Sequence[tuple[Fingerprint, ...]],
 ) -> list[Remark]:
     """Everything that stands out of the sampled episodes. `entry`: how the dataset would be read."""
-    remarks = [*_damaged(facts), *_misfits(facts, entry), *_windows(facts, windows), *_cameras(facts, entry)]
+    remarks = [*_damaged(facts), *_misfits(facts, entry), *_rate(facts, entry)]
+    remarks += [*_windows(facts, windows), *_cameras(facts, entry)]
     for field in chosen_actions(facts, entry):
         remarks += _actions(field, entry)
     return [*remarks, *_duplicates(duplicates)]
@@ -81,6 +82,13 @@ def _misfits(facts: Facts, entry: DatasetSpec | None) -> list[Remark]:
     there = [c.key for c in facts.cameras] + [f"{key} ({n})" for key, n in sizes.items()]
     text = f"the registry's entry wants {', '.join(missing)}; there are {', '.join(there) or 'neither'}"
     return [Remark("bad", MISFIT, text)]
+
+
+def _rate(facts: Facts, entry: DatasetSpec | None) -> list[Remark]:
+    """Formats that say their rate say it of the recording; another one makes another stride of it."""
+    if entry is None or facts.hz is None or facts.hz == entry.hz:
+        return []
+    return [Remark("doubt", "another rate", f"its files say {facts.hz:g} Hz; {entry.hz:g} Hz are taken")]
 
 
 def _windows(facts: Facts, windows: WindowFacts | None) -> list[Remark]:

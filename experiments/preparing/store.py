@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source, open_source
-from experiments.progress import Pace, step
+from experiments.progress import Pace, console, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.words import few
@@ -39,6 +39,7 @@ def make_store(
 
     made_with, settings = load_tokenizer(tokenizer or workspace.tokenizer), to_dict(study.store)
     require_same("tokens", workspace.store, _differences(study, workspace, sources, made_with), replace)
+    _say_other_rates(study, sources)
     how = {k: v for k, v in (("batch", batch), ("threads", threads)) if v is not None}
     workspace.store.mkdir(parents=True, exist_ok=True)
 
@@ -55,6 +56,21 @@ def make_store(
     with step(f"tokenise {len(sources)} dataset(s)") as update:
         for i in [i for i in range(len(sources)) if not make(i, wait=False)]:
             make(i, wait=True)
+
+
+def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
+    """Of datasets whose files say another native rate than their entry, which counts."""
+    from data_pipelines.sources.open import find_format
+
+    for spec, path in sources:
+        own = None if find_format(path) == "rlds" else open_source((spec, path), study.store).hz  # RLDS says none
+        if own not in (None, spec.hz):
+            console.print(
+                f"note: {spec.name}: its files say {own:g} Hz, its entry {spec.hz:g} Hz, which is what counts; if the "
+                "files are right, correct the entry",
+                markup=False,
+                soft_wrap=True,
+            )
 
 
 def _differences(study: Study, workspace: Workspace, sources: Sequence[Source], tokenizer: Tokenizer) -> list[str]:

@@ -24,14 +24,23 @@ def test_lerobot_and_robomimic_go_from_inspection_and_view_to_tokens(tmp_path, c
         assert main(["data", "inspect", place, "--entry", str(entries), "--frames", "2", *sheets]) == 0
         assert "Hz: stride" in capsys.readouterr().out  # the files say the rate
     assert main(["data", "view", *data, "--frames", "2", "--out", str(tmp_path / "first.html")]) == 0
-    assert "rate unknown" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "rate unknown" not in said and "another rate" not in said
     # These recordings are short, and frames of one colour look blank, as real ones would not.
     text = entries.read_text().replace("video_targets = false\n", "")
     entries.write_text(text.replace("hz = 20.0", "hz = 4.0"))
     page = tmp_path / "page.html"
     assert main(["data", "view", *data, "--registry", str(entries), "--out", str(page)]) == 0 and page.is_file()
+    assert "robomimic_lift: another rate: its files say 20 Hz; 4 Hz are taken" in capsys.readouterr().out
+    assert main(["data", "inspect", data[1], "--registry", str(entries), *sheets]) == 0
+    assert "rate 4 Hz (registry), though its files say 20: stride 2" in capsys.readouterr().out
     common = ["--preset", "smoke", "--out", str(tmp_path / "out"), "--registry", str(entries), "--data", *data]
     assert main(["tokenize", *common, "--set", "model.frames=4"]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    assert notes == [
+        "note: robomimic_lift: its files say 20 Hz, its entry 4 Hz, which is what counts; if the files are right, correct the "
+        "entry"
+    ]
     for name, keys in (("toy_arm", "observation/top"), ("robomimic_lift", "observation/agentview")):
         manifest = json.loads((tmp_path / "out" / "tokens" / name / "manifest.json").read_text())
         assert manifest["spec"]["image_key"] == keys and manifest["runs"]

@@ -141,8 +141,11 @@ def data_inspect(
     if rate:
         stride = dataclasses.replace(taken, hz=rate).stride if taken else stride_of(rate)
         windows = window_facts(facts, stride, frames)
+        source = "" if hz or not taken else " (registry)"
+        if facts.hz not in (None, rate):
+            source += f", though its files say {facts.hz:g}"
         console.print(
-            f"[bold]rate[/] {rate:g} Hz{'' if hz or not taken else ' (registry)'}: stride {stride}, "
+            f"[bold]rate[/] {rate:g} Hz{source}: stride {stride}, "
             f"{rate / stride:.2f} Hz; a whole window of {frames} frames takes {windows.native} steps, the shortest "
             f"{windows.needed}, which {windows.long_enough} of {facts.sampled} sampled episodes have; about "
             f"{windows.total:,.0f} windows in the split"
