@@ -6,6 +6,7 @@ import io
 import tempfile
 import zipfile
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -109,11 +110,11 @@ class Recording:
 
 
 def encode_video(images: Sequence[np.ndarray], rate: float) -> bytes:
-    """MP4 of frames uint8 [H, W, 3], enlarged, about `rate` of them per second. ConfigError where PyAV is missing."""
+    """MP4 of frames uint8 [H, W, 3], enlarged, `rate` of them per second. ConfigError where PyAV is missing."""
     av = require_module("av", "a video")
     file = io.BytesIO()
     with av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=max(round(rate), 1))
+        stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
         height, width = (ENLARGED * side for side in images[0].shape[:2])
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": "16"}

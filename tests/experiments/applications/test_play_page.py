@@ -118,6 +118,23 @@ def test_keys_move_the_robot_and_letting_go_stops_it(browsing):
     browsing(test)
 
 
+def test_keys_drive_once_the_rate_is_chosen(browsing):
+    """And do not choose another one."""
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        await page.focus("#rate")
+        await page.select_option("#rate", "15")
+        await page.keyboard.down("ArrowRight")
+        here = await count(page)
+        await page.wait_for_function(f"document.body.dataset.count > {here + 2}")
+        pressed = (await actions(client))[0][:2]
+        assert pressed[0] > 1 and pressed[1] == 0, pressed
+        assert await page.input_value("#rate") == "15" and not page.faults
+
+    browsing(test)
+
+
 def test_a_slider_sets_its_dimension_and_rewinding_goes_back(browsing):
     async def test(browser, address, client):
         page = await opened(browser, address)

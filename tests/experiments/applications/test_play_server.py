@@ -495,12 +495,16 @@ def test_a_recording_is_a_video_and_a_dataset(tmp_path):
     serving(test)
 
 
-@pytest.mark.parametrize(("hz", "said"), [(10.0, 5.0), (0.0, None)])
+@pytest.mark.parametrize(("hz", "said"), [(10.0, 5.0), (5.0, 2.5), (0.0, None)])
 def test_a_recording_says_its_rate_where_it_is_known(hz, said):
     recording = Recording(Robot("arm", 2, (0.0,), (1.0,), (0.0,), hz=hz))
     recording.add(np.zeros((8, 8, 3), np.uint8), np.zeros((2, 1)), np.zeros((8, 8, 3), np.uint8))
     metadata = json.loads(zipfile.ZipFile(io.BytesIO(recording.dataset())).read("arm_played/1.0.0/metadata.json"))
     assert metadata.get("hz") == said
+    import av
+
+    with av.open(io.BytesIO(recording.video())) as container:
+        assert container.streams.video[0].average_rate == (said or 2), "the film is not in the robot's own time"
 
 
 def _episodes(directory):
