@@ -158,9 +158,10 @@ def write_clip(seen: Mapping[str, Seen], path: Path, hz: float) -> None:
     model."""
     columns = [np.concatenate([one.true[:, 0], one.model[:, 0]], axis=1) for one in seen.values()]
     film = np.concatenate(columns, axis=2)
-    palette = Image.fromarray(np.concatenate(film)).quantize(COLOURS)
-    frames = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in film]
-    larger = [frame.resize((ZOOM * frame.width, ZOOM * frame.height), Image.Resampling.NEAREST) for frame in frames]
+    size = (ZOOM * film.shape[2], ZOOM * film.shape[1])
+    smooth = [Image.fromarray(frame).resize(size, Image.Resampling.BICUBIC) for frame in film]  # as the page shows them
+    palette = Image.fromarray(np.concatenate(smooth)).quantize(COLOURS)
+    larger = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in smooth]
     content = io.BytesIO()
     larger[0].save(content, "GIF", save_all=True, append_images=larger[1:], duration=round(1000 / hz), loop=0)
     write_file(path, content.getvalue())
