@@ -20,6 +20,7 @@ from data_pipelines.registry import DatasetSpec
 from data_pipelines.sources.open import find_format, open_source, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
+from data_pipelines.sources.robomimic import RobomimicSource
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
@@ -139,6 +140,21 @@ def test_what_is_lost_of_a_robomimic_file_does_not_say_where_it_lies(tmp_path):
         made.append(tokenize_dataset(VIEW, path, FakeTokenizer(), tmp_path / place / "store", corrupt="skip"))
     assert made[0].skipped[0].reason.startswith("image.hdf5: data/demo_10/obs/agentview_image is not there")
     assert made[0].hash() == made[1].hash()
+
+
+def test_pictures_of_a_robomimic_file_that_are_drawn_anew_are_another_source(tmp_path):
+    """Of the same states and as many bytes: tokens and conversions of those before were taken for theirs."""
+
+    def redraw(file):
+        for demo in file["data"].values():
+            demo["obs/agentview_image"][...] = 255 - demo["obs/agentview_image"][...]
+
+    before = write_robomimic(tmp_path / "image.hdf5")
+    (tmp_path / "new").mkdir()
+    after = write_robomimic(tmp_path / "new" / "image.hdf5", change=redraw)
+    assert before.stat().st_size == after.stat().st_size
+    assert open_source(before).fingerprint() != open_source(after).fingerprint()
+    assert RobomimicSource(before).identity() != RobomimicSource(after).identity()
 
 
 def test_damage_inside_of_a_robomimic_file_is_named(tmp_path):
