@@ -116,7 +116,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
         f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}",
         soft_wrap=True, highlight=False, markup=False,
     )  # fmt: skip
-    wrote(path, then=f"git add {shlex.quote(short(path))} && git commit, and only then run the trials")
+    wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit, and only then run the trials")
 
 
 def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float) -> tuple[Curve, list[Place]]:
