@@ -35,7 +35,9 @@ def spearman(true: np.ndarray, learned: np.ndarray) -> float:
 
 
 def rank_violation(true: np.ndarray, learned: np.ndarray) -> float:
-    """Mean maximum rank violation; 0 where both order the policies alike."""
+    """Mean maximum rank violation; 0 where both order the policies alike, nan where the true rates have no order."""
+    if np.ptp(true) == 0:
+        return math.nan
     gap = np.abs(true[:, None] - true[None])
     wrong = np.sign(true[:, None] - true[None]) != np.sign(learned[:, None] - learned[None])
     return float(np.where(wrong, gap, 0.0).max(1).mean())

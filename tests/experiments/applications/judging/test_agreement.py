@@ -14,7 +14,7 @@ def test_measures_of_known_cases():
     # 0.5 and 0.6 are exchanged; the others are as they should be.
     assert rank_violation(np.array([0.1, 0.5, 0.6]), np.array([0.0, 0.9, 0.8])) == pytest.approx(0.2 / 3)
     assert rank_violation(np.array([0.8, 0.2]), np.array([0.5, 0.5])) == pytest.approx(0.6)
-    assert np.isnan(pearson(true, np.ones(4)))
+    assert np.isnan(pearson(true, np.ones(4))) and np.isnan(rank_violation(np.ones(4), true))
     alike = np.full(11, 0.86)
     assert (alike - alike.mean()).any() and np.isnan(pearson(np.arange(11.0), alike))
 
