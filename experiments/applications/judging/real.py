@@ -24,15 +24,16 @@ class Count(NamedTuple):
 def read_real(path: Path) -> dict[str, Count]:
     """{policy: its count}. Raises ConfigError, naming the line, for what is none."""
     try:
-        with open(path, newline="") as file:
-            rows = list(csv.DictReader(file))
+        with open(path, newline="", encoding="utf-8-sig") as file:  # spreadsheets begin a file with a byte order mark
+            reader = csv.DictReader(file)
+            rows = [(reader.line_num, row) for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{path} cannot be read as counts of the real robot ({error})") from error
-    there = list(rows[0]) if rows else []
+    there = list(rows[0][1]) if rows else []
     missing = [name for name in COLUMNS if name not in there]
     require(not missing, f"{path}: no column {', '.join(missing)}, or no row; a row has {', '.join(COLUMNS)}")
     found: dict[str, Count] = {}
-    for line, row in enumerate(rows, start=2):
+    for line, row in rows:
         name = row["policy"]
         try:
             count = Count(int(row["successes"]), int(row["episodes"]))

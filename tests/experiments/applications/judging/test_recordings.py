@@ -178,7 +178,7 @@ def test_counts_of_policies_that_are_not_judged_are_refused(study, tmp_path, cap
         ("policy,successes,episodes\na,1,\n", "line 2: successes and episodes of a are whole numbers"),
         ("policy,successes,episodes\na,0.5,1\n", "line 2: successes and episodes of a are whole numbers"),
         ("policy,successes,episodes\na,1,2\nb,3,2\n", "line 3: b cannot succeed in 3 of 2"),
-        ("policy,successes,episodes\na,1,2\na,1,2\n", "line 3: a has a line before"),
+        ("policy,successes,episodes\na,1,2\n\na,1,2\n", "line 4: a has a line before"),
         ("policy,successes,episodes\na,1,2\nb,1,2\n", "has 2 policies; an order to compare needs at least 3"),
     ],
 )
@@ -187,6 +187,13 @@ def test_counts_that_are_none_are_named_to_the_line(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         read_real(path)
+
+
+def test_counts_are_read_as_a_spreadsheet_saves_them(tmp_path):
+    """With a byte order mark, and an end of line of its own."""
+    path = tmp_path / "real.csv"
+    path.write_bytes("\ufeffpolicy,successes,episodes\r\na,1,2\r\nb,0,2\r\nc,2,2\r\n".encode())
+    assert read_real(path) == {"a": (1, 2), "b": (0, 2), "c": (2, 2)}
 
 
 def test_every_format_says_how_long_a_recording_is_and_whether_it_succeeded(tmp_path):
