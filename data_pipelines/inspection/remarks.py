@@ -57,10 +57,10 @@ def chosen_actions(facts: Facts, entry: DatasetSpec | None) -> list[ActionFacts]
 
 
 def _damaged(facts: Facts) -> list[Remark]:
-    lost = [
-        Remark("bad", "cannot be read", f"{count} of the episodes drawn: {reason}")
-        for reason, count in facts.damaged.items()
-    ]
+    damaged = list(facts.damaged.items())
+    lost = [Remark("bad", "cannot be read", f"{count} of the episodes: {reason}") for reason, count in damaged[:NAMED]]
+    if rest := sum(count for _, count in damaged[NAMED:]):
+        lost.append(Remark("bad", "cannot be read", f"{rest:,} more episodes, for {len(damaged) - NAMED} more reasons"))
     short = sum(n < 2 for n in facts.steps)
     if short:
         lost.append(Remark("doubt", "single steps", f"{short} episodes of {facts.sampled} have one step: no motion"))

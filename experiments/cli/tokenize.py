@@ -17,6 +17,9 @@ from experiments.setting import Setting, StudyArguments, make_setting, short
 from experiments.wrote import wrote
 from hma_jax.config import require
 
+NAMED = 6
+"""Losses of a dataset that are said one by one: of one that was fetched in part every shard may be one."""
+
 
 def tokenize(
     asked: OmitArgPrefixes[StudyArguments],
@@ -120,6 +123,7 @@ def show_store(workspace: Workspace, rate: float | None) -> None:
     import numpy as np
 
     from data_pipelines.errors import without_advice
+    from data_pipelines.tokens.manifest import FILE
     from data_pipelines.tokens.store import TokenStore
 
     store = TokenStore(workspace.store)
@@ -143,5 +147,10 @@ def show_store(workspace: Workspace, rate: float | None) -> None:
         )
     console.print(table)
     for name in store.names:
-        for loss in store.manifest(name).skipped:
+        losses = store.manifest(name).skipped
+        for loss in losses[:NAMED]:
             console.print(f"[yellow]lost[/] {name}: {escape(without_advice(loss.reason))}", soft_wrap=True)
+        if rest := sum(loss.episodes for loss in losses[NAMED:]):
+            console.print(
+                f"[yellow]lost[/] {name}: {rest:,} more, see {short(store.root / name / FILE)}", soft_wrap=True
+            )

@@ -17,7 +17,7 @@ from data_pipelines.publishing.claims import claim
 from data_pipelines.tokens import part_maker
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from experiments.cli.main import main
-from experiments.cli.tokenize import show_store
+from experiments.cli.tokenize import NAMED, show_store
 from experiments.preparing import sources
 from experiments.progress import Pace
 from experiments.running.workspace import Workspace
@@ -165,6 +165,20 @@ def test_the_stride_that_is_told_is_the_studys(rate, stride, tmp_path, capsys):
     show_store(Workspace(tmp_path), rate)
     (line,) = [line for line in capsys.readouterr().out.splitlines() if spec.name in line]
     assert line.split()[-2:] == ["10", stride]
+
+
+def test_of_many_losses_some_are_named(tmp_path, capsys):
+    """Every shard that is missing is one, where a dataset of hundreds was fetched in part."""
+    rlds = write_rlds(tmp_path, ARM, [12] * 60, shards=20)
+    for shard in sorted(rlds.glob("*tfrecord*"))[8:]:
+        shard.unlink()
+    tokenize_dataset(ARM, rlds, FakeTokenizer(), tmp_path / "tokens", corrupt="skip", max_skipped=0.9)
+    show_store(Workspace(tmp_path), 2.0)
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith(f"lost {ARM.name}: ")]
+    assert len(told) == NAMED + 1 and told[-1].startswith(f"lost {ARM.name}: 18 more, see ")
+    assert main(["data", "inspect", str(rlds), "--hz", "5", "--out", str(tmp_path / "sheet")]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("damaged ")]
+    assert len(told) == 7 and told[-1] == "damaged 18 more episode(s): --json FILE names all"
 
 
 def test_time_left_does_not_count_what_was_there_before():

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 SHEET = "contact_sheet.png"
 
+NAMED = 6
+"""Damaged places that are said one by one: of a dataset that was fetched in part every shard may be one."""
+
 
 def data_list(
     words: Annotated[Positional[tuple[str, ...]], arg(metavar="[WORD ...]")] = (),
@@ -178,8 +181,11 @@ def print_facts(facts: Facts) -> None:
         f"{', no more: they are large' if facts.stopped else ''})",
         soft_wrap=True,
     )
-    for reason, count in facts.damaged.items():
+    damaged = list(facts.damaged.items())
+    for reason, count in damaged[:NAMED]:
         console.print(f"[yellow]damaged[/] {count} episode(s): {escape(reason)}", soft_wrap=True)
+    if rest := sum(count for _, count in damaged[NAMED:]):
+        console.print(f"[yellow]damaged[/] {rest:,} more episode(s): --json FILE names all", soft_wrap=True)
     splits = tidy_table("Splits", "split", "episodes", "shards", "MB")
     for s in facts.splits:
         splits.add_row(s.name, f"{s.episodes:,}", f"{s.shards:,}", f"{s.bytes / 1e6:,.1f}")

@@ -81,7 +81,7 @@ def test_actions_and_frames_of_different_number(tmp_path):
             features["steps/action"] = features["steps/action"][:-1]
 
     found = remarks_of(tmp_path, change)
-    assert found["cannot be read"].startswith("bad: 1 of the episodes drawn") and "action 19" in found["cannot be read"]
+    assert found["cannot be read"].startswith("bad: 1 of the episodes:") and "action 19" in found["cannot be read"]
 
 
 def test_numbers_that_are_not_finite(tmp_path):
