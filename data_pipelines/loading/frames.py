@@ -65,16 +65,17 @@ def make_frame_loader(
         source = open_source(directory, spec.split, corrupt=corrupt, max_skipped=max_skipped, files=files)
         source.check_keys(spec.image_key, spec.action_keys, spec.action_dims)
         bounds = (val_fraction, min_val, max_val, max_val_fraction)
-        mask = held_out_episodes(spec, source.runs, *bounds)[source.numbers]
+        all_held_out = held_out_episodes(spec, source.runs, *bounds)
+        mask = all_held_out[source.numbers]
         episodes = np.flatnonzero(mask if split == "val" else ~mask)
         counts[spec.name] = len(episodes)
         if not len(episodes):
             reasons[spec.name] = f"it has no {split} episode"
             if split == "val":
-                reasons[spec.name] += (
-                    f": of {len(mask)} none is held out, for which there must be at least two; val_fraction="
-                    f"{val_fraction:g}, min_val={min_val} and max_val={max_val} say how many are"
-                )
+                bound = f"val_fraction={val_fraction:g}, min_val={min_val} and max_val={max_val} say how many are"
+                lost = f"the {all_held_out.sum():,} of its {len(all_held_out):,} that are held out are all lost"
+                none = f"of {len(mask)} none is held out, for which there must be at least two"
+                reasons[spec.name] += f": {lost if all_held_out.any() else none}; {bound}"
             continue
         order = stream_seed(seed, "frames", split, spec.name)
         streams[spec.name] = _Stream(source, spec.image_key, episodes, order)

@@ -96,11 +96,17 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
     """Raises DataError, saying what would help, if not one window is left."""
     if any(len(s) for s in sets.values()):
         return
+    split = next(iter(sets.values())).split
     reasons = "; ".join(f"{name}: {s.shortage()}" for name, s in sets.items())
+    if not any(s.longest for s in sets.values()):
+        raise DataError(
+            f"there is no {split} episode to cut windows of. {reasons}. How many there are say store.val_fraction, "
+            "store.min_val and store.max_val; those may be lost."
+        )
     shorter = " or a shorter prompt" if any(s.least > TO_TRAIN for s in sets.values()) else ""
     raise DataError(
-        f"no {next(iter(sets.values())).split} episode is long enough for a window. {reasons}. Use a higher rate of "
-        f"frames{shorter}, or datasets with more or longer episodes."
+        f"no {split} episode is long enough for a window. {reasons}. Use a higher rate of frames{shorter}, or datasets "
+        "with more or longer episodes."
     )
 
 
