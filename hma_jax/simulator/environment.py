@@ -215,11 +215,11 @@ class RobotVectorEnv(VectorEnv):
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         simulator, again = self._task.simulator, self._over.copy()
-        simulator.step([None if over else action for action, over in zip(actions, again, strict=True)])
+        which = np.flatnonzero(again).tolist()
+        simulator.step([None if b in which else action for b, action in enumerate(actions)])
         clipped = np.array([bool(names) for names in simulator.clipped])
         rewards, done = self._task.judge(simulator)  # before others begin: a start does not count, as after `reset`
-        if again.any():
-            which = np.flatnonzero(again).tolist()
+        if which:
             self._task.begin([self._rngs[b] for b in which], which, None)
         self._steps = np.where(again, 0, self._steps + 1)
         terminated = done & ~again

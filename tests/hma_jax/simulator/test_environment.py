@@ -174,6 +174,8 @@ def test_each_episode_of_a_vector_may_have_its_own_seed():
     np.testing.assert_array_equal(again[0], shown[0][0])
     with pytest.raises(ConfigError, match="3 episodes need as many seeds, got 2"):
         env.reset(seed=[1, 2])
+    with pytest.raises(ConfigError, match="3 episodes need as many actions, got 2"):
+        env.step(low[:2])
 
 
 def test_a_part_of_a_vector_begins_anew_where_a_mask_says_so():
