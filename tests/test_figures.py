@@ -19,6 +19,9 @@ from experiments.applications.policies.tasks import Task
 from experiments.bench.beside import OURS, RELEASED, THEIRS
 from experiments.bench.record import read_record
 from experiments.rows import OVERALL, Row, read_csv
+from hma_jax.config import EvalConfig
+from hma_jax.evaluation.summary import summarise
+from hma_jax.evaluation.windows import WindowTable
 from tests.pages import table
 
 ROOT = Path(__file__).parents[1]
@@ -226,6 +229,34 @@ def planned(name: str) -> dict[str, dict[str, str]]:
     with (ROOT / "experiments" / "results" / name / "summary.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {row["way"]: {key: row[key] for key in ("mean", "low", "high")} for row in rows}
+
+
+def test_the_page_of_the_simulator_gives_what_its_windows_say():
+    by_label = {
+        "perplexity": ("perplexity", 2),
+        "PSNR (dB)": ("psnr", 2),
+        "SSIM": ("ssim", 3),
+        "LPIPS": ("lpips", 3),
+        "ΔPSNR (dB)": ("delta_psnr", 2),
+        "action-nats": ("action_nats", 2),
+        "counterfactual gain (dB, [what it is](statistics.md))": ("counterfactual_gain", 2),
+    }
+    cells = table(ROOT / "docs" / "simulator.md", "| | simulator_grown | simulator_weighed |")
+    assert cells.keys() == by_label.keys()
+    place = ROOT / "experiments" / "results" / "simulator_protocol"
+    judged = {name: WindowTable.load(place / name / "windows.parquet") for name in ("grown", "weighed", "first")}
+    of = {name: summarise(windows, EvalConfig.perplexity_group) for name, windows in judged.items()}
+    for label, (metric, digits) in by_label.items():
+        shown_of = [of[name].overall[metric] for name in judged]
+        if copied := of["grown"].overall.get(f"{metric}_copy"):
+            shown_of.append(copied)
+        texts = [f"{stat.mean:.{digits}f} ± {stat.sem:.{digits}f}" for stat in shown_of]
+        assert [cell for cell in cells[label] if cell] == texts, label
+    assert all((windows.metrics["retrieval"] == 1).all() for windows in judged.values())
+    beaten = {
+        name: [d for d, s in by.datasets.items() if s["lpips"].mean > s["lpips_copy"].mean] for name, by in of.items()
+    }
+    assert beaten == {"grown": [], "weighed": ["omni_chalk"], "first": ["omni_chalk"]}
 
 
 def test_readme_is_read_in_a_few_minutes():

@@ -28,7 +28,8 @@ from hma_jax.simulator.starts import Start
 
 ID = "HMA/Robot-v0"
 MAX_STEPS = 200
-"""Frames after which an episode is truncated, unless `gymnasium.make` or `make_vec` are told other `max_episode_steps`."""
+"""Frames after which an episode is truncated, unless `gymnasium.make` or `gymnasium.make_vec` is told other
+`max_episode_steps`."""
 
 
 def action_space(robot: Robot) -> gymnasium.spaces.Box:
