@@ -124,13 +124,7 @@ def plan_dataset(
     rate: float | None = FRAME_RATE,
 ) -> Manifest:
     """The manifest of a dataset before it is made. Raises ConfigError for settings that cannot work."""
-    stride = spec.stride_at(rate)
-    frame_step = stride if frame_step is None else frame_step
-    require(
-        frame_step >= 1 and stride % frame_step == 0,
-        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {stride} of "
-        f"{rate_in_words(rate if spec.rate is None else spec.rate)}",
-    )
+    frame_step = stored_step(spec, frame_step, rate)
     return Manifest(
         spec=spec.facts(),
         tokenizer=tokenizer_facts(tokenizer),
@@ -144,6 +138,19 @@ def plan_dataset(
         runs=source.runs,
         recipe=RECIPE,
     )
+
+
+def stored_step(spec: DatasetSpec, frame_step: int | None, rate: float | None = FRAME_RATE) -> int:
+    """Every how many native frames one is stored: `frame_step`, or the stride at `rate` Hz (None: native) if it is None.
+    Raises ConfigError for a step that does not divide that stride."""
+    stride = spec.stride_at(rate)
+    frame_step = stride if frame_step is None else frame_step
+    require(
+        frame_step >= 1 and stride % frame_step == 0,
+        f"dataset {spec.name!r}: frame_step {frame_step} does not divide the stride {stride} of "
+        f"{rate_in_words(rate if spec.rate is None else spec.rate)}",
+    )
+    return frame_step
 
 
 def tokenizer_facts(tokenizer: Tokenizer) -> TokenizerFacts:

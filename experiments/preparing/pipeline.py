@@ -13,7 +13,7 @@ from pathlib import Path
 
 from experiments.preparing.counterfactual import make_counterfactual
 from experiments.preparing.made_from import Step
-from experiments.preparing.sources import find_sources
+from experiments.preparing.sources import check_sources, find_sources
 from experiments.preparing.store import make_store
 from experiments.preparing.suite import make_suite
 from experiments.preparing.tokenizer import adopt_tokenizer, make_tokenizer
@@ -46,6 +46,7 @@ def prepare(
         require_lpips()  # before all that the evaluation comes after
     require_same_windows(study, workspace, replace)
     sources = find_sources(study, data) if data else make_suite(study, workspace, replace)
+    check_sources(study, sources)
     if tokenizer is None:
         make_tokenizer(study, workspace, sources, replace)
     else:

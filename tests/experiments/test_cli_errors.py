@@ -19,8 +19,11 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import get_spec
+from data_pipelines.registry import table as registry_table
+from data_pipelines.registry.toml_file import to_toml
 from data_pipelines.sampling.splits import held_out
 from data_pipelines.sources.identity import EpisodeRun, episode_ids
+from data_pipelines.tokens import tokenize_job
 from experiments.cli.data import registry as registry_commands
 from experiments.cli.main import main
 from experiments.preparing import tokenizer, windows
@@ -81,6 +84,20 @@ def refused(capsys):
         return said
 
     return run
+
+
+def test_what_one_of_many_datasets_lacks_is_said_before_anything_is_made(arm, tmp_path, monkeypatch, refused):
+    monkeypatch.setattr(tokenizer_training, "train_tokenizer", lambda *_, **__: pytest.fail("it is trained"))
+    monkeypatch.setattr(tokenize_job, "write_dataset", lambda *_, **__: pytest.fail("it is tokenised"))
+    monkeypatch.setattr(registry_table, "_registered", {})
+    data = ["--data", arm, write_rlds(tmp_path / "rlds", BASE, LENGTHS), "--out", tmp_path / "out"]
+    message = refused(2, "tokenize", *SMOKE, *data, "--set", "store.frame_step=3")
+    assert f"dataset {BASE.name!r}: frame_step 3 does not divide the stride 2 of 2 Hz" in message
+    assert main(["tokenizer", "pixels", "--out", str(tmp_path / "pixels")]) == 0
+    given = ["--preset", "smoke-continuous", "--tokenizer", tmp_path / "pixels"]
+    (tmp_path / "my.toml").write_text(to_toml(replace(BASE, image_key="observation/none")))
+    message = refused(2, "tokenize", *given, *data, "--registry", tmp_path / "my.toml")
+    assert f"{BASE.name}: no image 'observation/none'" in message
 
 
 def test_one_episode_alone_is_refused_before_a_tokenizer_is_trained_on_it(tmp_path, monkeypatch, refused):
