@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar, get_args
 
 import numpy as np
 
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
+from hma_jax.config.base import require_choice
 from hma_jax.simulator.interface import chosen_episodes
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -51,6 +52,7 @@ class TrueSimulator(ABC, Generic[W]):
 
     def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int, outside: Outside = "clip"):
         """Raises ConfigError for robots that there are not, or with other actions."""
+        require_choice(outside, get_args(Outside), "outside")
         for robot in robots:
             dim = self.dims().get(robot.name)
             require(dim is not None, f"there is no robot {robot.name!r}: it has no true simulator here")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from data_pipelines.tokens.store import TokenStore
 from data_pipelines.true_simulator import TrueSimulator
 from experiments.running.workspace import Workspace
 from hma_jax.config import DecodeConfig, require
+from hma_jax.config.base import require_choice
 from hma_jax.simulator.folder import DECODE, ROBOTS, TOKENIZER, save_decode, save_robots
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot, rest_of
@@ -74,8 +75,9 @@ def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | No
 def make_simulator(run: Path | str, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
     """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
 
-    Raises ConfigError; for "true" if a robot has no true simulator, or robots are of different ones.
+    Raises ConfigError for another word; for "true" if a robot has no true simulator, or robots are of different ones.
     """
+    require_choice(world, get_args(World), "world")
     learned = load_simulator(run, episodes=episodes, **options)
     return learned if world == "learned" else true_simulator(learned, tuple(learned.robots.values()), episodes)
 

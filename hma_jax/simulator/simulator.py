@@ -10,12 +10,13 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
 
 from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, Weights, require
+from hma_jax.config.base import require_choice
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
@@ -63,6 +64,8 @@ class Simulator:
         (`clipped` says which, and the log once) or refused."""
         config = model.config
         require(episodes >= 1, f"a simulator has at least 1 episode, got {episodes}")
+        require_choice(outside, get_args(Outside), "outside")
+        require_choice(rate, get_args(Rate), "rate")
         require(config.frames >= 3, f"a simulator needs a model of at least 3 frames, this one sees {config.frames}")
         taken = config.tokens, config.diffusion.token_channels if config.diffusion else 0
         made = tokenizer.tokens, tokenizer.channels

@@ -79,6 +79,11 @@ def test_a_trial_of_a_study_has_the_study_s_tokenizer(run, tmp_path):
     assert dict(load_simulator(trial).robots) == dict(load_simulator(run).robots)
 
 
+def test_neither_world_is_taken_for_one_that_there_is_not(run):
+    with pytest.raises(ConfigError, match="world: 'learnt' is not a choice; choose one of learned, true"):
+        make_simulator(run, "learnt")
+
+
 @pytest.mark.slow
 def test_true_and_learned_are_exchanged_by_one_word(run):
     seen = {}

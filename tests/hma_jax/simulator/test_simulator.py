@@ -221,6 +221,12 @@ def test_what_cannot_be_done_is_said(deed, message: str):
         deed(simulator(episodes=2))
 
 
+@pytest.mark.parametrize(("name", "word"), [("outside", "raise"), ("rate", "Native")])
+def test_another_word_is_not_taken_for_the_one_it_resembles(name: str, word: str):
+    with pytest.raises(ConfigError, match=f"{name}: '{word}' is not a choice; choose one of "):
+        simulator(**{name: word})
+
+
 def test_an_action_of_another_shape_or_that_is_not_finite_is_refused():
     sim = simulator()
     sim.reset(start(1, 1))
