@@ -177,7 +177,8 @@ def import_tokens(
     """Read token folders of the official release (video.bin, actions, segment_ids.bin) into a token store.
 
     A dataset is a pair of folders that end in _train and _val; either of them stands for both. The
-    tokens are taken as they are.
+    tokens are taken as they are. The store is for programs (data_pipelines.loading.loader.make_loader):
+    other commands make tokens of recordings themselves.
 
     Args:
         folders: Folders to read.
