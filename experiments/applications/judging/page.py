@@ -203,14 +203,14 @@ def _head(summary: dict[str, Any]) -> str:
 
 
 def say_control(summary: dict[str, Any]) -> str:
-    """In words, whether success in the model hangs on what policies do; "" where that shows."""
+    """In words, that success in the model may not hang on what policies do; "" where it is known to."""
     above = summary["above the control"]
     if above["low"] > 0:
         return ""
     return (
-        "In the model policies succeed no more often than in the control, where another episode's actions are executed: by "
-        f"{shown(above)} on average over policies. Then the rates do not show what policies do, whatever they are compared "
-        "with, or all starts are alike: look at the clips."
+        "It is not known that policies succeed more often in the model than in the control, where another episode's actions "
+        f"are executed: they do by {shown(above)} on average over policies. If it is not so, the rates do not show what "
+        "policies do, whatever they are compared with, or all starts are alike: look at the clips."
     )
 
 

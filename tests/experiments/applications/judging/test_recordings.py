@@ -269,7 +269,11 @@ def test_success_that_does_not_hang_on_what_policies_do_is_told():
     )
     assert same.low < 0 < same.high and 0 < better.low < better.mean < better.high
     told = [say_control({"above the control": {"mean": x.mean, "low": x.low, "high": x.high}}) for x in (same, better)]
-    assert "no more often than in the control" in told[0] and told[1] == ""
+    assert "not known that policies succeed more often in the model than in the control" in told[0] and told[1] == ""
+    unsure = {"above the control": {"mean": 0.3, "low": -0.02, "high": 0.6}}
+    assert "they do by 0.30 (-0.02 to 0.60) on average" in say_control(unsure), (
+        "few starts are no proof of the contrary"
+    )
 
 
 def test_a_head_that_is_no_better_than_always_saying_the_same_is_told():
