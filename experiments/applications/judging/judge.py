@@ -67,6 +67,7 @@ def judge_run(run_directory: Path, out: Path, config: JudgeConfig, step: Step, o
     the file gives are no policies.
     """
     simulator = load_simulator(run_directory, episodes=config.batch)
+    _require_some(simulator, own is not None or config.ladder.cloned or config.ladder.diffusion)
     robot = simulator.robot(config.task.robot)
     return _judge(run_directory, out, simulator, robot, TrueOutside(config, robot, simulator, step), step, own)
 
@@ -89,13 +90,18 @@ def judge_recorded(
     for one that cannot be read.
     """
     simulator = load_simulator(run_directory, own_starts=True)
-    some = own is not None or simulator.model.config.action_heads
-    require(some, "there is no policy to judge but the random one: give --policies FILE")
+    _require_some(simulator, own is not None)
     robot, stores = simulator.robot(config.task.robot), Workspace.of_run(run_directory).store
     recorded, _ = open_trajectories(dataset, split, robot, {}, simulator.tokenizer, stores)
     require_layout(recorded, robot, simulator.model.table)
     outside = Recordings(config, recorded, robot, step)
     return _judge(run_directory, out, _of_episodes(simulator, outside.config.batch), robot, outside, step, own, counted)
+
+
+def _require_some(simulator: Simulator, given: bool | int) -> None:
+    """Raises ConfigError where neither are policies given nor is the model one."""
+    some = given or simulator.model.config.action_heads
+    require(bool(some), "there is no policy to judge but the random one: give --policies FILE")
 
 
 def _of_episodes(simulator: Simulator, episodes: int) -> Simulator:

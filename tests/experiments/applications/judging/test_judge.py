@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from experiments.applications.judging import judge
 from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
 from experiments.applications.judging.config import JudgeConfig
 from experiments.applications.judging.head import HeadConfig, HeadJudge, load_head
@@ -84,6 +85,15 @@ def test_seeds_that_no_episode_can_have_are_refused_before_policies_are_trained(
     assert replace(ASKED, seed=first)
     with pytest.raises(ConfigError, match=f"--seed must lie in 0..{2**32 - 4}, got {beyond}"):
         replace(ASKED, seed=beyond)
+
+
+def test_the_random_policy_alone_is_not_judged(tmp_path, monkeypatch):
+    """For a quarter of an hour, since --policies was forgotten."""
+    model = SimpleNamespace(config=SimpleNamespace(action_heads=False))
+    monkeypatch.setattr(judge, "load_simulator", lambda *_, **__: SimpleNamespace(model=model))
+    alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
+    with pytest.raises(ConfigError, match="no policy to judge but the random one: give --policies FILE"):
+        judge_run(tmp_path / "model", tmp_path / "out", alone, step)
 
 
 def test_what_is_finished_is_found_again_and_the_rest_comes_out_the_same(judged):
