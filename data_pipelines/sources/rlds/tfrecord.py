@@ -26,6 +26,7 @@ import numpy as np
 
 from data_pipelines.errors import CorruptRecordError
 from data_pipelines.sources.rlds.location import Descriptor, Ranges, is_remote, locate, open_ranges
+from hma_jax.runtime.files import naming
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -237,13 +238,13 @@ def _verify(crc: int, footer: bytes, path: Location, offset: int) -> None:
 def write_shard(path: str | Path, records: Iterable[bytes]) -> int:
     """Writes `records` as one TFRecord file and returns their number.
 
-    The file appears under its name only when it is complete.
+    The file appears under its name only when it is complete. Raises OSError, which names it.
     """
     path = Path(path)
     aside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     count = 0
     try:
-        with open(aside, "wb") as out:
+        with naming(path), open(aside, "wb") as out:
             for record in records:
                 length = struct.pack("<Q", len(record))
                 out.write(length + struct.pack("<I", masked_crc32c(length)))

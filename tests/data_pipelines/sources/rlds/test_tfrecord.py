@@ -8,6 +8,7 @@ import pytest
 from data_pipelines.errors import CorruptRecordError, DataError
 from data_pipelines.sources.rlds.tfrecord import HEADER, index_shard, read_record, scan_shard, write_shard
 from tests.data_pipelines.fakes import REAL_DATA
+from tests.full_disk import full_disk
 
 RECORDS = [b"first", b"", b"a longer third record" * 20]
 
@@ -99,6 +100,12 @@ def test_failed_write_leaves_no_file(tmp_path):
 
     with pytest.raises(RuntimeError):
         write_shard(tmp_path / "out", records())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_said_of_the_shard_and_leaves_nothing(tmp_path):
+    with full_disk(100), pytest.raises(OSError, match="shard-0"):
+        write_shard(tmp_path / "shard-0", [b"one" * 99])
     assert list(tmp_path.iterdir()) == []
 
 
