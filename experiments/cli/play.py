@@ -26,7 +26,7 @@ def play(
     host: str = "127.0.0.1",
     port: int = 8765,
     visitors: int = 4,
-    window: Literal["exact", "streaming"] = "exact",
+    window: Annotated[Literal["exact", "streaming"] | None, arg(metavar="{exact,streaming}"), UNSET] = None,
     unmask_steps: Annotated[int | None, arg(name="unmask-steps", metavar="M"), UNSET] = None,
     temperature: Annotated[float | None, UNSET] = None,
     tokenizer: Annotated[Path | None, arg(metavar="DIR"), UNSET] = None,
@@ -42,7 +42,7 @@ def play(
         port: Of the address; 0 takes a free one.
         visitors: Who can drive at once, in one batch.
         window: Past the model's window of frames, exact computes it again for each; streaming is faster and
-            may no longer follow commands (docs/endurance_small.md).
+            may no longer follow commands (docs/endurance_small.md). Without it as RUN/decode.json says, or exact.
         unmask_steps: Looks at a frame until it is finished, instead of as many as RUN/decode.json says, or 2; more are
             slower.
         temperature: Of drawing tokens, instead of what RUN/decode.json says, or 0, which takes the likeliest.
@@ -65,8 +65,8 @@ def play(
     )
     require(0 <= port < 65536, f"--port must lie in 0..65535, got {port}")
     require(visitors >= 1, f"--visitors must be at least 1, got {visitors}")
-    asked = {"unmask_steps": unmask_steps, "temperature": temperature}
-    decode = replace(find_decode(run), slide=window, **{name: x for name, x in asked.items() if x is not None})
+    asked = {"slide": window, "unmask_steps": unmask_steps, "temperature": temperature}
+    decode = replace(find_decode(run), **{name: x for name, x in asked.items() if x is not None})
     simulator = load_simulator(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )

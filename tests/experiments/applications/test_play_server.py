@@ -28,8 +28,9 @@ from experiments.applications.play.crowd import REPLIES, Visitor
 from experiments.applications.play.recording import Recording
 from experiments.applications.play.turn import Seat
 from experiments.cli.main import main
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 from hma_jax.runtime.exits import Exit
+from hma_jax.simulator.folder import DECODE, USUAL, save_decode
 from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving
 from tests.hma_jax.simulator.small import simulator
@@ -145,6 +146,22 @@ def test_as_many_act_at_once_as_programs_are_compiled_for_and_all_take_turns():
         assert max(at_once) == 2
 
     serving(test, together=1)
+
+
+def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
+    from experiments.applications import simulators
+
+    asked = []
+
+    def load(*_, decode, **__):
+        asked.append(decode.slide)
+        raise ConfigError("enough is known")
+
+    monkeypatch.setattr(simulators, "load_simulator", load)
+    save_decode(replace(USUAL, slide="streaming"), tmp_path / DECODE)
+    for more in ([], ["--window", "exact"]):
+        assert main(["play", str(tmp_path), *more]) == 2
+    assert asked == ["streaming", "exact"]
 
 
 def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp_path):
