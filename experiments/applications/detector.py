@@ -40,7 +40,7 @@ from hma_jax.runtime.files import UNREADABLE, write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.shared import BaseTokenizer
 
-OUT = Path("experiments/results/detector")
+COMMITTED, OUT = Path("experiments/results/detector"), Path("runs/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
 EPISODES, FEWEST, PER_EPISODE, HELD_OUT = 1920, 48, 16, (24, 16)
 """Of all robots together, but so many of each, from the suite's training split, and frames of each episode; of each
@@ -243,8 +243,9 @@ def main() -> None:
     simulator = load_simulator(arguments.run)
     make_detector(list(known_robots(simulator.robots)), simulator.tokenizer, arguments.out)
     print((arguments.out / ERRORS).read_text())
-    then = f"python -m experiments.applications.endurance {arguments.run}"
-    wrote(arguments.out / WEIGHTS, arguments.out / ERRORS, then=then)
+    weights = arguments.out / WEIGHTS
+    then = f"python -m experiments.applications.endurance {arguments.run} --detector {weights}"
+    wrote(weights, arguments.out / ERRORS, then=then)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from data_pipelines.suite.simulator import SPECS
-from experiments.applications.detector import OUT as DETECTOR
-from experiments.applications.detector import WEIGHTS, Detector, chosen
+from experiments.applications.detector import COMMITTED, WEIGHTS, Detector, chosen
 from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import Kind, make_drive, native_robots
 from experiments.applications.endurance.figures import draw_curves, draw_sheet, shown_frames
@@ -100,7 +99,7 @@ def main() -> None:
     parser.add_argument("--every", type=float, default=60.0, help="seconds per row of the table")
     parser.add_argument("--name", default="model", help="of the run, in file names and the table")
     parser.add_argument("--table", default=TABLE, help="file in DIR; curves of the same name")
-    parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
+    parser.add_argument("--detector", type=Path, default=COMMITTED / WEIGHTS)
     asked = parser.parse_args()
     require(asked.minutes > 0, f"--minutes must be positive, got {asked.minutes:g}")
     require(asked.starts >= 1, f"--starts must be at least 1, got {asked.starts}")

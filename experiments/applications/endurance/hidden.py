@@ -25,8 +25,7 @@ from data_pipelines.suite.render import render_frames
 from data_pipelines.suite.rollout import Rollout, episode_seeds, simulate
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import EmbodimentSpec
-from experiments.applications.detector import CLOSE, SURE, WEIGHTS, Detector
-from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.detector import CLOSE, COMMITTED, SURE, WEIGHTS, Detector
 from experiments.applications.endurance.claims import claim_name
 from experiments.applications.endurance.drives import native_robots
 from experiments.applications.endurance.tables import Row
@@ -141,7 +140,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/endurance"))
     parser.add_argument("--name", default="model", help="of the run, in the table's name")
-    parser.add_argument("--detector", type=Path, default=DETECTOR / WEIGHTS)
+    parser.add_argument("--detector", type=Path, default=COMMITTED / WEIGHTS)
     asked = parser.parse_args()
     detector, rows, table = Detector.load(asked.detector), [], asked.out / f"{asked.name}_hidden.csv"
     simulator = load_simulator(asked.run, execution=ExecutionConfig(remat="none"), episodes=2 * PER_ROBOT, history=1)

@@ -113,6 +113,21 @@ def test_where_all_episodes_are_too_short_that_is_said(tmp_path, monkeypatch, ca
     assert f"left out, their episodes are too short or nothing is seen at the end: {ROBOTS[0].name}" in said
 
 
+def test_a_detector_of_one_s_own_leaves_the_committed_one(simulator, tmp_path, monkeypatch, capsys):
+    def make(robots, tokenizer, out):
+        out.mkdir(parents=True)
+        (out / detector_module.ERRORS).write_text("errors")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(detector_module, "load_simulator", lambda run: simulator)
+    monkeypatch.setattr(detector_module, "make_detector", make)
+    monkeypatch.setattr(sys, "argv", ["detector", "RUN"])
+    detector_module.main()
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+    said = " ".join(capsys.readouterr().out.split())
+    assert "python -m experiments.applications.endurance RUN --detector runs/detector/detector.npz" in said
+
+
 @pytest.mark.slow
 def test_a_detector_is_made_of_a_run_s_robots(simulator, tmp_path, monkeypatch):
     few = {"EPISODES": 4, "FEWEST": 2, "PER_EPISODE": 2, "HELD_OUT": (2, 2), "STEPS": 1, "MORE": 1}

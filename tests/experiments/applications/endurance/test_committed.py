@@ -6,7 +6,7 @@ import csv
 
 import numpy as np
 
-from experiments.applications.detector import OUT as DETECTOR
+from experiments.applications.detector import COMMITTED as DETECTOR
 from experiments.applications.detector import WEIGHTS, Detector
 from experiments.applications.endurance.tables import over_robots, read_rows
 from tests.experiments.applications.endurance.committed import (
