@@ -168,6 +168,12 @@ def run_cloned(settings: Settings, robot: Robot, seeds: np.ndarray, size: int, w
     ]
 
 
+def kept(out: Path, way: str, starts: int) -> list[Path]:
+    """Where outcomes are kept: one file for a start where somebody plans, otherwise one for all."""
+    name = out / "trials" / way.replace(" ", "_")
+    return [Path(f"{name}-{k}.json") for k in range(starts)] if way in PLANNERS else [Path(f"{name}.json")]
+
+
 def summarise(trials: Mapping[str, Sequence[dict]]) -> list[tuple[str, Interval, float]]:
     """Success of each way of acting, over its starts, and seconds per plan (median over starts)."""
     rates = [rate_interval(np.array([t["success"] for t in found], float)) for found in trials.values()]
@@ -255,9 +261,11 @@ def main() -> None:
     models = {"learned": LearnedModel(simulator, robot), "true": TrueModel(settings.make_task().spec, robot, size)}
     claim(out, run, simulator, asdict(settings))
     (out / "trials").mkdir(exist_ok=True)
+    places = {way: kept(out, way, settings.starts) for way in WAYS}
+    wanted = [way for way in WAYS if way in wanted or all(path.exists() for path in places[way])]  # tables are of all
     trials: dict[str, list[dict]] = {}
     for way in (name for name in (*CLONED, RANDOM) if name in wanted):
-        path = out / "trials" / f"{way.replace(' ', '_')}.json"
+        (path,) = places[way]
         with step(way) as update:
             if not path.exists():
                 write_file(path, json.dumps(run_cloned(settings, robot, seeds, size, way, update)))
@@ -268,7 +276,7 @@ def main() -> None:
         with step(f"{', '.join(planners)}: {settings.starts} episodes each") as update:
             for k, seed in enumerate(seeds.tolist()):
                 for way in planners:
-                    path, (search_by, where) = out / "trials" / f"{way.replace(' ', '_')}-{k}.json", PLANNERS[way]
+                    path, (search_by, where) = places[way][k], PLANNERS[way]
                     if not path.exists():
                         write_file(path, json.dumps(run_planner(search_by, models[where], robot, settings, seed, size)))
                     trials[way].append(json.loads(path.read_text()))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
 from data_pipelines.suite.environment import Environment
+from experiments.applications import plan_actions
 from experiments.applications.plan_actions import draw, summarise
 from experiments.applications.planning.cem import plan_cem
 from experiments.applications.planning.control import Planner, Units
@@ -17,6 +20,7 @@ from experiments.applications.planning.shooting import plan_shooting
 from experiments.applications.policies.tasks import find_task
 from hma_jax.config import ConfigError
 from hma_jax.simulator.robots import Robot
+from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, simulator
 
 CONFIG = SearchConfig(candidates=16, iterations=4, knots=3, hold=2)
@@ -121,3 +125,18 @@ def test_a_figure_shows_planners_that_always_or_never_succeed(tmp_path):
     }
     draw(summarise(tried), tmp_path / "planning.png")
     assert (tmp_path / "planning.png").exists()
+
+
+def test_ways_that_were_tried_before_stay_in_the_table(tmp_path, monkeypatch):
+    run, out = make_run(tmp_path / "study"), tmp_path / "out"
+
+    def run_cloned(settings, *_):
+        return [{"success": True, "distance": 0.0, "seconds": 0.0}] * settings.starts
+
+    monkeypatch.setattr(plan_actions, "run_cloned", run_cloned)
+    monkeypatch.setattr(plan_actions, "run_planner", lambda *_: {"success": False, "distance": 1.0, "seconds": 1.0})
+    tried = "random actions", "MPPI in the model", "behaviour cloning of 100 trajectories"
+    for way in tried:
+        monkeypatch.setattr(sys, "argv", ["plan_actions", str(run), "--starts", "2", "--out", str(out), "--ways", way])
+        plan_actions.main()
+    assert set(plan_actions.read_trials(out / "trials.csv")) == set(tried)
