@@ -12,7 +12,7 @@ import pytest
 from experiments.applications.judging import judge
 from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
 from experiments.applications.judging.config import JudgeConfig
-from experiments.applications.judging.head import HeadConfig, HeadJudge, load_head
+from experiments.applications.judging.head import PIECE, HeadConfig, HeadJudge, load_head
 from experiments.applications.judging.judge import judge_run
 from experiments.applications.judging.ladder import LadderConfig, names
 from experiments.applications.judging.outcomes import HEAD, LEARNED, STATE, TRUE, read_outcomes, write_outcomes
@@ -240,6 +240,21 @@ def test_the_head_judges_environments_and_forgets_with_them(judged):
     judge.begin(simulator.show(1, 0), [0])
     assert judge(simulator.show(1, 1))[1].tolist() == [False, True]
     assert judge(simulator)[1].tolist() == [False, True]
+
+
+def test_a_head_looks_at_a_few_frames_without_looking_at_many(judged):
+    head, rng = load_head(judged[0] / "out" / "head"), np.random.default_rng(0)
+    pairs, apply, looked_at = rng.integers(0, 256, (PIECE + 1, 2, 8, 8, 3), np.uint8), head._apply, []
+
+    def looking(params, frames):
+        looked_at.append(len(frames))
+        return apply(params, frames)
+
+    head._apply = looking
+    few, one, many = head.on_pairs(pairs[:3]), head.on_pairs(pairs[:1]), head.on_pairs(pairs)
+    assert looked_at == [4, 1, PIECE, PIECE] and len(many) == PIECE + 1
+    np.testing.assert_allclose(few, many[:3], rtol=1e-5)
+    np.testing.assert_allclose(one, many[:1], rtol=1e-5)
 
 
 def brighter(images: np.ndarray, first: np.ndarray) -> np.ndarray:
