@@ -41,6 +41,8 @@ def plan(study: Study) -> Sweep:
     def judged(seed: int) -> tuple[str, ...]:
         return first if study.judged == "first" else draw_judged(study, seed, fewest)
 
+    drawn = f"{fewest} datasets that are drawn for each seed,"
+    on = "the smallest set of datasets" if study.judged == "first" else drawn
     sweep = make_sweep(
         study,
         name="datasets",
@@ -49,8 +51,8 @@ def plan(study: Study) -> Sweep:
         values=study.dataset_counts,
         change=change,
         reference_x=len(names),
-        question="Does training on more robots help or hurt those already there? All points are judged "
-        "on the smallest set of datasets and see the same number of windows in training.",
+        question=f"Does training on more robots help or hurt those already there? All points are judged on {on} "
+        "and see the same number of windows in training.",
         gain="more robots",
     )
     if study.judged == "first":

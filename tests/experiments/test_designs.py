@@ -226,6 +226,7 @@ def test_the_whole_fits_into_about_twelve_hours_of_two_cores():
 def test_the_paper_judges_on_a_random_five_with_a_given_tokenizer():
     sweep = find_axis("datasets")(PAPER)
     assert sweep.scope == draw_judged(PAPER, 0, 5) != PAPER.datasets[:5]
+    assert "judged on 5 datasets that are drawn for each seed, and see" in sweep.question
     for p in sweep.points:
         assert p.scope == sweep.scope and set(sweep.scope) <= set(p.trial.datasets)
     assert [len(p.trial.datasets) for p in sweep.points] == [5, 10, 20, 30, 40, 40]
