@@ -22,11 +22,11 @@ from data_pipelines.registry import FRAME_RATE, DatasetSpec
 from data_pipelines.sampling.splits import MAX_VAL, MIN_VAL, VAL_FRACTION, check_bounds, count_held_out
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.tokens.moments import Moments
-from data_pipelines.tokens.row_sample import Spread
+from data_pipelines.tokens.row_sample import Spread, moves
 from hma_jax.config import require
 from hma_jax.config.json import stable_hash, to_dict
 from hma_jax.config.training import ActionScale
-from hma_jax.model.embodiments import DEAD_STD, Embodiment
+from hma_jax.model.embodiments import Embodiment
 
 FILE = "manifest.json"
 SPLITS = ("train", "val")
@@ -224,8 +224,9 @@ class Manifest:
                 f"{self.spec.name}: its tokens were made by a version that kept no quantiles of actions. Remove the "
                 "dataset from the store and tokenise it again, or use --set train.action_scale=deviation."
             )
-        pairs = zip(spread.quantiles[0], spread.quantiles[-1], spread.low, spread.high, strict=True)
-        chosen = [(a, b) if (b - a) / 2 > DEAD_STD else (least, most) for a, b, least, most in pairs]
+        first, last = spread.quantiles[0], spread.quantiles[-1]
+        pairs = zip(first, last, spread.low or first, spread.high or last, moves(spread.quantiles), strict=True)
+        chosen = [(a, b) if moving else (least, most) for a, b, least, most, moving in pairs]
         return tuple(a for a, _ in chosen), tuple(b for _, b in chosen)
 
     def hash(self) -> str:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.sampling.order import hash64, stream_seed
+from hma_jax.model.embodiments import DEAD_STD
 
 ROWS = 4096
 """Rows that a dataset's quantiles are taken of, at most."""
@@ -30,14 +31,23 @@ MOST_STEPS = np.uint64(2**32)
 SEED = stream_seed("quantiles")
 
 
+PIECE = 2**22
+"""Rows whose hashes are in memory at a time."""
+
+
 @dataclass(frozen=True)
 class Spread:
     """Over which values rows of actions extend, per column: `quantiles` as `QUANTILES` lists them, the smallest and the
-    largest. All () without rows."""
+    largest. All () without rows, the last two also where they are not needed: every value `moves`."""
 
     quantiles: tuple[tuple[float, ...], ...] = ()
     low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
+
+
+def moves(quantiles: tuple[tuple[float, ...], ...]) -> np.ndarray:
+    """bool per column: whether the outermost of `quantiles` are apart by more than rounding (`DEAD_STD`)."""
+    return (np.asarray(quantiles[-1]) - np.asarray(quantiles[0])) / 2 > DEAD_STD
 
 
 @dataclass(frozen=True)
@@ -76,8 +86,7 @@ class RowSampler:
 
     def add(self, rows: np.ndarray, episode: int) -> None:
         """The actions [N, A] of episode `episode` of the dataset, which comes once."""
-        numbers = np.uint64(episode) * MOST_STEPS + np.arange(len(rows), dtype=np.uint64)
-        self._put(hash64(numbers, SEED), np.asarray(rows, np.float32))
+        self._put(_hashes(np.array([episode]), np.array([len(rows)])), np.asarray(rows, np.float32))
 
     def add_sample(self, sample: RowSample) -> None:
         """What another sampler kept, of other episodes."""
@@ -104,6 +113,28 @@ class RowSampler:
             hashes, rows = np.concatenate(self._hashes), np.concatenate(self._rows)
             order = np.argsort(hashes, kind="stable")[: self._limit]
             self._hashes, self._rows, self._held = [hashes[order]], [rows[order]], len(order)
+
+
+def _hashes(episodes: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """uint64 of every row of `episodes`, which have so many `steps`, one after the other."""
+    first = np.cumsum(steps) - steps
+    step = np.arange(int(steps.sum()), dtype=np.uint64) - np.repeat(first.astype(np.uint64), steps)
+    return hash64(np.repeat(episodes.astype(np.uint64), steps) * MOST_STEPS + step, SEED)
+
+
+def sampled_episodes(episodes: np.ndarray, steps: np.ndarray, limit: int = ROWS) -> np.ndarray:
+    """Positions in `episodes` (numbers in the dataset, with so many `steps` each) of those that the sample of all their
+    rows has rows of: a hash decides, so that the others need not be read."""
+    steps = np.asarray(steps, np.int64)
+    hashes, owners = np.zeros(0, np.uint64), np.zeros(0, np.int64)
+    pieces = np.flatnonzero(np.diff(np.cumsum(steps) // PIECE)) + 1
+    for at in np.split(np.arange(len(steps)), pieces):
+        hashes = np.concatenate([hashes, _hashes(episodes[at], steps[at])])
+        owners = np.concatenate([owners, np.repeat(at, steps[at])])
+        if len(hashes) > limit:
+            smallest = np.argpartition(hashes, limit)[:limit]
+            hashes, owners = hashes[smallest], owners[smallest]
+    return np.unique(owners)
 
 
 def merge_samples(samples: Iterable[RowSample]) -> RowSample:

@@ -19,7 +19,7 @@ from data_pipelines.tokens.episode_record import StoredEpisode, decode_episode
 from data_pipelines.tokens.manifest import FILE, SPLITS, Manifest, part_name
 from data_pipelines.tokens.manifest_file import load_manifest
 from data_pipelines.tokens.moments import Moments, merge_exactly, moments_row, read_moments
-from data_pipelines.tokens.row_sample import RowSampler, Spread
+from data_pipelines.tokens.row_sample import RowSampler, Spread, moves, sampled_episodes
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
 from hma_jax.config.training import ActionScale
@@ -98,18 +98,22 @@ class TokenStore:
     def action_spread(self, name: str, episodes: Sequence[int]) -> Spread:
         """Over which values the actions of these training episodes alone extend (positions in the store).
 
-        Reads the episodes. Raises DataError for a damaged record.
+        Reads the episodes that the quantiles are taken of, and all of them where a value does not move between these.
+        Raises DataError for a damaged record.
         """
-        sampler, extremes = RowSampler(), []
-        for i in episodes:
-            item = self.episode(name, "train", int(i))
+        facts, episodes = self.manifest(name).train, np.asarray(episodes, np.int64)
+        numbers, steps = (np.asarray(column, np.int64)[episodes] for column in (facts.episodes, facts.steps))
+        sampler = RowSampler()
+        for i in episodes[sampled_episodes(numbers, steps)].tolist():
+            item = self.episode(name, "train", i)
             sampler.add(item.actions, item.episode)
-            if item.actions.size:
-                extremes.append((item.actions.min(axis=0), item.actions.max(axis=0)))
-        if not extremes:
-            return Spread()
+        quantiles = sampler.sample().quantiles()
+        if not quantiles or moves(quantiles).all():
+            return Spread(quantiles)
+        with_steps = (self.episode(name, "train", i).actions for i in episodes[steps > 0].tolist())
+        extremes = [(actions.min(axis=0), actions.max(axis=0)) for actions in with_steps]
         low, high = np.min([a for a, _ in extremes], axis=0), np.max([b for _, b in extremes], axis=0)
-        return Spread(sampler.sample().quantiles(), tuple(low.tolist()), tuple(high.tolist()))
+        return Spread(quantiles, tuple(low.tolist()), tuple(high.tolist()))
 
     def action_moments(self, name: str, episodes: np.ndarray) -> Moments:
         """Statistics of the actions of these training episodes alone (int [N], positions in the store).

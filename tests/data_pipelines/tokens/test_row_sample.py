@@ -11,8 +11,10 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.loading.selection import LoaderConfig, select_windows, training_table
+from data_pipelines.tokens import row_sample
+from data_pipelines.tokens import store as store_module
 from data_pipelines.tokens.manifest_file import load_manifest
-from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, merge_samples, rows_of_part
+from data_pipelines.tokens.row_sample import QUANTILES, ROWS, RowSample, RowSampler, Spread, merge_samples, rows_of_part
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config.json import from_dict, to_dict
@@ -129,6 +131,38 @@ def test_a_value_that_moves_in_less_than_a_hundredth_is_measured_by_its_extremes
     assert manifest.action_quantiles[0][2] == 0 <= manifest.action_quantiles[-1][2] <= rounding
     scaled = manifest.embodiment(scale="quantiles")
     assert (scaled.low[2], scaled.high[2]) == (0, 4)
+
+
+def test_the_episodes_that_are_sampled_are_known_before_any_is_read(monkeypatch):
+    monkeypatch.setattr(row_sample, "PIECE", 50)
+    rng = np.random.default_rng(0)
+    numbers, steps = rng.permutation(1000)[:60], rng.integers(0, 40, 60)
+    sampler = RowSampler(25)
+    for number, count in zip(numbers.tolist(), steps.tolist(), strict=True):
+        sampler.add(np.full((count, 1), number), number)
+    sampled = set(sampler.sample().arrays()[1][:, 0].astype(int).tolist())
+    assert set(numbers[row_sample.sampled_episodes(numbers, steps, 25)].tolist()) == sampled
+    assert len(row_sample.sampled_episodes(numbers, steps)) == (steps > 0).sum()
+
+
+def test_quantiles_of_some_trajectories_read_those_that_are_sampled_alone(tmp_path, monkeypatch):
+    """Of millions all would take hours, at every start."""
+
+    def change(episode, features):
+        features["steps/action"][:] = np.random.default_rng(episode).normal(size=(120, 3))
+
+    manifest = tokenize_dataset(
+        SPEC, write_rlds(tmp_path, SPEC, [120] * 8, change=change), FakeTokenizer(), tmp_path / "s"
+    )
+    store, read = TokenStore(tmp_path / "s"), set()
+    whole = store.action_spread("toy", range(len(manifest.train.episodes)))
+    assert whole == Spread(manifest.action_quantiles)
+    assert manifest.embodiment(scale="quantiles", spread=whole) == manifest.embodiment(scale="quantiles")
+    real, few = store.episode, row_sample.sampled_episodes
+    monkeypatch.setattr(store, "episode", lambda *place: read.add(place[2]) or real(*place))
+    monkeypatch.setattr(store_module, "sampled_episodes", lambda *rows: few(*rows, 2))
+    store.action_spread("toy", range(len(manifest.train.episodes)))
+    assert 1 <= len(read) <= 2
 
 
 def test_quantiles_of_some_trajectories_are_of_those_alone(tmp_path):
