@@ -38,7 +38,7 @@ PIECE = 2**22
 @dataclass(frozen=True)
 class Spread:
     """Over which values rows of actions extend, per column: `quantiles` as `QUANTILES` lists them, the smallest and the
-    largest. All () without rows, the last two also where they are not needed: every value `moves`."""
+    largest. All () without rows, the last two also where every value `moves` or is constant and they tell nothing."""
 
     quantiles: tuple[tuple[float, ...], ...] = ()
     low: tuple[float, ...] = ()

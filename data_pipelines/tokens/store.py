@@ -23,7 +23,7 @@ from data_pipelines.tokens.row_sample import RowSampler, Spread, moves, sampled_
 from hma_jax.config import ConfigError
 from hma_jax.config.json import stable_hash
 from hma_jax.config.training import ActionScale
-from hma_jax.model.embodiments import EmbodimentTable
+from hma_jax.model.embodiments import DEAD_STD, EmbodimentTable
 
 _File = tuple[str, str, int]  # dataset, split, part
 
@@ -98,8 +98,8 @@ class TokenStore:
     def action_spread(self, name: str, episodes: Sequence[int]) -> Spread:
         """Over which values the actions of these training episodes alone extend (positions in the store).
 
-        Reads the episodes that the quantiles are taken of, and all of them where a value does not move between these.
-        Raises DataError for a damaged record.
+        Reads the episodes that the quantiles are taken of, and all of them where a value that varies does not move
+        between these. Raises DataError for a damaged record.
         """
         facts, episodes = self.manifest(name).train, np.asarray(episodes, np.int64)
         numbers, steps = (np.asarray(column, np.int64)[episodes] for column in (facts.episodes, facts.steps))
@@ -108,7 +108,10 @@ class TokenStore:
             item = self.episode(name, "train", i)
             sampler.add(item.actions, item.episode)
         quantiles = sampler.sample().quantiles()
-        if not quantiles or moves(quantiles).all():
+        if not quantiles:
+            return Spread()
+        varies = np.asarray(self.action_moments(name, episodes).std) > DEAD_STD
+        if not (varies & ~moves(quantiles)).any():
             return Spread(quantiles)
         with_steps = (self.episode(name, "train", i).actions for i in episodes[steps > 0].tolist())
         extremes = [(actions.min(axis=0), actions.max(axis=0)) for actions in with_steps]
