@@ -18,7 +18,7 @@ import numpy as np
 
 from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
-from data_pipelines.sources.lerobot import SUCCESS, TASK, LeRobotSource
+from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
@@ -26,6 +26,7 @@ from data_pipelines.sources.rlds.schema import field_slice, step_key
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
     MAX_SKIPPED,
+    REWARD_KEY,
     SUCCESS_KEY,
     Corrupt,
     EpisodeSource,
@@ -122,7 +123,7 @@ class LeRobotDataset(EpisodeSource):
 
     def record(self, i: int, keys: Sequence[str]) -> dict[str, Any]:
         where, entry = self._where(i), self._entries[i]
-        table = self._table(i, [TASK, SUCCESS, *(self._vectors[key] for key in keys if key in self._vectors)])
+        table = self._table(i, [TASK, SUCCESS, REWARD, *(self._vectors[key] for key in keys if key in self._vectors)])
         times = self._read.times(table, where)
         found: dict[str, Any] = {}
         for key in keys:
@@ -134,6 +135,8 @@ class LeRobotDataset(EpisodeSource):
                 found[key] = [text.encode() for text in self._read.texts(entry, table, where)]
             elif key == SUCCESS_KEY and (success := self._read.success(table, where)) is not None:
                 found[key] = np.array([success], np.int64)
+            elif key == REWARD_KEY and REWARD in table.column_names:
+                found[key] = self._read.numbers(table, REWARD, where)[:, 0].astype(np.float32)
         return found
 
     def _where(self, i: int) -> str:

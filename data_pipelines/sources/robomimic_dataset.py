@@ -23,6 +23,7 @@ from data_pipelines.sources.settings import RobomimicSettings
 from data_pipelines.sources.source import (
     INSTRUCTION_KEY,
     MAX_SKIPPED,
+    REWARD_KEY,
     SUCCESS_KEY,
     Corrupt,
     EpisodeSource,
@@ -116,6 +117,8 @@ class RobomimicDataset(EpisodeSource):
                     found[key] = [self._read.task.encode()] * max(int(self._lengths[i]), 0)
                 elif key == SUCCESS_KEY and (success := self._success(demo, where)) is not None:
                     found[key] = np.array([success], np.int64)
+                elif key == REWARD_KEY and "rewards" in demo:
+                    found[key] = read_rows(demo, "rewards", slice(None), where).astype(np.float32)
         return found
 
     @contextmanager

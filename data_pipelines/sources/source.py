@@ -28,6 +28,9 @@ INSTRUCTION_KEY = "steps/language_instruction"
 SUCCESS_KEY = "episode_metadata/success"
 """Optional episode flag that says whether the behaviour reached its goal."""
 
+REWARD_KEY = "steps/reward"
+"""Optional: what each step's action brought about, which the frame after it shows."""
+
 MAX_SKIPPED = 16.0
 """Default bound of the policy corrupt='skip': so many episodes or, below 1, this share of them."""
 

@@ -22,6 +22,7 @@ def judge(
     policies: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
     recordings: Annotated[str | None, arg(metavar="DATASET"), UNSET] = None,
     split: Annotated[str | None, arg(metavar="NAME"), UNSET] = None,
+    reward: Annotated[float | None, arg(metavar="LEAST"), UNSET] = None,
     registry: Annotated[Path | None, arg(metavar="FILE"), UNSET] = None,
     real: Annotated[Path | None, arg(metavar="CSV"), UNSET] = None,
     starts: int = 50,
@@ -58,6 +59,8 @@ def judge(
         recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether they
             succeeded: the head learns from them, and episodes begin as those that are held out.
         split: Of --recordings. Default: train.
+        reward: From which on a recorded step has reached the goal, with --recordings that have one in every step: they
+            teach the head frame by frame, which takes far fewer of them than ends alone.
         registry: TOML file with entries of your own.
         real: What came of policies on the real robot, with --recordings: columns policy, successes, episodes.
         starts: Held-out episodes at whose beginning every policy starts; of --recordings at most as many as are held out.
@@ -96,8 +99,9 @@ def judge(
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")
     of_expert = {"--demonstrations": demonstrations, "--steps": steps, "--cloned": cloned, "--diffusion": diffusion}
     usual = [JudgeConfig.demonstrations, LadderConfig.steps, LadderConfig.cloned, LadderConfig.diffusion]
+    of_recordings = {"--real": real, "--registry": registry, "--split": split, "--reward": reward}
     if recordings is None:
-        for flag, value in (("--real", real), ("--registry", registry), ("--split", split)):
+        for flag, value in of_recordings.items():
             require(value is None, f"{flag} is of robots without a true simulator: give --recordings, or leave it out")
         judged_task: AnyTask = find_task(robot, task, frames, hold)
     else:
@@ -106,7 +110,7 @@ def judge(
         require(not vain, f"recordings have no expert to clone: leave {', '.join(vain)} out")
         usual[2:] = 0, 0
         split = split or "train"
-        judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold)
+        judged_task = RecordedTask(robot, frames or 0, RecordedTask.hold if hold is None else hold, reward)
     of_expert = {flag: n if m is None else m for n, (flag, m) in zip(usual, of_expert.items(), strict=True)}
     demonstrations, steps, cloned, diffusion = of_expert.values()
     config = JudgeConfig(
@@ -131,7 +135,7 @@ def judge(
     draw_scatter(summary, out / "scatter.png")
     given: dict[str, Any] = {
         "--robot": robot, "--task": task if recordings is None else None, "--policies": policies,
-        "--recordings": recordings, "--split": split, "--registry": registry, "--real": real,
+        "--recordings": recordings, "--split": split, "--reward": reward, "--registry": registry, "--real": real,
         "--starts": judged.config.starts, "--batch": judged.config.batch, "--frames": judged.config.task.frames,
         "--hold": judged.config.task.hold, **(of_expert if recordings is None else {}),
         "--head-episodes": head_episodes, "--head-steps": head_steps, "--seed": seed, "--out": out,

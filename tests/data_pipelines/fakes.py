@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -106,16 +106,20 @@ def write_rlds(
     lengths: list[int],
     shards: int = 1,
     change: Callable[[int, dict], None] | None = None,
+    rewards: Callable[[int], Sequence[float]] | None = None,
 ) -> Path:
     """Writes `<root>/<name>/1.0.0` with one episode per length; returns that directory.
 
-    `change(episode, features)` may spoil an episode before it is written.
+    `change(episode, features)` may spoil an episode before it is written. `rewards(episode)` are those of its steps,
+    which otherwise have none.
     """
     directory = root / spec.name / "1.0.0"
     directory.mkdir(parents=True)
     records = []
     for i, steps in enumerate(lengths):
         features = make_features(i, steps, spec.action_dims)
+        if rewards is not None:
+            features["steps/reward"] = np.asarray(rewards(i), np.float32)
         if change is not None:
             change(i, features)
         records.append(encode_example(features))
@@ -123,11 +127,11 @@ def write_rlds(
     for k, part in enumerate(np.array_split(np.arange(len(records)), shards)):
         path = directory / f"{spec.name}-train.tfrecord-{k:05d}-of-{shards:05d}"
         counts.append(write_shard(path, [records[i] for i in part]))
-    write_metadata(directory, spec, counts)
+    write_metadata(directory, spec, counts, rewards is not None)
     return directory
 
 
-def write_metadata(directory: Path, spec: DatasetSpec, counts: list[int]) -> None:
+def write_metadata(directory: Path, spec: DatasetSpec, counts: list[int], rewarded: bool = False) -> None:
     from tensorflow_datasets import features as tf
 
     def tensor(size: int):
@@ -145,6 +149,7 @@ def write_metadata(directory: Path, spec: DatasetSpec, counts: list[int]) -> Non
                     "is_last": tf.Scalar(dtype=np.bool_),
                     "language_instruction": tf.Text(),
                 }
+                | ({"reward": tf.Scalar(dtype=np.float32)} if rewarded else {})
             ),
             "episode_metadata": tf.FeaturesDict({"success": tf.Scalar(dtype=np.bool_)}),
         }

@@ -14,7 +14,7 @@ from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.sources.identity import episode_ids
 from data_pipelines.sources.open import open_source, source_name
 from data_pipelines.sources.rlds.images import fit_images
-from data_pipelines.sources.source import INSTRUCTION_KEY
+from data_pipelines.sources.source import INSTRUCTION_KEY, REWARD_KEY
 from data_pipelines.tokens.manifest import FILE as MANIFEST
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError, require
@@ -67,6 +67,10 @@ class Trajectories(ABC):
         """Raises EpisodeError for an episode that cannot be read."""
 
     @abstractmethod
+    def rewards(self, i: int) -> np.ndarray | None:
+        """float32 [M], see `rewards_of_frames`; None where the recording has none. Raises EpisodeError as `outline`."""
+
+    @abstractmethod
     def ids(self) -> np.ndarray:
         """uint64 [trajectories]: what decides which are held out, see `sampling.splits`."""
 
@@ -100,6 +104,12 @@ class RldsTrajectories(Trajectories):
     def outline(self, i: int) -> Outline:
         with self._source.open_episode(i, self.spec.image_key, self.spec.action_keys) as episode:
             return Outline(-(-episode.steps // self._robot.stride), episode.success)
+
+    def rewards(self, i: int) -> np.ndarray | None:
+        native = self._source.record(i, [REWARD_KEY]).get(REWARD_KEY)
+        if not isinstance(native, np.ndarray):
+            return None
+        return rewards_of_frames(native, self._robot.stride)
 
     def ids(self) -> np.ndarray:
         return self._source.ids[self._source.numbers]
@@ -142,6 +152,9 @@ class StoredTrajectories(Trajectories):
     def outline(self, i: int) -> Outline:
         episode = self._store.episode(self.name, self.split, i)
         return Outline(len(episode.tokens[:: self._every]), episode.success)
+
+    def rewards(self, i: int) -> np.ndarray | None:
+        return None  # a token store does not keep them
 
     def ids(self) -> np.ndarray:
         manifest = self._store.manifest(self.name)
@@ -200,6 +213,16 @@ def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Rob
     held = np.concatenate([actions, np.repeat(actions[-1:], max(missing, 0), 0)])[: len(images) * robot.stride]
     chunks = held.reshape(len(images), robot.stride, robot.action_dim).astype(np.float32)
     return Trajectory(origin, images, chunks, instruction)
+
+
+def rewards_of_frames(native_N: np.ndarray, stride: int) -> np.ndarray:
+    """float32 [M], of N native steps: the reward of the action that led to each frame, nan for the first. The last frame
+    has the greatest of that and of what came after it, which no frame shows: many recordings reward their last step alone.
+    """
+    before = np.arange(0, len(native_N), stride) - 1
+    rewards = np.where(before < 0, np.nan, native_N[before]).astype(np.float32)
+    rewards[-1] = native_N[max(before[-1], 0) :].max()
+    return rewards
 
 
 def describe(trajectories: Trajectories) -> dict[str, Any]:

@@ -1,8 +1,9 @@
 """A robot without a true simulator: recordings that say whether they succeeded teach the head, and episodes begin as they
 did.
 
-A recording is looked at from where a policy would take over, the last frame of a start. Frames at which nobody knows
-whether the goal is reached, between the first half of a success and its last `hold` frames, are left out.
+A recording is looked at from where a policy would take over, the last frame of a start. Where its rewards say frame by
+frame whether the goal is reached, all of them teach the head. Otherwise those at which nobody knows, between the first half
+of a success and its last `hold` frames, are left out.
 """
 
 from __future__ import annotations
@@ -70,8 +71,13 @@ class Recordings:
         with step("which recordings succeeded") as report:
             outlines = [recorded.outline(i) for i in _one_by_one(range(len(recorded)), report)]
         length = np.array([outline.frames - BEFORE for outline in outlines])
-        known = np.array([outline.success is not None for outline in outlines], bool)
-        self._success = np.array([bool(outline.success) for outline in outlines], bool)
+        self._reached = self._read_rewards(task.reward)
+        if self._reached is None:
+            known = np.array([outline.success is not None for outline in outlines], bool)
+            self._success = np.array([bool(outline.success) for outline in outlines], bool)
+        else:
+            known = np.ones(len(outlines), bool)
+            self._success = np.array([held(x[None, 1:], task.hold).any() for x in self._reached], bool)
         # A recording that is held out of a model's training comes first here, too: by the same hash.
         order = np.argsort(hash64(recorded.ids(), stream_seed("held-out", recorded.spec.name)), kind="stable")
         enough = length > task.hold
@@ -99,6 +105,22 @@ class Recordings:
             starts=starts - starts % batch,
             batch=batch,
         )
+
+    def _read_rewards(self, least: float | None) -> list[np.ndarray] | None:
+        """By their rewards, of every recording at which of the frames that are looked at the goal is reached, bool [n]."""
+        if least is None:
+            return None
+        reached = []
+        with self._step("at which frames their goal is reached") as report:
+            for i in _one_by_one(range(len(self._recorded)), report):
+                rewards = self._recorded.rewards(i)
+                require(
+                    rewards is not None and bool(np.isfinite(rewards[1:]).all()),
+                    f"{self._recorded.origin(i)}: no reward of every step, which --reward asks for; leave it out, and the ends "
+                    "of recordings say which succeeded (tokens have no rewards: give the dataset that they were made of)",
+                )
+                reached.append(rewards[BEFORE:] >= least)
+        return reached
 
     def about(self) -> dict[str, Any]:
         return {"recordings": describe(self._recorded)}
@@ -134,7 +156,7 @@ class Recordings:
         """Of one recording what `fit_heads` takes; half of it, drawn, as the tokenizer shows it. Taken in turn, the frames of
         one kind could all be of one turn."""
         images, rng = self._images(i), np.random.default_rng([self.config.seed, i, 17])
-        chosen, label = labelled(len(images), bool(self._success[i]), self.config.task.hold)
+        chosen, label = self._labelled(i, len(images))
         seen = np.stack([np.broadcast_to(images[0], images[chosen].shape), images[chosen]], 1)
         decoded = rng.permutation(len(chosen))[: len(chosen) // 2]
         flat = seen[decoded].reshape(-1, *images.shape[1:])
@@ -148,7 +170,7 @@ class Recordings:
         scores, labels, said, said_decoded = [], [], [], []
         for i in self.held_out:
             images = self._images(i)
-            chosen, label = labelled(len(images), bool(self._success[i]), hold)
+            chosen, label = self._labelled(i, len(images))
             for shown, found in ((images, said), (reconstruct(images), said_decoded)):
                 probability = head.probabilities(shown, shown[:1])
                 found.append(held(probability[None, 1:] > head.threshold, hold).any())
@@ -163,6 +185,11 @@ class Recordings:
             "episode accuracy, decoded": float((np.array(said_decoded) == successes).mean()),
             **self._left_out,
         }
+
+    def _labelled(self, i: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+        if self._reached is not None:
+            return np.arange(length), self._reached[i]
+        return labelled(length, bool(self._success[i]), self.config.task.hold)
 
     def _images(self, i: int) -> np.ndarray:
         return self._recorded[i].images[BEFORE:]
@@ -180,7 +207,7 @@ class Recordings:
 
 
 def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of a recording of which it is known whether the goal is reached, int [n], and whether it is, bool [n]: no
+    """Frames of a recording without rewards of which it is known whether the goal is reached, int [n], and whether it is, bool [n]: no
     frame of a failure, of a success all of its last `hold` and none of its first half, as far as these leave it."""
     if not success:
         return np.arange(length), np.zeros(length, bool)

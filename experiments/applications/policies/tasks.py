@@ -122,6 +122,7 @@ class RecordedTask:
     robot: str
     frames: int = 0  # 0: as long as most of the recorded successes
     hold: int = 2
+    reward: float | None = None  # from which on a step has reached the goal; None: their ends alone say it
     goal: str = ""  # in words, where the recordings have some
     name: str = "recorded"
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from data_pipelines.registry import DatasetSpec, get_spec
-from experiments.applications.generating.trajectories import Outline, RldsTrajectories
+from experiments.applications.generating.trajectories import Outline, RldsTrajectories, rewards_of_frames
 from experiments.applications.judging.agreement import agree, agree_with_counts, mean_above
 from experiments.applications.judging.head import balanced_error
 from experiments.applications.judging.outcomes import HEAD, read_outcomes
@@ -148,6 +148,7 @@ def test_success_by_a_user_s_own_function_takes_the_place_of_the_head(study, tmp
         (("--frames", "1"), "a goal held for 2 frames does not fit 1 frames"),
         (("--real", "nowhere.csv"), "nowhere.csv cannot be read as counts"),
         (("--batch", "1"), "--batch must be at least 2"),
+        (("--reward", "1"), "berkeley_gnm_cory_hall/train/0: no reward of every step, which --reward asks for"),
     ],
 )
 def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_path, capsys, more, message):
@@ -156,9 +157,9 @@ def test_what_cannot_be_judged_is_refused_before_anything_is_made(study, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("flag", ["--real", "--registry", "--split"])
+@pytest.mark.parametrize("flag", ["--real", "--registry", "--split", "--reward"])
 def test_what_is_of_recordings_is_refused_without_them(tmp_path, capsys, flag):
-    asked = ["--robot", "pusher_sand", "--out", str(tmp_path / "out"), flag, "x"]
+    asked = ["--robot", "pusher_sand", "--out", str(tmp_path / "out"), flag, "1"]
     assert main(["judge", str(tmp_path / "model"), *asked]) == 2
     assert f"{flag} is of robots without a true simulator: give --recordings" in said(capsys, error=True)
 
@@ -215,6 +216,47 @@ def test_every_format_says_how_long_a_recording_is_and_whether_it_succeeded(tmp_
         recorded = RldsTrajectories(str(place), "train", spec, Robot(spec.name, 2, zeros, zeros, zeros), 8)
         assert [recorded.outline(i) for i in range(2)] == [Outline(*one) for one in outlines]
         assert len(recorded[0]) == outlines[0][0] and len(set(recorded.ids().tolist())) == len(recorded)
+
+
+def test_a_frame_has_the_reward_of_the_action_before_it_and_the_last_one_what_came_after():
+    np.testing.assert_array_equal(rewards_of_frames(np.array([0.0, 1, 2, 3, 4]), 1), [np.nan, 0, 1, 2, 4])
+    np.testing.assert_array_equal(rewards_of_frames(np.array([0.0, 1, 2, 3, 4, 9, 5]), 3), [np.nan, 2, 9])
+    np.testing.assert_array_equal(rewards_of_frames(np.array([0.5]), 3), [np.float32(0.5)])
+
+
+def test_rewards_are_read_in_every_format_that_has_them(tmp_path):
+    zeros = (0.0,) * 7
+    rlds = write_rlds(tmp_path, SPEC, [4, 4], rewards=lambda i: np.arange(i, i + 4))
+    without = write_rlds(tmp_path / "without", SPEC, [4])
+    lerobot = write_lerobot(tmp_path / "toy-arm", "v3.0", camera="image")
+    robomimic = write_robomimic(tmp_path / "image.hdf5", lengths=(5, 23))
+    written = (
+        (lerobot, DatasetSpec("toy_arm", "observation/top", ("action",), (3,), 10), [1.0, 1.0]),
+        (robomimic, DatasetSpec("robomimic_lift", "observation/agentview", ("action",), (7,), 20), [1.0, 0.0]),
+        (rlds, SPEC, [3.0, 4.0]),
+        (without, SPEC, [None]),
+    )
+    for place, spec, last in written:
+        own = zeros[: spec.action_dim]
+        recorded = RldsTrajectories(str(place), "train", spec, Robot(spec.name, 2, own, own, own), 8)
+        rewards = [recorded.rewards(i) for i in range(len(last))]
+        assert [None if r is None else r[-1] for r in rewards] == last
+        assert all(len(r) == recorded.outline(i).frames for i, r in enumerate(rewards) if r is not None)
+
+
+def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp_path, capsys, few_draws):
+    """Whatever the flag of success says: of these 20 the first 10 stay at the goal from their fifth frame on."""
+    root = tmp_path / "rewarded"
+    directory = write_rlds(root, SPEC, [9] * 20, rewards=lambda i: (i < 10) * (np.arange(9) >= 3))
+    out, asked = tmp_path / "out", ("--recordings", str(directory), "--reward", "1")
+    assert judge(study, out, "--frames", "3", *asked) == 0
+    head = json.loads((out / "agreement.json").read_text())["head"]
+    assert (head["successes"], head["learnt from"], head["successes among them"]) == (2, 16, 8)
+    # From the third frame on: of a success two without the goal, then five at it.
+    assert head["frames"] == 4 * 7 and head["positive"] == pytest.approx(2 * 5 / 28)
+    assert "--reward 1.0" in (out / "judge.html").read_text()
+    assert judge(study, tmp_path / "none", *asked[:2], "--reward", "2") == 2
+    assert "of 20 recordings 0 succeeded and 20 failed" in said(capsys, error=True)
 
 
 def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():
