@@ -12,6 +12,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 from experiments.cli.hosts import Hosts
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.progress import console, step, tidy_table
+from experiments.running.attempts import JOB
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, require_local, short
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
@@ -66,6 +67,10 @@ def evaluate_model(
     from hma_jax.training.runs import load_model
 
     require_local("--to", to)
+    require(
+        to is None or not (to / JOB).is_file(),
+        f"--to {to}: a trial is there, whose result vouches for the windows that it was made from; choose another --to",
+    )
     trained = load_model(run, setting.study.execution, weights).run
     # Before the work: that its results can be written, and by nobody else.
     with locked_run(to or run, EVALUATION) if is_writer() else nullcontext():

@@ -14,6 +14,7 @@ from experiments.cli.begin import known, require_another_place, require_known, s
 from experiments.cli.hosts import Hosts
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step
+from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, short
 from experiments.sweeps.sweep import reference_trial
@@ -180,11 +181,21 @@ def _check(
 
     options.check()
     require_plain(run)
+    _require_no_trial(setting, run)
     check_schedule(setting.study.train.optimizer, setting.study.train.steps)
     require_only(setting.study.train, setting.study.dataset_names())
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
     return _taken(run, begin)
+
+
+def _require_no_trial(setting: Setting, run: Path) -> None:
+    """Raises ConfigError for the run of a trial: its result vouches for the log as it is, and its study for the steps."""
+    require(
+        run.name != RUN or not (run.absolute().parent / JOB).is_file(),
+        f"{short(run)} is the run of a trial, and its study would refuse what was trained on; to train its model further: "
+        f"{setting.command('train', '--from', run)} --run NEW",
+    )
 
 
 def _require_trained_here(setting: Setting, run: Path) -> None:

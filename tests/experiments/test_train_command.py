@@ -333,6 +333,22 @@ def test_a_converted_run_is_not_resumed(released, where, tmp_path, monkeypatch, 
         assert f"hma train --from {quoted} --preset smoke " in said and said.endswith(" --run NEW\n")
 
 
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_what_a_trial_keeps_is_not_written_over(command, train, where, tmp_path, capsys):
+    """Its study would refuse it, and with it every report."""
+    train()
+    trial = tmp_path / "trials" / "1d"
+    shutil.copytree(tmp_path / "run", trial / "run")
+    (trial / "job.json").write_text("{}")
+    there = sorted(trial.rglob("*"))
+    asked = ["--run", str(trial / "run"), "--set", "train.steps=5"] if command == "train" else ["--to", str(trial)]
+    asked = [*([str(tmp_path / "run")] if command == "evaluate" else []), *asked]
+    assert main([command, *asked, *where]) == 2
+    said = f"train --from {trial / 'run'}" if command == "train" else "a trial is there, whose result vouches"
+    assert said in capsys.readouterr().err
+    assert sorted(trial.rglob("*")) == there
+
+
 def test_a_new_run_does_not_lie_where_the_model_lies_that_it_begins_with(tmp_path, where, monkeypatch, capsys):
     """By default both would be OUT/model."""
     monkeypatch.setattr("experiments.preparing.pipeline.prepare", lambda *_, **__: pytest.fail("it is prepared"))
