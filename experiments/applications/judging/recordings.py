@@ -71,7 +71,7 @@ class Recordings:
         with step("which recordings succeeded") as report:
             outlines = [recorded.outline(i) for i in _one_by_one(range(len(recorded)), report)]
         length = np.array([outline.frames - BEFORE for outline in outlines])
-        self._reached = self._read_rewards(task.reward)
+        self._reached = self._read_rewards(task.reward, [outline.frames for outline in outlines])
         if self._reached is None:
             known = np.array([outline.success is not None for outline in outlines], bool)
             self._success = np.array([bool(outline.success) for outline in outlines], bool)
@@ -106,16 +106,16 @@ class Recordings:
             batch=batch,
         )
 
-    def _read_rewards(self, least: float | None) -> list[np.ndarray] | None:
+    def _read_rewards(self, least: float | None, frames: Sequence[int]) -> list[np.ndarray] | None:
         """By their rewards, of every recording at which of the frames that are looked at the goal is reached, bool [n]."""
         if least is None:
             return None
         reached = []
         with self._step("at which frames their goal is reached") as report:
-            for i in _one_by_one(range(len(self._recorded)), report):
+            for i in _one_by_one(range(len(frames)), report):
                 rewards = self._recorded.rewards(i)
                 require(
-                    rewards is not None and bool(np.isfinite(rewards[1:]).all()),
+                    rewards is not None and len(rewards) == frames[i] and bool(np.isfinite(rewards[1:]).all()),
                     f"{self._recorded.origin(i)}: no reward of every step, which --reward asks for; leave it out, and the ends "
                     "of recordings say which succeeded (tokens have no rewards: give the dataset that they were made of)",
                 )
