@@ -30,9 +30,9 @@ from experiments.running.machine import describe_machine
 from experiments.running.run_options import CHECKPOINTS
 from experiments.running.workspace import Workspace
 from experiments.study import Study
-from experiments.words import plus_minus
+from experiments.words import few, plus_minus
 from hma_jax.config import ConfigError, TokenizerConfig, require
-from hma_jax.config.json import to_dict
+from hma_jax.config.json import diff, to_dict
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -170,11 +170,26 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
             origin = there.inputs[ORIGIN] if there else "not written down"
             lines = [f"tokenizer: {identity} ({origin}) -> {tokenizer.identity} ({source})"]
         require_same("tokenizer", place, lines, replace)
+    _say_held_out_elsewhere(read_stamp(source), study)
     aside = workspace.root / "tokenizer.adopted"
     shutil.rmtree(aside, ignore_errors=True)
     save_tokenizer(tokenizer, aside)
     made_from.save(aside)
     publish(aside, place)
+
+
+def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None:
+    """Of a tokenizer that was trained on datasets of the study with other episodes held out."""
+    inputs = trained_from.inputs if trained_from is not None else {}
+    changes = diff(inputs.get("store", {}), {name: getattr(study.store, name) for name in HELD_OUT}, "store")
+    names = [name for name in study.all_names() if name in inputs.get("data", {})]
+    if names and changes:
+        console.print(
+            f"note: the tokenizer was trained on {few(names)} with other episodes held out ({'; '.join(changes)}): it may "
+            "have seen frames that are held out here",
+            markup=False,
+            soft_wrap=True,
+        )
 
 
 def reconstruction_psnr(tokenizer: Tokenizer, frames: FrameLoader) -> Stat:

@@ -176,6 +176,15 @@ def test_a_tokenizer_that_is_given_does_not_replace_one_that_was_trained(hma, ou
     assert code == 2 and "origin: given with --tokenizer, identity " in said and " -> trained here" in said
 
 
+@pytest.mark.parametrize(("min_val", "told"), [(1, True), (2, False)])
+def test_a_given_tokenizer_that_may_have_seen_what_is_held_out_is_told(min_val, told, made, tmp_path, capsys):
+    there, data = made
+    given = ["--tokenizer", str(there / "tokenizer"), "--set", f"store.min_val={min_val}"]
+    assert main(["tokenize", *SMOKE, "--out", str(tmp_path / "new"), *data, *given]) == 0
+    said = " with other episodes held out (store.min_val: 2 -> 1): it may have seen frames that are held out here"
+    assert (said in capsys.readouterr().out) == told
+
+
 def test_the_tokenizer_that_is_there_can_be_given(hma, out):
     before = contents(out)
     assert hma("tokenize", "--tokenizer", str(out / "tokenizer"))[0] == 0
