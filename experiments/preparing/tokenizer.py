@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,7 +33,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.words import few, plus_minus
 from hma_jax.config import ConfigError, TokenizerConfig, require
-from hma_jax.config.json import diff, to_dict
+from hma_jax.config.json import to_dict
 from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
@@ -179,13 +180,16 @@ def adopt_tokenizer(source: Path, study: Study, workspace: Workspace, replace: S
 
 
 def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None:
-    """Of a tokenizer that was trained on datasets of the study with other episodes held out."""
+    """Of a tokenizer that was trained on datasets of the study with fewer episodes held out: those are among these."""
     inputs = trained_from.inputs if trained_from is not None else {}
-    changes = diff(inputs.get("store", {}), {name: getattr(study.store, name) for name in HELD_OUT}, "store")
+    there, here = inputs.get("store", {}), to_dict(study.store)
+    more = [
+        f"store.{name}: {there[name]} -> {here[name]}" for name in HELD_OUT if here[name] > there.get(name, math.inf)
+    ]
     names = [name for name in study.all_names() if name in inputs.get("data", {})]
-    if names and changes:
+    if names and more:
         console.print(
-            f"note: the tokenizer was trained on {few(names)} with other episodes held out ({'; '.join(changes)}): it may "
+            f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it may "
             "have seen frames that are held out here",
             markup=False,
             soft_wrap=True,
