@@ -25,7 +25,9 @@ class Exit(IntEnum):
     FAILED = 1  # the work could not be done: data, disk, a trial
     REFUSED = 2  # wrong arguments or configuration, or a directory that another process holds
     DIVERGED = 3  # a number was not finite: the same command would end so again
-    LOST = 75  # another process of the same program is lost or failed (EX_TEMPFAIL): start all of them again
+    # EX_TEMPFAIL. Another process of the same program is lost or failed: start all of them again. Of the process of a
+    # trial: its files could not be written.
+    LOST = 75
     UNREAD = 128 + signal.SIGPIPE  # whoever read the output does so no more, as `| head`
     INTERRUPTED = 128 + signal.SIGINT  # Ctrl-C; what could be saved is, and the same command goes on
     STOPPED = 128 + signal.SIGTERM  # the same, asked for by SIGTERM
