@@ -38,6 +38,9 @@ POOLED = (False, True, True, False, False)
 NOTHING = 1e-10
 """Added to the length of a feature vector, which may be zero."""
 
+AT_ONCE = 16
+"""Pairs of images of which features are in memory: 3 MB for each of 256 x 256 pixels."""
+
 
 def require_lpips() -> None:
     """Raises ConfigError, with what to install, where nobody brought the weights."""
@@ -82,14 +85,10 @@ def lpips(params: Params, a: jax.Array, b: jax.Array) -> jax.Array:
     def of_pair(pair: tuple[jax.Array, jax.Array]) -> jax.Array:
         ours, theirs = (_features(params, image[None]) for image in pair)
         weights = [params[f"layer{i}"]["weight"] for i in range(len(LAYERS))]
-        return sum(jnp.mean((x - y) ** 2 @ w) for x, y, w in zip(ours, theirs, weights, strict=True))
+        return sum(jnp.mean(jnp.sum(w * (x - y) ** 2, -1)) for x, y, w in zip(ours, theirs, weights, strict=True))
 
     flat = tuple(x.reshape(-1, *x.shape[-3:]) for x in (a, b))
     return jax.lax.map(of_pair, flat, batch_size=AT_ONCE).reshape(a.shape[:-3])
-
-
-AT_ONCE = 16
-"""Pairs of images of which features are in memory: 3 MB for each of 256 x 256 pixels."""
 
 
 def _features(params: Params, images: jax.Array) -> list[jax.Array]:
