@@ -28,6 +28,11 @@ def robots_trial(study: Study, seed: int, count: int, steps: int, kinship: Kinsh
     """The judged robots of a seed among `count`, judged alone; all robots of the study, for its own steps, are the
     reference trial."""
     names = study.dataset_names()
+    require(
+        steps >= 1,
+        f"{count} of {len(names)} robots are to be trained for their share of train.steps {study.train.steps}, which is "
+        f"none; set it to at least {-(-len(names) // count)}",
+    )
     if count == len(names):
         return reference_trial(study, seed, steps)
     reference = replace(reference_trial(study, seed, steps), measure_untrained=False)

@@ -158,6 +158,8 @@ def test_few_shots_start_from_trials_of_other_axes():
     [
         ("dilution", "designs.counts=", r"designs.counts \(\) must begin with designs.judged, 5, and end with all 40"),
         ("transfer", "designs.counts=", r"designs.counts \(\) must begin"),
+        ("transfer", "train.steps=7", "5 of 40 robots .* share of train.steps 7, which is none; set it to at least 8"),
+        ("newcomers", "train.steps=7", "5 of 40 robots .* share of train.steps 7, which is none; set it to at least 8"),
         ("fewshot", "designs.shots=", "designs.shots is empty"),
         ("fewshot", "designs.shots_after=", "designs.shots_after is empty"),
         ("lr_horizon", "designs.budgets=", "designs.budgets is empty"),
