@@ -95,7 +95,14 @@ class Recordings:
         self.learnt = [i for i in usable if i not in set(self.held_out)]
         frames = task.frames or int(np.ceil(np.quantile(length[kinds[0]], MOST))) - 1  # one is the start's
         said = recorded[self.held_out[0]].instruction
-        starts = min(config.starts, len(self.held_out))
+        # As starts in true worlds do, those begin before their goal is reached, of which that is known.
+        self._begun_from = [i for i in self.held_out if self._reached is None or not self._reached[i][0]]
+        require(
+            len(self._begun_from) >= 2,
+            f"{recorded.name}: {len(self._begun_from)} of {len(self.held_out)} recordings that are held out have not reached "
+            f"their goal (--reward {task.reward}) by frame {BEFORE} at the model's rate, from which policies act",
+        )
+        starts = min(config.starts, len(self._begun_from))
         batch = min(config.batch, starts)
         goal = said or "what its recordings call success"
         self.config = replace(
@@ -196,7 +203,7 @@ class Recordings:
 
     def starts(self) -> list[Start]:
         found = []
-        for i in self.held_out[: self.config.starts]:
+        for i in self._begun_from[: self.config.starts]:
             trajectory = confined(self._recorded[i], self._robot)
             given = trajectory.chunks[:BEFORE].reshape(-1, self._robot.action_dim)
             found.append(Start(self._robot.name, trajectory.images[:START_FRAMES], given))

@@ -255,8 +255,22 @@ def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp
     # From the third frame on: of a success two without the goal, then five at it.
     assert head["frames"] == 4 * 7 and head["positive"] == pytest.approx(2 * 5 / 28)
     assert "--reward 1.0" in (out / "judge.html").read_text()
+    assert load_rollout(out / "rollouts" / "low.learned.npz").images.shape[0] == 4
     assert judge(study, tmp_path / "none", *asked[:2], "--reward", "2") == 2
     assert "of 20 recordings 0 succeeded and 20 failed" in said(capsys, error=True)
+
+
+def test_episodes_begin_before_the_goal_is_reached_where_that_is_known(study, tmp_path, capsys, few_draws):
+    """Of the 4 recordings that are held out both successes are at the goal when policies take over."""
+    directory = write_rlds(tmp_path / "at", SPEC, [9] * 20, rewards=lambda i: np.full(9, float(i < 10)))
+    asked = ("--recordings", str(directory), "--reward", "1", "--frames", "3")
+    assert judge(study, tmp_path / "out", *asked) == 0
+    assert load_rollout(tmp_path / "out" / "rollouts" / "low.learned.npz").images.shape[0] == 2
+    directory = write_rlds(tmp_path / "all", SPEC, [9] * 20, rewards=lambda i: np.r_[np.ones(3), np.full(6, i < 10)])
+    assert judge(study, tmp_path / "none", "--recordings", str(directory), *asked[2:]) == 2
+    assert "0 of 4 recordings that are held out have not reached their goal (--reward 1.0) by frame" in said(
+        capsys, True
+    )
 
 
 def test_between_the_first_half_and_the_last_frames_of_a_success_nobody_knows():
