@@ -4,6 +4,7 @@ import importlib.util
 import pickle
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -106,11 +107,12 @@ def test_the_network_is_alexnet_position_by_position(weights):
 
 def test_any_number_of_pairs_each_by_itself(weights):
     rng = np.random.default_rng(1)
-    a, b = rng.integers(0, 256, (2, 2, AT_ONCE + 1, 31, 31, 3), np.uint8)
-    found = np.asarray(lpips(weights, jnp.asarray(a), jnp.asarray(b)))
-    assert found.shape == (2, AT_ONCE + 1)
-    np.testing.assert_allclose(found[1, -1], lpips(weights, jnp.asarray(a[1, -1]), jnp.asarray(b[1, -1])), rtol=1e-5)
-    assert not np.asarray(lpips(weights, jnp.asarray(a), jnp.asarray(a))).any()
+    a, b = rng.integers(0, 256, (2, AT_ONCE + 1, 31, 31, 3), np.uint8)
+    compare = jax.jit(lpips)
+    found = np.asarray(compare(weights, a, b))
+    assert found.shape == (AT_ONCE + 1,) and (found > 0).all()
+    np.testing.assert_allclose(compare(weights, a[::-1], b[::-1])[::-1], found, rtol=1e-5)
+    assert not np.asarray(compare(weights, a, a)).any()
 
 
 @pytest.mark.parametrize("shape", [(30, 64, 3), (64, 64, 1)])
@@ -159,13 +161,12 @@ def test_evaluation_judges_predicted_and_copied_frames(weights):
         return jnp.broadcast_to(tokens[:, :, None, None], (len(tokens), 32, 32, 3)).astype(jnp.uint8)
 
     predicted = Predicted(grey, grey[:, :1], None)
-    found = image_metrics(decode, 8, {}, predicted, images, config, real, None, weights)
+    found = jax.jit(lambda w: image_metrics(decode, 8, {}, predicted, images, config, real, None, w))(weights)
     shown = decode({}, grey.reshape(-1, 1)).reshape(2, 3, 32, 32, 3)
     copied = jnp.broadcast_to(images[:, 1:2], shown.shape)
-    for metric, made in (("lpips", shown), ("lpips_copy", copied)):
-        of_frames = np.asarray(lpips(weights, made, images[:, 2:]))
-        np.testing.assert_allclose(found[metric], [of_frames[0].mean(), of_frames[1, :2].mean()], rtol=1e-5)
-    assert not {"lpips", "lpips_copy"} & image_metrics(decode, 8, {}, predicted, images, config, real).keys()
+    of_frames = np.asarray(jax.jit(lpips)(weights, jnp.stack([shown, copied]), jnp.stack([images[:, 2:]] * 2)))
+    for metric, of in zip(("lpips", "lpips_copy"), of_frames, strict=True):
+        np.testing.assert_allclose(found[metric], [of[0].mean(), of[1, :2].mean()], rtol=1e-5)
 
 
 def test_a_study_is_refused_before_anything_is_made(tmp_path, monkeypatch):

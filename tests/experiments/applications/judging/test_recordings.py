@@ -245,29 +245,22 @@ def test_rewards_are_read_in_every_format_that_has_them(tmp_path):
 
 
 def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp_path, capsys, few_draws):
-    """Whatever the flag of success says: of these 20 the first 10 stay at the goal from their fifth frame on."""
-    root = tmp_path / "rewarded"
-    directory = write_rlds(root, SPEC, [9] * 20, rewards=lambda i: (i < 10) * (np.arange(9) >= 3))
-    out, asked = tmp_path / "out", ("--recordings", str(directory), "--reward", "1")
-    assert judge(study, out, "--frames", "3", *asked) == 0
+    """Whatever the flag of success says: of these 20 the first 10 stay at the goal, seven of them from the first frame on,
+    three from their fifth. Policies begin where it is not reached yet."""
+    begin = [0] * 7 + [3] * 3
+    written = write_rlds(tmp_path, SPEC, [9] * 20, rewards=lambda i: (i < 10) * (np.arange(9) >= begin[i % 10]))
+    out, asked = tmp_path / "out", ("--recordings", str(written), "--frames", "3", "--reward")
+    assert judge(study, out, *asked, "1") == 0
     head = json.loads((out / "agreement.json").read_text())["head"]
     assert (head["successes"], head["learnt from"], head["successes among them"]) == (2, 16, 8)
-    # From the third frame on: of a success two without the goal, then five at it.
-    assert head["frames"] == 4 * 7 and head["positive"] == pytest.approx(2 * 5 / 28)
+    # From the third frame on: of one held-out success two without the goal, then five at it; of the other seven.
+    assert head["frames"] == 4 * 7 and head["positive"] == pytest.approx((5 + 7) / 28)
+    assert load_rollout(out / "rollouts" / "low.learned.npz").images.shape[0] == 3
     assert "--reward 1.0" in (out / "judge.html").read_text()
-    assert load_rollout(out / "rollouts" / "low.learned.npz").images.shape[0] == 4
-    assert judge(study, tmp_path / "none", *asked[:2], "--reward", "2") == 2
+    assert judge(study, tmp_path / "none", *asked, "2") == 2
     assert "of 20 recordings 0 succeeded and 20 failed" in said(capsys, error=True)
-
-
-def test_episodes_begin_before_the_goal_is_reached_where_that_is_known(study, tmp_path, capsys, few_draws):
-    """Of the 4 recordings that are held out both successes are at the goal when policies take over."""
-    directory = write_rlds(tmp_path / "at", SPEC, [9] * 20, rewards=lambda i: np.full(9, float(i < 10)))
-    asked = ("--recordings", str(directory), "--reward", "1", "--frames", "3")
-    assert judge(study, tmp_path / "out", *asked) == 0
-    assert load_rollout(tmp_path / "out" / "rollouts" / "low.learned.npz").images.shape[0] == 2
-    directory = write_rlds(tmp_path / "all", SPEC, [9] * 20, rewards=lambda i: np.r_[np.ones(3), np.full(6, i < 10)])
-    assert judge(study, tmp_path / "none", "--recordings", str(directory), *asked[2:]) == 2
+    always = write_rlds(tmp_path / "all", SPEC, [9] * 20, rewards=lambda i: np.r_[np.ones(3), np.full(6, i < 10)])
+    assert judge(study, tmp_path / "none", "--recordings", str(always), *asked[2:], "1") == 2
     assert "0 of 4 recordings that are held out have not reached their goal (--reward 1.0) by frame" in said(
         capsys, True
     )
