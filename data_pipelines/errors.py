@@ -9,6 +9,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+NAMED = 6
+"""Examples that are said one by one, the others by their number: of a dataset that was fetched in part every shard may
+be damage."""
+
 ADVICE = re.compile(r"[.;] (?:Fetch|Repair|[Ll]eave) [^.;]*(?:--skip-damaged|corrupt='skip')[^.;]*\.?$")
 """The end of a message that says how damage is left out."""
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from data_pipelines.errors import NAMED
 from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.duplicates import Fingerprint
 from data_pipelines.inspection.inspect import ActionFacts, Facts
@@ -15,9 +16,6 @@ from data_pipelines.registry.angles import TURN
 from data_pipelines.sources.rlds.schema import field_slice
 
 MISFIT = "entry does not fit"
-
-NAMED = 6
-"""Examples that a remark lists."""
 
 
 @dataclass(frozen=True)

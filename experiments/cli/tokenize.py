@@ -9,6 +9,7 @@ from typing import Annotated
 from rich.markup import escape
 from tyro.conf import OmitArgPrefixes, arg
 
+from data_pipelines.errors import NAMED
 from experiments.cli.arguments import Remake
 from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
@@ -16,9 +17,6 @@ from experiments.running.workspace import Busy, Workspace
 from experiments.setting import Setting, StudyArguments, make_setting, short
 from experiments.wrote import wrote
 from hma_jax.config import require
-
-NAMED = 6
-"""Losses of a dataset that are said one by one: of one that was fetched in part every shard may be one."""
 
 
 def tokenize(

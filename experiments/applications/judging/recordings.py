@@ -214,8 +214,9 @@ class Recordings:
 
 
 def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of a recording without rewards of which it is known whether the goal is reached, int [n], and whether it is, bool [n]: no
-    frame of a failure, of a success all of its last `hold` and none of its first half, as far as these leave it."""
+    """Frames of a recording without rewards of which it is known whether the goal is reached, int [n], and whether it is,
+    bool [n]: no frame of a failure, of a success all of its last `hold` and none of its first half, as far as these leave it.
+    """
     if not success:
         return np.arange(length), np.zeros(length, bool)
     half = min(length // 2, length - hold)

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
+from data_pipelines.errors import NAMED
 from experiments.cli.data.next_command import no_window, other_rate, tokenize_command
 from experiments.progress import console, step, tidy_table
 from experiments.setting import say_unmatched, use_entries
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
     from data_pipelines.registry import DatasetSpec
 
 SHEET = "contact_sheet.png"
-
-NAMED = 6
-"""Damaged places that are said one by one: of a dataset that was fetched in part every shard may be one."""
 
 
 def data_list(
