@@ -35,7 +35,7 @@ def check(
         windows: Of each robot.
     """
     from experiments.applications.check import check_run, choose_robots, open_study, verdict, write_effects
-    from experiments.cli.evaluate import check_fits
+    from experiments.cli.evaluate import check_fits, say_what_it_may_have_seen
     from hma_jax.simulator.folder import find_robots
     from hma_jax.training.runs import load_model
 
@@ -48,6 +48,7 @@ def check(
         chosen, left_out = choose_robots(run, model, materials, robots, windows, workspace.root)
         for why in left_out.values():
             console.print(f"not checked: {why}", markup=False, soft_wrap=True)
+        say_what_it_may_have_seen(model.run, chosen, materials.store)
         found = check_run(run, model, materials, chosen, windows)
     names = {robot.name: robot.dimensions for robot in find_robots(run, model.table)}
     for robot, effects in found.items():

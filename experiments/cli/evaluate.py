@@ -99,12 +99,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             f"{few(besides)}, which --data does not name",
             soft_wrap=True,
         )
-    if elsewhere := trained_on_other_tokens(trained, names, materials.store):
-        console.print(
-            f"note: {few(elsewhere)}: the model was trained on other tokens than lie here, so that it may have seen "
-            "episodes that are held out here; the --out that it was trained in holds out those that it has not",
-            soft_wrap=True,
-        )
+    say_what_it_may_have_seen(trained, names, materials.store)
     made_from = describe_evaluation(trained, names, materials, setting.study.eval)
     if not replace:
         require_same_evaluation(place, made_from)
@@ -149,6 +144,16 @@ def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
     if not set(config.datasets) <= set(materials.store.names):
         return []
     return list(select_windows(materials.store, config).mixture.dropped)
+
+
+def say_what_it_may_have_seen(trained: Run, names: Sequence[str], store: TokenStore) -> None:
+    """Where what is held out in `store` may be no test of a model."""
+    if elsewhere := trained_on_other_tokens(trained, names, store):
+        console.print(
+            f"note: {few(elsewhere)}: the model was trained on other tokens than lie here, so that it may have seen "
+            "episodes that are held out here; the --out that it was trained in holds out those that it has not",
+            soft_wrap=True,
+        )
 
 
 def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStore) -> list[str]:

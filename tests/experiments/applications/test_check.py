@@ -9,6 +9,7 @@ import pytest
 
 from data_pipelines.windows.evalset import freeze_manifest
 from experiments.applications.check import choose_robots, shortage
+from experiments.cli.check import check
 from hma_jax.config import ConfigError
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -55,3 +56,20 @@ def test_robots_of_too_few_episodes_are_left_out_and_the_others_checked(tmp_path
         choose("few", "none")
     with pytest.raises(ConfigError, match="no windows of other here; there are few, many, none"):
         choose("many", "other")
+
+
+def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, capsys):
+    """Tokens of which more is held out than of those that it was trained on."""
+    own, here = (small_store(tmp_path / f"{n}", lengths=(20,) * 20, min_val=n) for n in (4, 5))
+    assert set(own.manifest("toy").train.episodes) & set(here.manifest("toy").val.episodes)
+    provenance = {"loader": {"datasets": ["toy"]}, "store": own.hash(["toy"])}
+    model = SimpleNamespace(table=own.embodiment_table(("toy",)), run=SimpleNamespace(provenance=provenance))
+    monkeypatch.setattr("hma_jax.training.runs.load_model", lambda run: model)
+    monkeypatch.setattr("experiments.cli.evaluate.check_fits", lambda trained, materials: None)
+    monkeypatch.setattr("experiments.applications.check.check_run", lambda *_: {})
+    for store, told in ((own, False), (here, True)):
+        materials = SimpleNamespace(store=store, manifest=freeze_manifest(store, ("toy",), 4, 64, 0))
+        monkeypatch.setattr("experiments.applications.check.open_study", lambda _, found=materials: found)
+        check(tmp_path, tmp_path)
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("toy: the model was trained on other tokens than lie here, so that it may have seen" in said) == told
