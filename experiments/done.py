@@ -7,7 +7,7 @@ refuses it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,11 @@ from typing import Any
 from experiments.preparing.made_from import read_stamp
 from experiments.running.attempts import RESULT, RUN
 from experiments.running.ledger import DIVERGED, FAILED, Ledger
-from experiments.running.provenance import Provenance
+from experiments.running.provenance import Provenance, trial_closure
 from experiments.running.results_version import RESULTS_VERSION
+from experiments.running.shared_runs import latest_common, share_runs
+from experiments.running.trained import find_trained
+from experiments.running.trial import Trial
 from experiments.running.workspace import Workspace, find_record
 from experiments.setting import Setting
 from experiments.study import Study
@@ -38,16 +41,19 @@ class Done:
     provenance: Provenance = UNKNOWN
     finished: frozenset[str] = frozenset()
     left: Mapping[str, str] = field(default_factory=dict)  # that ended without a result and are not run again, and how
-    steps: Mapping[str, int] = field(default_factory=dict)  # that trials have made, of those that have begun
+    steps: Mapping[str, int] = field(
+        default_factory=dict
+    )  # that trials have made, or go on from, of those not finished
 
 
 NOTHING = Done()
 
 
-def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = False) -> Done:
+def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = False, accept_code: bool = False) -> Done:
     """What there is of the trials of `sweeps` in the study's directory; nothing where another study is.
 
-    `retry_failed`: trials that failed or diverged are run again. Raises ConfigError for a damaged ledger.
+    `retry_failed`: trials that failed or diverged are run again; `accept_code`: they may go on from what other sources
+    trained. Raises ConfigError for a damaged ledger.
     """
     study, workspace = setting.study, setting.workspace
     try:
@@ -60,8 +66,9 @@ def find_done(setting: Setting, sweeps: Sequence[Sweep], retry_failed: bool = Fa
     if record is None or record.provenance is None:
         return done
     provenance = dataclasses.replace(record.provenance, results=RESULTS_VERSION)
-    trials = _trials(workspace, unique_trials(sweeps, provenance), retry_failed)
-    return dataclasses.replace(done, provenance=provenance, **trials)
+    trials = unique_trials(sweeps, provenance)
+    former = find_trained(workspace.trials, trials, provenance, None if accept_code else trial_closure())
+    return dataclasses.replace(done, provenance=provenance, **_trials(workspace, trials, former, retry_failed))
 
 
 def find_prepared(setting: Setting) -> Done:
@@ -75,7 +82,9 @@ def newest_step(run: Path) -> int:
     return max(steps, default=0)
 
 
-def _trials(workspace: Workspace, ids: Collection[str], retry_failed: bool) -> dict[str, Any]:
+def _trials(
+    workspace: Workspace, ids: Mapping[str, Trial], former: Mapping[str, Trial], retry_failed: bool
+) -> dict[str, Any]:
     finished = frozenset(id for id in ids if (workspace.trials / id / RESULT).exists())
     events = {id: record["event"] for id, record in Ledger(workspace.ledger).states().items()}
     ended = {id: events[id] for id in ids if id not in finished and events.get(id) in (FAILED, DIVERGED)}
@@ -83,6 +92,11 @@ def _trials(workspace: Workspace, ids: Collection[str], retry_failed: bool) -> d
     # A trial that diverged is run anew (`runner`).
     begun = [id for id in ids if id not in finished and id not in left and events.get(id) != DIVERGED]
     steps = {id: newest_step(workspace.trials / id / RUN) for id in begun}
+    if former:
+        shared = share_runs(ids, former)
+        for id in begun:
+            before = [one for one in shared[id].before if one[0] in former]
+            steps[id] = steps[id] or latest_common(workspace.trials, before)[1]
     return {"finished": finished, "left": left, "steps": {id: n for id, n in steps.items() if n}}
 
 

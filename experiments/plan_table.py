@@ -80,7 +80,7 @@ def _say_done(done: Done, trials: int) -> str:
     before = {"the suite": done.suite, "the tokenizer": done.tokenizer, "tokens": done.tokens}
     parts = [name for name, there in before.items() if there]
     parts += [f"{len(done.finished)} of {trials} trials"] if done.finished else []
-    parts += [f"{sum(done.steps.values()):,} steps of unfinished training"] if done.steps else []
+    parts += [f"{sum(done.steps.values()):,} steps of training"] if done.steps else []
     said = f"There already, and not counted: {', '.join(parts)}. " if parts else ""
     if done.left:
         how = " or ".join(sorted(set(done.left.values())))

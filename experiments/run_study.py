@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
 from experiments.progress import SweepMonitor, console
 from experiments.report.draw import draw
-from experiments.running.attempts import State, read_states
+from experiments.running.attempts import RESULT, State, read_states
 from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import Launching
@@ -18,6 +18,7 @@ from experiments.running.ledger import FINISHED, Ledger
 from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import share_runs
+from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.running.workspace import Record, Workspace, find_record, save_record
 from experiments.setting import Setting, short
@@ -76,25 +77,40 @@ def run_study(
         record = Record(study, setting.data, kept, whole_command(setting, kept), provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}
-        jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common)
+        former = find_trained(workspace.trials, trials, provenance, None if accept_code else sources)
+        jobs = make_jobs(trials, titles(sweeps, provenance), provenance, common, former)
+        say_trained(jobs, former, workspace)
         states = run_jobs(jobs, workspace, place, retry_failed)
         draw(workspace, record)
     require_results(jobs, states, again)
 
 
 def make_jobs(
-    trials: dict[str, Trial], names: dict[str, str], provenance: Provenance, common: dict[str, Any]
+    trials: dict[str, Trial],
+    names: dict[str, str],
+    provenance: Provenance,
+    common: dict[str, Any],
+    former: Mapping[str, Trial] = {},
 ) -> list[Job]:
     """A job for every trial, the widest and longest first: they take longest, and no worker is left with one at the
     end. Trials that have the beginning of their training in common wait for the shorter ones of them, and those that go
-    on from another one for it."""
-    shared = share_runs(trials)
+    on from another one for it. What `former` ones have in common with them is not trained again."""
+    shared = share_runs(trials, former)
     jobs = []
     for id, trial in sorted(trials.items(), key=lambda item: (-item[1].model.width, -item[1].train.steps)):
         record = {"trial": to_dict(trial), **common, "shared": to_dict(shared[id])}
         sources = {trial_id(other, provenance) for other in trial.with_source()[:-1]}
         jobs.append(Job(id, names[id], record, after=frozenset(sources | {other for other, _ in shared[id].before})))
     return jobs
+
+
+def say_trained(jobs: Sequence[Job], former: Collection[str], workspace: Workspace) -> None:
+    """Says of how many trials that are to be run all training or some is there, in `former` ones."""
+    missing = [job for job in jobs if not (workspace.trials / job.id / RESULT).exists()]
+    count = sum(bool(job.after & set(former)) for job in missing)
+    if count:
+        what = "go on from what was trained here for trials that are not of this study"
+        console.print(f"{count} of {len(missing)} trials to be run {what}")
 
 
 def whole_command(setting: Setting, axes: Sequence[str]) -> str:

@@ -83,7 +83,7 @@ def _run(
 
         sweeps, given, trained = plan_sweeps(setting.study, axes), bool(setting.data), setting.tokenizer is None
         devices = Devices(check_trials(setting.study, sweeps, launching.share()), launching.at_once)
-        done = find_done(setting, sweeps, running.retry_failed)
+        done = find_done(setting, sweeps, running.retry_failed, running.accept_code)
         console.print(plan_table(setting.study, sweeps, devices, given=given, trained=trained, done=done))
         return
     from experiments.run_study import run_study

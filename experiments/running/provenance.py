@@ -120,6 +120,15 @@ def record_end(directory: Path) -> None:
         _save(directory, replace(known, besides=known.besides | later))
 
 
+def record_origin(directory: Path, source: Path) -> None:
+    """Notes that a trial goes on from what the trial in `source` computed: with its sources, on its machines."""
+    before, known = read_record(source), read_record(directory)
+    if before is not None and known is not None:
+        starts = tuple(start for start in before.starts if start not in known.starts) + known.starts
+        merged = {"closures": before.closures | known.closures, "besides": before.besides | known.besides}
+        _save(directory, replace(known, starts=starts, **merged))
+
+
 def read_record(directory: Path) -> TrialRecord | None:
     """None where there is none. Raises ConfigError for one that cannot be read."""
     path = directory / FILE

@@ -1,8 +1,8 @@
 """Trials that share the beginning of their training: one constant phase, a decay for every number of steps.
 
-What a trial is and what it computes does not depend on it: a trial that goes on from another one's checkpoint ends
-with the same bytes as one that was trained alone (`hma_jax.training.branch`). Where the others are not there, or ran
-elsewhere, it is trained from its first step.
+Those that are judged otherwise share all of it. What a trial is and what it computes does not depend on it: a trial
+that goes on from another one's checkpoint ends with the same bytes as one that was trained alone
+(`hma_jax.training.branch`). Where the others are not there, or ran elsewhere, it is trained from its first step.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.running.attempts import RUN
+from experiments.running.provenance import record_origin
 from experiments.running.trial import Trial, training_of
 from hma_jax.config import OptimizerConfig
 from hma_jax.config.json import stable_hash
@@ -29,16 +30,21 @@ class Shared:
 ALONE = Shared()
 
 
-def share_runs(trials: Mapping[str, Trial]) -> dict[str, Shared]:
-    """For every trial of a study, by id. Trials of as many steps that are judged otherwise share as well."""
+def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) -> dict[str, Shared]:
+    """For every trial of a study, by id. `former`: others that are finished (`trained.find_trained`)."""
+    trained: dict[str, dict[str, int]] = defaultdict(dict)
+    for id, trial in former.items():
+        trained[stable_hash(training_of(trial))][id] = trial.train.steps
     families: dict[str, list[tuple[int, str]]] = defaultdict(list)
     for id, trial in trials.items():
         families[stable_hash(training_of(trial))].append((trial.train.steps, id))
     found = {}
-    for family in map(sorted, families.values()):
+    for key, family in families.items():
+        family.sort()
         for i, (steps, id) in enumerate(family):
             optimizer = trials[id].train.optimizer
-            common = [(other, common_steps(optimizer, steps, n)) for n, other in family[:i]]
+            others = trained[key] | {other: n for n, other in family[:i]}
+            common = [(other, common_steps(optimizer, steps, n)) for other, n in others.items()]
             keep = {common_steps(optimizer, steps, n) for n, _ in family[i + 1 :]} - {0}
             found[id] = Shared(tuple((other, step) for other, step in common if step), tuple(sorted(keep)))
     return found
@@ -48,19 +54,31 @@ def common_steps(optimizer: OptimizerConfig, fewer: int, more: int) -> int:
     """Up to which step two runs are the same; 0: they differ from the beginning."""
     from hma_jax.training.optimizer import steps_in_common
 
+    if fewer == more:  # the trials are judged otherwise, or on others
+        return fewer
     return int(min(steps_in_common(optimizer, fewer, more), fewer, more))
 
 
 def begin_shared(directory: Path, before: Iterable[tuple[str, int]]) -> tuple[str, int] | None:
     """Lets the trial in `directory` go on from the latest checkpoint that it has in common with those `before` it.
 
-    Returns whose it was and its step; None if it begins by itself, or has begun.
+    Its record then has the sources and machines of both. Returns whose it was and its step; None if it begins by
+    itself, or has begun.
     """
-    from hma_jax.training.branch import begin_from, last_step
+    from hma_jax.training.branch import begin_from, has_begun
 
-    runs = {id: directory.parent / id / RUN for id, _ in before}
-    there = {id: last_step(runs[id], until) for id, until in before}
-    best = max(there, key=lambda id: there[id], default=None)
-    if best is None or not there[best] or begin_from(runs[best], directory / RUN, there[best]) is None:
+    best, step = latest_common(directory.parent, before)
+    if not step or has_begun(directory / RUN):
         return None
-    return best, there[best]
+    record_origin(directory, directory.parent / best)  # first: a copy that is cut short is made again
+    begin_from(directory.parent / best / RUN, directory / RUN, step)
+    return best, step
+
+
+def latest_common(trials: Path, before: Iterable[tuple[str, int]]) -> tuple[str, int]:
+    """Which of those `before` a trial has the latest checkpoint in common with it, and its step; 0 where none has any."""
+    from hma_jax.training.branch import last_step
+
+    there = [(last_step(trials / id / RUN, until), id) for id, until in before]
+    step, id = max(there, key=lambda one: one[0], default=(0, ""))
+    return id, step

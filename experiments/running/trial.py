@@ -58,6 +58,8 @@ def training_of(trial: Trial) -> dict[str, Any]:
     for name in ("evaluated", "eval", "measure_untrained"):
         del fields[name]
     del fields["train"]["steps"]
+    if trial.source:
+        fields["source"] = training_of(trial.source) | {"steps": trial.source.train.steps}
     return fields
 
 

@@ -23,6 +23,11 @@ def last_step(run_dir: Path, latest: int) -> int:
     return max((step for step in list_steps(run_dir / CHECKPOINTS) if step <= latest), default=0)
 
 
+def has_begun(run_dir: Path) -> bool:
+    """Whether a run has a checkpoint."""
+    return bool(list_steps(run_dir / CHECKPOINTS))
+
+
 def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
     """Puts into `run_dir` the last checkpoint of `source` up to step `latest`, and what was logged until then.
 
@@ -30,7 +35,7 @@ def begin_from(source: Path, run_dir: Path, latest: int) -> int | None:
     checkpoint appears whole or not at all. Whether the two runs agree is checked when it is restored. Raises OSError.
     """
     step = last_step(source, latest)
-    if not step or list_steps(run_dir / CHECKPOINTS):
+    if not step or has_begun(run_dir):
         return None
     place = run_dir / CHECKPOINTS / str(step)
     place.parent.mkdir(parents=True, exist_ok=True)

@@ -47,7 +47,19 @@ def test_finished_trials_are_not_priced_again_and_begun_ones_from_their_step(set
     assert plans[first].flops == pytest.approx(plans[first].cost.flops - 2 / 3 * plans[first].cost.train_flops)
     assert plans[second].flops == plans[second].cost.flops
     said = plan_table(STUDY, sweeps, done=done).caption
-    assert f"{len(done.finished)} of {len(plans)} trials, 2 steps of unfinished training. About " in said
+    assert f"{len(done.finished)} of {len(plans)} trials, 2 steps of training. About " in said
+
+
+def test_trials_that_are_judged_otherwise_are_not_trained_again(setting):
+    """Where what was trained is still here; by other sources only where the user accepts them, as the study would."""
+    sweeps = plan_sweeps(replace(STUDY, eval=replace(STUDY.eval, random_actions=3)), SCALING)
+    for id in find_done(setting, plan_sweeps(STUDY, SCALING)).finished:
+        (setting.workspace.trials / id / "run" / "checkpoints" / "3").mkdir(parents=True)
+    for accept in (False, True):
+        done = find_done(setting, sweeps, accept_code=accept)
+        plans = plan_trials(STUDY, sweeps, done=done).values()
+        trained = [0.0 if accept else plan.cost.train_flops for plan in plans]
+        assert [plan.flops - plan.cost.evaluation_flops for plan in plans] == pytest.approx(trained, abs=1)
 
 
 def test_trials_that_stay_without_a_result_are_priced_only_where_they_are_tried_again(setting):

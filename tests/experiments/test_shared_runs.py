@@ -12,13 +12,16 @@ from experiments.presets import CPU_FULL, SMOKE
 from experiments.run_study import make_jobs
 from experiments.running import trial as trial_module
 from experiments.running.attempts import RUN
+from experiments.running.provenance import FILE, Start, TrialRecord, read_record
 from experiments.running.runner import Job
 from experiments.running.shared_runs import begin_shared, share_runs
+from experiments.running.trained import find_trained
 from experiments.running.trial import Trial, trial_id
 from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import control_of, reference_trial, titles, unique_trials
 from hma_jax.config import DiffusionConfig
 from hma_jax.config.json import from_dict, stable_hash, to_dict
+from tests.experiments import fakes
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.test_runner import events, job, run
 
@@ -38,8 +41,8 @@ def test_trials_that_differ_in_steps_or_judging_alone_share_their_run():
     trials["control"] = control_of(trial(400))
     shared = share_runs(trials)
     assert shared["100"].before == () and shared["100"].keep == (80,)
-    assert shared["200"].before == (("100", 80),) and shared["200"].keep == (160,)
-    assert shared["judged on five"].before == (("100", 80), ("200", 160))
+    assert shared["200"].before == (("100", 80),) and shared["200"].keep == (160, 200)
+    assert shared["judged on five"].before == (("100", 80), ("200", 200))
     assert dict(shared["400"].before) == {"100": 80, "200": 160, "judged on five": 160} and shared["400"].keep == ()
     for alone in ("another seed", "control"):
         assert shared[alone].before == () and shared[alone].keep == ()
@@ -66,6 +69,58 @@ def test_a_trial_begins_at_the_latest_step_that_it_has_in_common(tmp_path):
     assert begin_shared(tmp_path / "400", before) is None, "it has begun"
     assert begin_shared(tmp_path / "other", (("300", 240),)) is None
     assert begin_shared(tmp_path / "other", (("100", 70),)) is None, "its checkpoints are of the decay"
+
+
+def test_a_trial_that_is_judged_otherwise_goes_on_from_what_is_trained(tmp_path):
+    """Of its finished namesake in all but the judging: from the last step, or, with other steps, from before the decay."""
+    former = {"200": trial(200), "other": replace(trial(200), tau=1.0)}
+    judged = replace(trial(200), eval=replace(trial(200).eval, random_actions=3))
+    adapted = replace(judged, source=trial(100))
+    now = {"judged": judged, "longer": trial(400), "adapted": adapted, "seed": replace(judged, weighed="all")}
+    former["adapted"] = replace(trial(200), source=replace(trial(100), eval=judged.eval))
+    shared = share_runs(now, former)
+    assert shared["judged"].before == (("200", 200),) and not shared["seed"].before
+    assert shared["longer"].before == (("200", 160), ("judged", 160)) and shared["adapted"].before == (
+        ("adapted", 200),
+    )
+    assert shared["judged"].keep == (160,)
+    source = replace(trial(100), train=replace(trial(100).train, steps=99))
+    assert share_runs({"a": replace(adapted, source=source)}, former)["a"].before == ()
+
+
+def test_it_says_then_what_both_ran(tmp_path):
+    """The sources and machines of the trial that it goes on from, and its own."""
+    checkpoint(tmp_path, "200", 160, 200)
+    (tmp_path / "new").mkdir()
+    for id, code in (("200", "old"), ("new", "now")):
+        record = TrialRecord(PROVENANCE, {code: {"experiments.running.trial": code}}, {}, (Start(code, {}),))
+        (tmp_path / id / FILE).write_text(json.dumps(to_dict(record)))
+    assert begin_shared(tmp_path / "new", (("200", 200),)) == ("200", 200)
+    record = read_record(tmp_path / "new")
+    assert record.code == "now" and set(record.closures) == {"old", "now"} and len(record.starts) == 2
+    assert begin_shared(tmp_path / "new", (("200", 200),)) is None
+
+
+def test_what_is_trained_is_found_where_its_name_tokens_and_sources_are_today_s(tmp_path):
+    trials = fakes.finished_study(tmp_path).trials
+    ids = sorted(path.name for path in trials.iterdir())
+    ran = dict(fakes.RECORD.closures["c0de"])
+    assert find_trained(trials, (), PROVENANCE, ran) == {}, "no checkpoint is left"
+    for id in ids:
+        checkpoint(trials, id, 3)
+    windows = replace(PROVENANCE, manifest="other")
+    assert (
+        sorted(find_trained(trials, (), windows, ran)) == ids
+        and sorted(find_trained(trials, ids[2:], windows, ran)) == ids[:2]
+    )
+    assert find_trained(trials, (), replace(PROVENANCE, store="other"), ran) == {}
+    other = {"experiments.running.trial": "2"}
+    assert find_trained(trials, (), PROVENANCE, other) == {} and len(find_trained(trials, (), PROVENANCE, None)) == len(
+        ids
+    )
+    (trials / ids[0]).rename(trials / "renamed")
+    (trials / ids[1] / "job.json").write_text("{")
+    assert sorted(find_trained(trials, (), PROVENANCE, ran)) == ids[2:]
 
 
 def test_a_job_waits_for_those_that_it_goes_on_from(tmp_path):

@@ -126,7 +126,7 @@ def test_a_dry_run_counts_nothing_that_is_there(train):
     train()
     said, *_ = train("--set", "train.steps=6", "--dry-run")
     said = " ".join(said.split())
-    assert "There already, and not counted: the tokenizer, tokens, 3 steps of unfinished training. About" in said
+    assert "There already, and not counted: the tokenizer, tokens, 3 steps of training. About" in said
     assert "to prepare" not in said
 
 

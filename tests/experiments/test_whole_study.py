@@ -68,3 +68,23 @@ def test_killed_study_ends_with_the_same_csv(tmp_path):
     shutil.rmtree(tmp_path / "trials" / lost)  # never killed, this time
     finish(command)
     assert starts(tmp_path) == 7 and (tmp_path / "results.csv").read_bytes() == csv
+
+
+@pytest.mark.slow
+def test_a_study_that_is_judged_otherwise_trains_nothing_again(tmp_path):
+    command = hma("sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path), "--set", "trajectory_counts=4")
+    finish(command)
+    before = {p.name: json.loads((p / "result.json").read_text()) for p in (tmp_path / "trials").iterdir()}
+    finish([*command, "--set", "eval.random_actions=3", "--replace", "study"])
+    now = [
+        json.loads((path / "result.json").read_text())
+        for path in (tmp_path / "trials").iterdir()
+        if path.name not in before
+    ]
+    assert len(now) == len(before) == 2 and {one["run"]["train_seconds"] for one in now} == {0.0}
+
+    def of(results):
+        return sorted((one["training_loss"]["mean"], str(stats["perplexity"])) for one in results
+                      for stats in one["evaluation"].values())  # fmt: skip
+
+    assert of(now) == of(before.values())  # of the recorded actions: the models are the same

@@ -1,0 +1,42 @@
+"""Finished trials that lie in a study's directory and are not of it: what they were trained for need not be trained again.
+
+A study that is to be judged otherwise (`eval`, `--replace study`) has trials of other names. Their training is the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+
+from experiments.running.attempts import JOB, RESULT, RUN
+from experiments.running.closure import Closure, changed
+from experiments.running.job import read_job
+from experiments.running.provenance import Provenance, inputs_of, read_record
+from experiments.running.trial import Trial, trial_id
+
+
+def find_trained(
+    trials: Path, ids: Collection[str], provenance: Provenance, sources: Closure | None
+) -> dict[str, Trial]:
+    """Finished trials in `trials` by id, without those of `ids`, that were trained on the same tokens, are what today's code
+    would name so, and have checkpoints.
+
+    `sources`: those that they have to have run; None: whichever. What cannot be read is nothing to go on from.
+    """
+    found = {}
+    for directory in sorted(path.parent for path in trials.glob(f"*/{RESULT}") if path.parent.name not in ids):
+        if not (directory / RUN / "checkpoints").is_dir():
+            continue
+        try:
+            job = json.loads((directory / JOB).read_text())
+            trial, inputs = read_job(job)[0], inputs_of(job["provenance"])
+            ran = read_record(directory)
+        except (OSError, ValueError, KeyError, TypeError):  # ConfigError is a ValueError
+            continue
+        alike = replace(inputs, manifest=provenance.manifest) == provenance  # the manifest is what it is judged on
+        same = sources is None or (ran is not None and not any(changed(c, sources) for c in ran.sources().values()))
+        if alike and same and trial_id(trial, inputs) == directory.name:
+            found[directory.name] = trial
+    return found
