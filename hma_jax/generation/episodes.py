@@ -98,3 +98,8 @@ def choose(which_B: jax.Array, new: T, old: T) -> T:
 def take(episodes: Episodes, rows_B: jax.Array) -> Episodes:
     """Episode b goes on as a copy of episode `rows_B[b]`."""
     return jax.tree.map(lambda x: jnp.take(x, rows_B, axis=0), episodes)
+
+
+def put(episodes: Episodes, rows_n: jax.Array, new: Episodes) -> Episodes:
+    """Episode `rows_n[i]` goes on as the i-th of `new`, the others as they are. A row may stand twice with equal ones."""
+    return jax.tree.map(lambda whole, part: whole.at[rows_n].set(part), episodes, new)

@@ -1,13 +1,13 @@
 """What a simulator compiles: from pixels and raw actions to pixels in one call each, of fixed shapes.
 
 Begin from images, begin again from tokens, advance, copy: each takes and gives back the state of all episodes, and
-all but the last use its memory again. `advance` is compiled once for every power of two of episodes that advance
-together (`padded`), so that those that wait cost nothing.
+all but the last use its memory again. The first three are compiled once for every power of two of episodes that they
+are of (`padded`), so that the others cost nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import DecodeConfig
-from hma_jax.generation.episodes import Episodes, advance_each, choose, start_each, take
+from hma_jax.generation.episodes import Episodes, advance_each, put, start_each, take
 from hma_jax.model.params import Params
 from hma_jax.simulator.episode import Episode
 from hma_jax.tokenizers.shared import BaseTokenizer
@@ -23,30 +23,29 @@ from hma_jax.training.runs import Model
 
 
 class Beginning(NamedTuple):
-    """Where episodes begin, or begin again; padded to the room of T - 1 frames."""
+    """Where n of the episodes begin, or begin again; padded to the room of T - 1 frames."""
 
-    frames: np.ndarray  # uint8 [B, T - 1, H, W, 3], or tokens [B, T - 1, S (, C)]
-    chunks: np.ndarray  # float32 [B, T - 2, U]
-    robots: np.ndarray  # int32 [B]
-    given: np.ndarray  # int32 [B]: how many of the frames are real
-    counts: np.ndarray  # int32 [B]: frames so far
-    which: np.ndarray  # bool [B]: the others stay where they are
+    rows: np.ndarray  # int32 [n]: which; one that stands twice begins the same twice
+    frames: np.ndarray  # uint8 [n, T - 1, H, W, 3], or tokens [n, T - 1, S (, C)]
+    chunks: np.ndarray  # float32 [n, T - 2, U]
+    robots: np.ndarray  # int32 [n]
+    given: np.ndarray  # int32 [n]: how many of the frames are real
+    counts: np.ndarray  # int32 [n]: frames so far
 
     @classmethod
-    def blank(cls, episodes: int, room: int, width: int, shape: tuple[int, ...], dtype: Any) -> Beginning:
-        """Of none of so many episodes, with frames of `shape`."""
-        frames = np.zeros((episodes, room, *shape), dtype)
-        chunks = np.zeros((episodes, room - 1, width), np.float32)
-        one, none = np.ones(episodes, np.int32), np.zeros(episodes, np.int32)
-        return cls(frames, chunks, none, one, one.copy(), np.zeros(episodes, bool))
+    def blank(cls, rows: Sequence[int], room: int, width: int, shape: tuple[int, ...], dtype: Any) -> Beginning:
+        """Of these episodes, with frames of `shape`, before they are placed."""
+        n = len(rows)
+        frames, chunks = np.zeros((n, room, *shape), dtype), np.zeros((n, room - 1, width), np.float32)
+        return cls(np.array(rows, np.int32), frames, chunks, *np.zeros((3, n), np.int32))
 
-    def place(self, b: int, episode: Episode, frames: np.ndarray) -> None:
-        """Episode b begins as `episode` after the newest `frames` of its window."""
+    def place(self, i: int, episode: Episode, frames: np.ndarray) -> None:
+        """The i-th of them begins as `episode` after the newest `frames` of its window."""
         given = len(frames)
-        self.frames[b, :given] = frames
+        self.frames[i, :given] = frames
         if given > 1:
-            self.chunks[b, : given - 1] = list(episode.chunks)[-(given - 1) :]
-        self.robots[b], self.given[b], self.counts[b], self.which[b] = episode.index, given, episode.count, True
+            self.chunks[i, : given - 1] = list(episode.chunks)[-(given - 1) :]
+        self.robots[i], self.given[i], self.counts[i] = episode.index, given, episode.count
 
 
 class Weights(NamedTuple):
@@ -79,8 +78,7 @@ class Programs:
         def again(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array]:
             tokens = jnp.asarray(at.frames)
             newest = jnp.take_along_axis(tokens, at.given.reshape(-1, *(1,) * (tokens.ndim - 1)) - 1, axis=1)[:, 0]
-            state = choose(at.which, fresh(weights, tokens, at), state)
-            return state, decoded(weights, newest)
+            return put(state, at.rows, fresh(weights, tokens, at)), decoded(weights, newest)
 
         def begin(weights: Weights, state: Episodes, at: Beginning) -> tuple[Episodes, jax.Array, jax.Array]:
             images = jnp.asarray(at.frames)
@@ -95,8 +93,7 @@ class Programs:
             keys = jax.vmap(jax.random.key)(seed_n)
             before, hma = take(state, rows_n), declared.merge(weights.model)
             new, frames = advance_each(hma, before, chunk_nU, keys, decode, hidden=hidden)
-            state = jax.tree.map(lambda whole, part: whole.at[rows_n].set(part), state, new)
-            return state, frames, decoded(weights, frames)
+            return put(state, rows_n, new), frames, decoded(weights, frames)
 
         self.begin = jax.jit(begin, donate_argnums=1)
         self.again = jax.jit(again, donate_argnums=1)
@@ -105,9 +102,10 @@ class Programs:
         self.token_shape = (tokenizer.tokens, tokenizer.channels) if tokenizer.channels else (tokenizer.tokens,)
         described = jax.ShapeDtypeStruct
         empty = Beginning(
+            described((episodes,), jnp.int32),
             described((episodes, room, *self.token_shape), jnp.float32 if tokenizer.channels else jnp.int32),
             described((episodes, room - 1, model.table.action_width), jnp.float32),
-            *(described((episodes,), kind) for kind in (jnp.int32, jnp.int32, jnp.int32, jnp.bool)),
+            *[described((episodes,), jnp.int32)] * 3,
         )
         self._shapes = jax.eval_shape(lambda weights, at: fresh(weights, at.frames, at), self.weights, empty)
 

@@ -151,17 +151,20 @@ class Simulator:
         require(len(each) == len(numbers) == len(which), asked)
         require(all(0 <= s < 2**32 for s in numbers), "seeds must lie in [0, 2^32)")
         new = {b: self._episode(start, int(seed)) for b, start, seed in zip(which, each, numbers, strict=True)}
-        at = self._blank((*self.tokenizer.image_shape, 3), np.uint8)
-        for b, start in zip(which, each, strict=True):
-            at.place(b, new[b], start.images[-self.room :])
+        if not which:
+            return self.images
+        at = self._blank(which, (*self.tokenizer.image_shape, 3), np.uint8)
+        begun = dict(zip(which, each, strict=True))
+        for i, b in enumerate(at.rows.tolist()):
+            at.place(i, new[b], begun[b].images[-self.room :])
         with self._giving_the_state():
             state, *made = self._programs.begin(self._programs.weights, self._state, at)
             tokens, seen = map(np.asarray, made)
             self._state = state
-        for b, episode in new.items():
-            episode.frames.extend(tokens[b, : at.given[b]])
+        for i, (b, episode) in enumerate(new.items()):
+            episode.frames.extend(tokens[i, : at.given[i]])
             self._episodes[b] = episode
-        return self._show(which, seen[which])
+        return self._show(which, seen[: len(which)])
 
     def _episode(self, start: Start, seed: int) -> Episode:
         robot, table = self.robot(start.robot), self.model.table
@@ -169,8 +172,8 @@ class Simulator:
         require(given == size, f"a start of {robot.name}: frames must be {size}, got {given}")
         return begin_episode(robot, table.index(robot.name), start, seed, self.room, self.history, table.action_width)
 
-    def _blank(self, shape: tuple[int, ...], dtype: Any) -> Beginning:
-        return Beginning.blank(len(self), self.room, self.model.table.action_width, shape, dtype)
+    def _blank(self, which: list[int], shape: tuple[int, ...], dtype: Any) -> Beginning:
+        return Beginning.blank(padded(which, len(self)), self.room, self.model.table.action_width, shape, dtype)
 
     def _begun(self, b: int) -> Episode:
         episode = self._episodes[b]
@@ -297,20 +300,23 @@ class Simulator:
         """
         require(frames >= 0, f"an episode is taken back by 0 frames or more, got {frames}")
         which = chosen_episodes(episodes, len(self))
-        at = self._blank(self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
+        if not which:
+            return self.images
+        at = self._blank(which, self._programs.token_shape, np.float32 if self.tokenizer.channels else np.int32)
         new: dict[int, Episode] = {}
         for b in which:
             reach = self.reach(b)
             require(frames <= reach, f"episode {b} can be taken back by {reach} frames, not by {frames}")
-            episode = new[b] = self._begun(b).earlier(frames)
-            at.place(b, episode, np.stack(list(episode.frames)[-min(episode.count, self.room) :]))
+            new[b] = self._begun(b).earlier(frames)
+        for i, b in enumerate(at.rows.tolist()):
+            at.place(i, new[b], np.stack(list(new[b].frames)[-min(new[b].count, self.room) :]))
         with self._giving_the_state():
             state, made = self._programs.again(self._programs.weights, self._state, at)
             seen = np.asarray(made)
             self._state = state
         for b, episode in new.items():
             self._episodes[b] = episode
-        return self._show(which, seen[which])
+        return self._show(which, seen[: len(which)])
 
     def reach(self, b: int) -> int:
         """By how many frames episode b can be taken back."""

@@ -12,13 +12,16 @@ from hma_jax.simulator.starts import Start
 
 
 def warm_up(simulator: Simulator, together: int | None = None) -> None:
-    """Begins and rewinds black episodes, then all is as before; and compiles for as many as advance together, or up to
-    `together` of them. The others: `warm_up_more`."""
+    """Begins and rewinds black episodes, then all is as before; and compiles for as many as advance together. All of it
+    for any number of episodes at once, or for up to `together` of them. More that advance: `warm_up_more`."""
     kept = simulator.snapshot()
     robot = next(iter(simulator.robots.values()))
     black = np.zeros((1, *simulator.images.shape[1:]), np.uint8)
-    simulator.reset(Start(robot.name, black, np.zeros((0, robot.action_dim), np.float32)))
-    simulator.rewind(0)
+    for size in sizes(len(simulator)):
+        if size <= (together or len(simulator)):
+            which = range(size)
+            simulator.reset(Start(robot.name, black, np.zeros((0, robot.action_dim), np.float32)), episodes=which)
+            simulator.rewind(0, which)
     simulator.restore(kept)
     warm_up_more(simulator, 0, together)
 

@@ -103,6 +103,29 @@ def test_a_waiting_episode_stays_and_another_s_actions_do_not_reach_it():
     assert sim.counts == (10, 3)
 
 
+def test_beginning_and_going_back_cost_what_they_are_of_and_come_to_the_same(monkeypatch):
+    """Of four episodes one, then three: a power of two is computed, and the others stay where they are."""
+    starts, asked, computed = [start(b % 3, b + 1) for b in range(4)], ([2], [1, 3, 0], []), []
+    whole, parts = simulator(episodes=4), simulator(episodes=4)
+    monkeypatch.setattr(parts, "_programs", copy(parts._programs))  # others share them
+    for name in ("begin", "again"):
+        made = getattr(parts._programs, name)
+        counted = lambda w, state, at, made=made: (computed.append(len(at.frames)), made(w, state, at))[1]  # noqa: E731
+        monkeypatch.setattr(parts._programs, name, counted)
+    whole.reset(starts, seeds=range(4))
+    for which in asked:
+        parts.reset([starts[b] for b in which], seeds=which, episodes=which)
+    plans, frames = [chunks_of(b % 3, 4) for b in range(4)], []
+    for t in range(4):
+        frames.append(whole.step([p[t] for p in plans]))
+        np.testing.assert_array_equal(parts.step([p[t] for p in plans]), frames[t])
+    for which in asked:
+        parts.rewind(2, which)
+    np.testing.assert_array_equal(parts.images, frames[1])
+    np.testing.assert_array_equal(parts.step([p[2] for p in plans]), frames[2])
+    assert computed == [1, 4] * 2 and parts.counts == (4, 5, 6, 6)
+
+
 @pytest.mark.parametrize("steps", [3, 9], ids=["in the window", "past it"])
 def test_a_snapshot_is_gone_on_from_any_number_of_times(steps: int):
     sim, plan = simulator(), chunks_of(1, 12)
