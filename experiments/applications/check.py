@@ -76,7 +76,7 @@ def check_run(
 ) -> dict[str, list[Effect]]:
     """Effects of each robot's dimensions, on so many held-out windows of each."""
     known = {r.name: r for r in find_robots(run, model.table)}
-    loss = jax.jit(make_loss(model.config, model.table, model.execution))
+    loss = jax.jit(make_loss(model.config, model.table, model.run.train.masking.setting, model.execution))
     return {
         name: _check(model, loss, materials.store, materials.manifest, known[name], windows, spoil) for name in robots
     }

@@ -188,7 +188,7 @@ def _form(run: Run) -> ModelConfig:
     as the release holds it. Raises ConfigError if the release could not compute it."""
     if _untouched(run):
         return run.model
-    require_official(run.model, run.table)
+    require_official(run.model, run.table, run.train.masking.setting)
     return released_form(run.model)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from hma_jax.config import ConfigError, ModelConfig, MupConfig
+from hma_jax.config import ConfigError, ModelConfig, MupConfig, Setting
 from hma_jax.convert.official_config import BASE_WIDTH, is_continuous
 from hma_jax.model.embodiments import EmbodimentTable
 
@@ -37,9 +37,13 @@ def loads_in_release(config: Mapping[str, Any]) -> bool:
     return not (is_continuous(config) and config.get("use_mup") and config["d_model"] != BASE_WIDTH)
 
 
-def require_official(model: ModelConfig, table: EmbodimentTable) -> None:
-    """Raises ConfigError for a model that the release cannot compute."""
+def require_official(model: ModelConfig, table: EmbodimentTable, setting: Setting = "forward") -> None:
+    """Raises ConfigError for a model, trained for `setting`, that the release cannot compute."""
     reasons = []
+    if setting == "passive":
+        reasons.append("train.masking.setting is 'passive': the model is shown no action, the release shows all")
+    if setting == "inverse":
+        reasons.append("train.masking.setting is 'inverse': its attention looks ahead, the release's looks back only")
     if model.action_alignment != "released":
         reasons.append(f"model.action_alignment is {model.action_alignment!r}, the release has 'released' only")
     if model.conditioning == "cross_attention":

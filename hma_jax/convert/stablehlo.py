@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
-from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, ModelConfig, require
+from hma_jax.config import ConfigError, DecodeConfig, ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.config.json import to_dict
 from hma_jax.convert.aside import written_aside
 from hma_jax.convert.neutral import describe_tensors
@@ -28,6 +28,7 @@ from hma_jax.convert.tensors import write_safetensors
 from hma_jax.generation import rollout
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
+from hma_jax.objective.masking import never_shown
 from hma_jax.training.runs import Run
 
 FORMAT, VERSION = "hma-jax-stablehlo", 1
@@ -58,12 +59,15 @@ class ProgramConfig:
         )
 
 
-def generate_function(model: ModelConfig, table: EmbodimentTable, config: ProgramConfig) -> Callable[..., jax.Array]:
+def generate_function(
+    model: ModelConfig, table: EmbodimentTable, setting: Setting, config: ProgramConfig
+) -> Callable[..., jax.Array]:
     """generate(weights, prompt, actions, embodiment, key) -> frames prompt .. frames - 1.
 
     weights: path -> array. prompt int32 [B, T', S] or float32 [B, T', S, C]; actions float32
     [B, T, U], raw and padded with zeros; embodiment int32 [B]; key uint32 [2], of which every row
-    of the batch derives its own random numbers.
+    of the batch derives its own random numbers. Actions that a model trained for `setting` was never shown are not
+    looked at.
     """
     # One program for every platform: none of them may be a single platform's own.
     declared = declare_model(model, table, ExecutionConfig(attention="plain"))
@@ -71,8 +75,8 @@ def generate_function(model: ModelConfig, table: EmbodimentTable, config: Progra
     def generate(weights, prompt, actions, embodiment, key):
         base = jax.random.wrap_key_data(key, impl="threefry2x32")
         keys = jax.vmap(lambda row: jax.random.fold_in(base, row))(jnp.arange(config.batch))
-        hma = declared.merge(nested(weights))
-        return rollout(hma, prompt, actions[:, None], embodiment, keys, config.decode)[:, 0]
+        hma, hidden = declared.merge(nested(weights)), never_shown(table, setting, embodiment, config.frames)
+        return rollout(hma, prompt, actions[:, None], embodiment, keys, config.decode, hidden_BT=hidden)[:, 0]
 
     return generate
 
@@ -100,7 +104,7 @@ def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
     weights = {path: jax.ShapeDtypeStruct(spec.shape, jnp.float32) for path, spec in leaves.items()}
     inputs = input_shapes(model, table, config)
     with written_aside(directory) as aside:
-        program = jax.jit(generate_function(model, table, config))
+        program = jax.jit(generate_function(model, table, run.train.masking.setting, config))
         exported = export.export(program, platforms=config.platforms)(weights, *inputs.values())
         (aside / PROGRAM).write_bytes(exported.serialize())
         write_safetensors(aside / WEIGHTS, {path: np.asarray(x) for path, x in flat(run.params).items()})
@@ -110,7 +114,8 @@ def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
 
 MEANINGS = {
     "prompt": "frames to continue: token ids, or latent patches",
-    "actions": "raw action chunks of all frames, padded with zeros; chunk t is executed after frame t",
+    "actions": "raw action chunks of all frames, padded with zeros; chunk t is executed after frame t. Not looked at where "
+    "the robot has none in `table`, or the model was trained without",
     "embodiment": "index of each example's robot in `table`",
     "key": "any two numbers, as jax.random.key_data gives them; row i of the batch draws with fold_in(key, i)",
 }

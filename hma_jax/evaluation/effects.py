@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 
-from hma_jax.config import ExecutionConfig, ModelConfig, require
+from hma_jax.config import ExecutionConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.metrics import factored_cross_entropy, mean_over_frames
 from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.generation import next_frame_outputs
@@ -29,6 +29,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params
 from hma_jax.objective.losses import frame_diffusion_loss
+from hma_jax.objective.masking import never_shown
 
 Kind = Literal["still", "negated", "scaled", "swapped"]
 
@@ -164,16 +165,17 @@ def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
 
 
 def make_loss(
-    model: ModelConfig, table: EmbodimentTable, execution: ExecutionConfig = ExecutionConfig()
+    model: ModelConfig, table: EmbodimentTable, setting: Setting, execution: ExecutionConfig = ExecutionConfig()
 ) -> Callable[[Params, dict[str, jax.Array], jax.Array], jax.Array]:
     """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted; the batch
-    is as `protocol.Batch` says."""
+    is as `protocol.Batch` says, `setting` what the model was trained for."""
     declared = declare_model(model, table, execution)
 
     def loss(params: Params, batch: dict[str, jax.Array], actions: jax.Array) -> jax.Array:
         hma, tokens, real = declared.merge(params), batch["tokens"][:, : model.frames], batch.get("real")
         followed = None if real is None else real[:, 1 : model.frames]
-        said = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"])
+        hidden = never_shown(table, setting, batch["embodiment"], model.frames)
+        said = next_frame_outputs(hma, tokens, actions[:, : model.frames], batch["embodiment"], hidden)
         if model.diffusion:
             keys = jax.vmap(jax.random.key)(jnp.arange(len(tokens)))  # common noise under all changes
             return mean_over_frames(frame_diffusion_loss(hma, said, tokens[:, 1:], keys), followed)

@@ -44,6 +44,7 @@ from hma_jax.model.hma import HMA, declare_model
 from hma_jax.model.params import Params
 from hma_jax.model.readout import likeliest
 from hma_jax.objective.losses import frame_diffusion_loss
+from hma_jax.objective.masking import never_shown
 
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
@@ -110,7 +111,7 @@ def make_predictor(
     def predict(params: Params, batch: Batch) -> tuple[dict[str, jax.Array], Predicted]:
         hma = declared.merge(params)
         tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
-        hidden = _hidden(table, setting, robots, actions.shape[1])
+        hidden = never_shown(table, setting, robots, actions.shape[1])
         keys = {
             purpose: window_keys(config.seed, purpose, table, robots, batch["episode"], batch["start"])
             for purpose in ("likelihood", "policy")
@@ -157,16 +158,6 @@ def make_predictor(
         return metrics, predicted
 
     return predict
-
-
-def _hidden(table: EmbodimentTable, setting: Setting, embodiment_B: jax.Array, frames: int) -> jax.Array | None:
-    """bool [B, T]: chunks that the model is not shown; None if it sees all."""
-    shape = (len(embodiment_B), frames)
-    if setting == "passive":
-        return jnp.ones(shape, bool)
-    if all(table.chunks):
-        return None
-    return jnp.broadcast_to(jnp.asarray(table.chunks == 0)[embodiment_B][:, None], shape)
 
 
 def _after_recorded(

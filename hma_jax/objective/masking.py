@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.config import MaskingConfig, ModelConfig
+from hma_jax.config import MaskingConfig, ModelConfig, Setting
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.frames import compose, factorise
 
@@ -148,6 +148,16 @@ def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Arr
     if masking.setting == "policy":
         return jnp.arange(frames) >= jax.random.randint(key, (), 0, frames)
     return jnp.zeros(frames, bool)
+
+
+def never_shown(table: EmbodimentTable, setting: Setting, embodiment_B: jax.Array, frames: int) -> jax.Array | None:
+    """bool [B, T]: chunks that a model so trained was never shown, and is to be used without; None if it sees all."""
+    shape = (len(embodiment_B), frames)
+    if setting == "passive":
+        return jnp.ones(shape, bool)
+    if all(table.chunks):
+        return None
+    return jnp.broadcast_to(jnp.asarray(table.chunks == 0)[embodiment_B][:, None], shape)
 
 
 def mask_example(

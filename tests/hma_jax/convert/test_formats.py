@@ -22,13 +22,15 @@ from hma_jax.convert import (
     write_run,
     write_stablehlo,
 )
+from hma_jax.convert.stablehlo import generate_function
 from hma_jax.convert.table import flat
 from hma_jax.convert.tensors import read_safetensors, write_safetensors
 from hma_jax.generation import rollout
+from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.training.runs import Run, load_run
 from hma_jax.training.train import train_model
 from tests.hma_jax.convert.fakes import CONTINUOUS, DISCRETE, make_checkpoint
-from tests.tiny import TABLE, batches, lively_params, model_config, random_batch, train_config
+from tests.tiny import TABLE, batches, lively_params, model_config, random_batch, shallow_config, train_config
 
 DIFFUSION = DiffusionConfig(channels=2, patch=2, width=8, depth=1)
 
@@ -188,6 +190,25 @@ def test_the_program_generates_the_same_frames_where_this_project_is_not_install
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4)
     else:
         np.testing.assert_array_equal(got, want)
+
+
+def test_a_program_shows_no_action_that_its_model_was_trained_without():
+    """Stem and modulation of such a robot are as they were drawn: noise to every frame."""
+    config, silent = shallow_config(frames=3), Embodiment("film", 0, 1, (), ())
+    batch, program = random_batch(0, config, 2), ProgramConfig(batch=2, prompt=1, frames=3)
+    given = batch["tokens"][:, :1], batch["embodiment"], np.array([0, 7], np.uint32)
+
+    def frames(setting, table, robot, actions):
+        prompt, _, key = given
+        generate = jax.jit(generate_function(config, table, setting, program))
+        weights = flat(lively_params(config, table)[1])
+        return np.asarray(generate(weights, prompt, actions, np.full(2, robot, np.int32), key))
+
+    actions, films = batch["actions"], EmbodimentTable((*TABLE.entries, silent))
+    passive, film, arm = ("passive", TABLE, 1), ("forward", films, 3), ("forward", films, 1)
+    for case in (passive, film):
+        np.testing.assert_array_equal(frames(*case, actions), frames(*case, 3 * actions))
+    assert (frames(*arm, actions) != frames(*arm, 3 * actions)).any()
 
 
 def test_a_program_that_cannot_be_is_refused(tmp_path):

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, ExecutionConfig, MupConfig
+from hma_jax.config import ConfigError, ExecutionConfig, MaskingConfig, MupConfig
 from hma_jax.convert import loads_in_release, read_official, write_official
 from hma_jax.convert.multipliers import folded, query_ratio, readout_ratio
 from hma_jax.convert.official import official_config, official_tensors
@@ -189,3 +189,11 @@ def test_what_the_release_cannot_compute_is_refused_by_name(changes, message, tm
     with pytest.raises(ConfigError, match=message):
         write_official(run, tmp_path / "a")
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize("setting", ["passive", "inverse"])
+def test_a_model_that_is_used_otherwise_than_the_release_uses_all_is_refused(setting, tmp_path):
+    train, config = train_config(masking=MaskingConfig(setting=setting)), model_config()
+    run = Run(config, train, TABLE, declare_model(config, TABLE).init(0), 7, {})
+    with pytest.raises(ConfigError, match=f"train.masking.setting is '{setting}'"):
+        write_official(run, tmp_path / "a")

@@ -1,10 +1,12 @@
 """What is found of action dimensions whose effect is known."""
 
+import jax
 import numpy as np
 import pytest
 
 from hma_jax.config import ConfigError
-from hma_jax.evaluation.effects import Change, Difference, find_effects
+from hma_jax.evaluation.effects import Change, Difference, find_effects, make_loss
+from tests.tiny import TABLE, lively_params, random_batch, shallow_config
 
 DIM, WINDOWS = 4, 48
 WEIGHTS = np.array([1.0, 0.5, -0.8, 0.0])
@@ -71,3 +73,11 @@ def test_few_episodes_say_less_and_too_few_nothing():
 def test_a_model_that_is_deaf_ignores_every_dimension():
     effects = find_effects(lambda actions: np.ones(len(actions)), recorded(), np.zeros(DIM), range(WINDOWS))
     assert all(effect.ignored for effect in effects)
+
+
+def test_a_model_that_was_trained_without_actions_listens_to_none():
+    config, settings = shallow_config(frames=3), ("passive", "forward")
+    params, batch = lively_params(config)[1], random_batch(0, config, 2)
+    losses = [jax.jit(make_loss(config, TABLE, setting)) for setting in settings]
+    passive, forward = ([np.asarray(loss(params, batch, x * batch["actions"])) for x in (1, 3)] for loss in losses)
+    assert (passive[0] == passive[1]).all() and (forward[0] != forward[1]).all()
