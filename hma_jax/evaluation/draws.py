@@ -60,11 +60,11 @@ def random_actions(
     Bit for bit the same in batches of any shape.
     """
 
-    def one(key: jax.Array, value: jax.Array) -> jax.Array:
-        return _normal(jax.random.fold_in(key, value), (draws, frames))
-
-    of_window = jax.vmap(one, (None, 0), -1)
-    noise = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
+    of_window = jax.vmap(jax.random.fold_in, (None, 0))
+    keys = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
+    # In one row: nested rows of keys take XLA three times as long to compile.
+    noise = jax.vmap(lambda key: _normal(key, (draws * frames,)))(keys.reshape(-1))
+    noise = jnp.moveaxis(noise.reshape(*keys.shape, draws, frames), 1, -1)
     mean_BU, std_BU = statistics or own_statistics(embodiment_B, table)
     # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
     from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)
