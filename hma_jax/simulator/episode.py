@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import copy
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from hma_jax.config import require
@@ -59,9 +61,39 @@ def begin_episode(robot: Robot, index: int, start: Start, seed: int, room: int, 
     return Episode(robot, index, seed, seen, deque(maxlen=kept), deque(chunks, maxlen=kept - 1))
 
 
+CHANGING = ("frames", "chunks", "pending")
+"""What of an episode grows while it goes on, besides its count."""
+
+
 class Snapshot(NamedTuple):
     """Where all episodes of a simulator stood."""
 
     state: Episodes
     images: np.ndarray
     episodes: tuple[Episode | None, ...]
+
+
+def as_arrays(snapshot: Snapshot) -> dict[str, np.ndarray]:
+    """A snapshot as a file keeps it; of its episodes, all of which must have begun, what has changed since."""
+    arrays = {"images": snapshot.images}
+    for i, leaf in enumerate(jax.tree.leaves(snapshot.state)):
+        arrays[f"state/{i}"] = np.asarray(leaf)
+    for b, episode in enumerate(snapshot.episodes):
+        arrays |= {f"episode/{b}/{name}": np.array(list(getattr(episode, name))) for name in CHANGING}
+        arrays[f"episode/{b}/count"] = np.array(episode.count)
+    return arrays
+
+
+def from_arrays(arrays: Mapping[str, np.ndarray], begun: Snapshot) -> Snapshot:
+    """What `as_arrays` kept, of a simulator whose same episodes have `begun` again. KeyError for arrays of others."""
+    leaves, tree = jax.tree.flatten(begun.state)
+    # Where they lay, or programs would be compiled once more; a file knows bfloat16 by its width alone.
+    state = [jax.device_put(arrays[f"state/{i}"].view(x.dtype), x.sharding) for i, x in enumerate(leaves)]
+    episodes = copy.deepcopy(begun.episodes)
+    for b, episode in enumerate(episodes):
+        episode.count = int(arrays[f"episode/{b}/count"])
+        for name in CHANGING:
+            rows = getattr(episode, name)
+            rows.clear()
+            rows.extend(arrays[f"episode/{b}/{name}"])
+    return Snapshot(tree.unflatten(state), arrays["images"], episodes)

@@ -3,9 +3,9 @@ Command: python -m experiments.applications.endurance RUN --minutes 10 --out DIR
 Cost: ten minutes of eight robots, half an hour of one core for each variant.
 Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
 
-Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped. Writes
-DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every variant, a sheet of frames, the
-truth above. A detector is needed (experiments.applications.detector).
+Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped, also in the
+middle of a film. Writes DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every variant, a
+sheet of frames, the truth above. A detector is needed (experiments.applications.detector).
 """
 
 from __future__ import annotations
@@ -76,15 +76,15 @@ def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int
 
 def run_variant(
     run: Path, detector: Detector, variant: str, kind: Kind, minutes: float, which: int,
-    robots: Mapping[str, Robot], starts: Mapping[str, Sequence[Start]], update: Update,
+    robots: Mapping[str, Robot], starts: Mapping[str, Sequence[Start]], unfinished: Path, update: Update,
 ) -> dict[str, Film]:  # fmt: skip
-    """`robots` of a run, each from its start number `which` on, in one batch."""
+    """`robots` of a run, each from its start number `which` on, in one batch. See `make_films` for `unfinished`."""
     decode = replace(find_decode(run), **VARIANTS[variant])
     options = {"execution": ExecutionConfig(remat="none"), "episodes": len(robots), "decode": decode, "history": 1}
     simulator, drives = load_simulator(run, **options), []
     for name, robot in robots.items():
         drives.append(make_drive(robot, starts[name][which], round(60 * minutes * robot.hz), kind, seed=which))
-    return make_films(simulator, detector, drives, update)
+    return make_films(simulator, detector, drives, unfinished, update)
 
 
 def main() -> None:
@@ -117,11 +117,13 @@ def main() -> None:
             new: list[Row] = []
             for which in range(asked.starts):
                 path = film_path(asked.out, asked.name, variant, kind, asked.minutes, which, asked.robots)
+                unfinished = path.with_name(f"{path.name}.unfinished")
                 if not path.exists():
                     with step(f"{variant}, {kind}, {asked.minutes:g} min, start {which}") as update:
                         options = (variant, kind, asked.minutes, which, robots, starts)
-                        made = run_variant(asked.run, detector, *options, update)
+                        made = run_variant(asked.run, detector, *options, unfinished, update)
                     save_films(made, path)
+                unfinished.unlink(missing_ok=True)
                 films = load_films(path)
                 hz, tools = ({n: f(SPECS[n]) for n in films} for f in (lambda s: s.hz, lambda s: len(s.body.tools)))
                 new += rows_of(f"{asked.name}/{variant}", kind, which, films, hz, tools, asked.every)

@@ -1,6 +1,7 @@
 """Frames of the learned simulator beside those of the true one, under the same actions, and what is measured in each.
 
-All robots advance in one batch. Frames themselves are not kept, but for a few of each to look at.
+All robots advance in one batch. Frames themselves are not kept, but for a few of each to look at. What there is after
+every `BLOCK` of frames is kept in a file until the films are whole: half an hour of work survives its process.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from experiments.applications.endurance.drives import Drive
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.metrics import psnr
 from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.simulator import Simulator
 
 BLOCK = 64
-"""Frames that are measured together."""
+"""Frames that are measured, and kept, together."""
 
 SHOWN = (1, 12, 24, 48, 120, 240, 600, 1200, 1800, 2400, 3600)
 """Frames that are kept to look at, where they are reached."""
@@ -50,14 +52,20 @@ class Film:
 
 
 def make_films(
-    simulator: Simulator, detector: Detector, drives: Sequence[Drive], progress: Progress = lambda done, total: None
+    simulator: Simulator,
+    detector: Detector,
+    drives: Sequence[Drive],
+    unfinished: Path,
+    progress: Progress = lambda done, total: None,
 ) -> dict[str, Film]:
-    """One film for each drive, named by its robot: `simulator` has as many episodes."""
-    images = [simulator.reset([drive.start for drive in drives], seeds=0).copy()]
-    longest, parts = max(map(len, drives)), {i: [] for i in range(len(drives))}
+    """One film for each drive, named by its robot: `simulator` has as many episodes. Goes on from the file `unfinished`,
+    where a process that was killed has left it, and comes out as if it never had been."""
+    simulator.reset([drive.start for drive in drives], seeds=0)
+    begun, parts = _go_on(simulator, drives, unfinished) if unfinished.exists() else (0, [[] for _ in drives])
+    images, longest = [simulator.images.copy()], max(map(len, drives))
     points = [drive.points() for drive in drives]
     first = [drive.frames(0, 1)[0] for drive in drives]
-    for begin in range(0, longest, BLOCK):
+    for begin in range(begun, longest, BLOCK):
         stop = min(begin + BLOCK, longest)
         for t in range(begin, stop):
             images.append(simulator.step([d.actions[t] if t < len(d) else None for d in drives]).copy())
@@ -69,12 +77,39 @@ def make_films(
                 film, true = block[: end - begin + 1, i], drive.frames(begin, end + 1)
                 parts[i].append(_measured(detector, drive, points[i], begin, film, true, first[i]))
         images = images[-1:]
-    films = {}
-    for i, drive in enumerate(drives):
-        films[drive.robot.name] = Film(
-            **{f.name: np.concatenate([p[f.name] for p in parts[i]], int(f.name == "shown")) for f in fields(Film)}
-        )
-    return films
+        _keep(simulator, parts, stop, unfinished)
+    return {drive.robot.name: Film(**_joined(mine)) for drive, mine in zip(drives, parts, strict=True)}
+
+
+def _joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {f.name: np.concatenate([part[f.name] for part in parts], int(f.name == "shown")) for f in fields(Film)}
+
+
+def _keep(simulator: Simulator, parts: Sequence[Sequence[Mapping[str, np.ndarray]]], frames: int, path: Path) -> None:
+    """All that there is of the films after so many frames."""
+    arrays = as_arrays(simulator.snapshot()) | {"made": np.array(frames)}
+    arrays |= {f"film/{i}/{name}": array for i, mine in enumerate(parts) for name, array in _joined(mine).items()}
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, content.getvalue())
+
+
+def _go_on(
+    simulator: Simulator, drives: Sequence[Drive], path: Path
+) -> tuple[int, list[list[Mapping[str, np.ndarray]]]]:
+    """(frames, parts) as `_keep` left them; the simulator, whose episodes have begun, stands there again. ConfigError for
+    a damaged file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        parts = [[{f.name: arrays[f"film/{i}/{f.name}"] for f in fields(Film)}] for i in range(len(drives))]
+        simulator.restore(from_arrays(arrays, simulator.snapshot()))
+        return int(arrays["made"]), parts
+    except UNREADABLE as error:
+        raise ConfigError(
+            f"{path} cannot be read ({error}); remove it, the same command films from the start"
+        ) from error
 
 
 def _measured(

@@ -12,6 +12,7 @@ import pytest
 from hma_jax.config import ConfigError, DecodeConfig, MaskingConfig, TrainConfig
 from hma_jax.generation import rollout
 from hma_jax.simulator import Simulator, Start
+from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.warm_up import sizes, warm_up, warm_up_more
 from tests.hma_jax.simulator.small import CONFIG, DECODE, ROBOTS, actions, parts, simulator, start
 from tests.tiny import TABLE
@@ -136,6 +137,25 @@ def test_a_snapshot_is_gone_on_from_any_number_of_times(steps: int):
     for _ in range(2):
         sim.restore(kept)
         np.testing.assert_array_equal(run(sim, plan[steps:]), first)
+
+
+def test_a_snapshot_from_a_file_is_gone_on_from_and_taken_back(tmp_path):
+    """By a simulator whose same episodes have begun anew."""
+    sim, other = simulator(episodes=2), simulator(episodes=2)
+    for one in (sim, other):
+        one.reset([start(0, 1), start(1, 2)], seeds=[3, 4])
+    plan = chunks_of(0, 9)
+    for chunk in plan[:6]:
+        sim.step([chunk, None])
+    np.savez(tmp_path / "kept.npz", **as_arrays(sim.snapshot()))
+    with np.load(tmp_path / "kept.npz") as file:
+        other.restore(from_arrays(file, other.snapshot()))
+    np.testing.assert_array_equal(other.images, sim.images)
+    assert other.counts == sim.counts == (7, 2)
+    for one in (sim, other):
+        one.rewind(2, [0])
+    for chunk in plan[4:]:
+        np.testing.assert_array_equal(other.step([chunk, None]), sim.step([chunk, None]))
 
 
 @pytest.mark.parametrize("back", [1, 4, 11])

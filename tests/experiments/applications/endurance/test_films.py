@@ -1,0 +1,66 @@
+"""Films of a tiny simulator beside a truth that is made up, killed and gone on with."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments.applications.endurance import films
+from experiments.applications.endurance.films import Film, make_films
+from hma_jax.config import ConfigError, DecodeConfig
+from tests.hma_jax.simulator.small import ROBOTS, actions, simulator, start
+
+
+class Driven:
+    """In place of a `Drive`, of a robot that no suite has."""
+
+    def __init__(self, robot: int, frames: int):
+        rng = np.random.default_rng(robot)
+        self.robot, self.start = ROBOTS[robot], start(robot, 2)
+        self.actions = actions(robot, frames, rng)
+        self._true = rng.integers(0, 256, (frames + 1, 8, 8, 3), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def frames(self, first: int, stop: int) -> np.ndarray:
+        return self._true[first:stop]
+
+    def points(self) -> SimpleNamespace:
+        spread = np.arange(len(self) + 1.0)
+        return SimpleNamespace(position=spread[:, None, None] + [[[1, 2]]], share=spread[:, None] > 2)
+
+
+def watch(name: str, frames: np.ndarray) -> SimpleNamespace:
+    grey = frames.mean((1, 2, 3))
+    return SimpleNamespace(position=grey[:, None, None] * [[[1, 2]]], confidence=grey[:, None] / 255)
+
+
+@pytest.mark.parametrize("slide", ["exact", pytest.param("streaming", marks=pytest.mark.slow)])
+def test_films_that_a_kill_cut_short_go_on_and_come_out_the_same(slide, tmp_path, monkeypatch):
+    monkeypatch.setattr(films, "BLOCK", 4)
+    decode = DecodeConfig(2, temperature=1.0, slide=slide)
+
+    def make(path, progress=lambda done, total: None) -> dict[str, Film]:
+        one = simulator(episodes=2, decode=decode, history=1)
+        return make_films(one, SimpleNamespace(watch=watch), [Driven(0, 10), Driven(1, 6)], path, progress)
+
+    killed, whole = tmp_path / "films" / "a.npz.unfinished", make(tmp_path / "b.npz.unfinished")
+    with pytest.raises(InterruptedError):
+        make(killed, lambda done, total: _kill() if done == 7 else None)
+    made: list[int] = []
+    again = make(killed, lambda done, total: made.append(done))
+    assert made == [5, 6, 7, 8, 9, 10]
+    for name, film in whole.items():
+        for f in dataclasses.fields(Film):
+            np.testing.assert_array_equal(getattr(again[name], f.name), getattr(film, f.name), err_msg=f.name)
+    killed.write_bytes(killed.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match="a.npz.unfinished cannot be read .* remove it, the same command films from"):
+        make(killed)
+
+
+def _kill() -> None:
+    raise InterruptedError
