@@ -56,7 +56,10 @@ def make_train_step(
         not set(config.only) - set(table.names),
         f"train.only names {', '.join(config.only)}; the embodiments are {', '.join(table.names)}",
     )
-    check_targets([entry for entry, trained in zip(table.entries, trained_E, strict=True) if trained], masking)
+    learning = [entry for entry, trained in zip(table.entries, trained_E, strict=True) if trained]
+    check_targets(learning, masking)
+    if config.only:
+        check_own(learning, masking)
 
     def sums(params: Any, batch: Batch, counts: TargetCounts) -> tuple[jax.Array, LossSums]:
         model = declared.merge(params)
@@ -133,6 +136,17 @@ def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
         frames or actions,
         f"train.masking.setting {masking.setting!r} predicts {predicted}, of which {robots[0].name} and all other robots "
         "that are trained have none to learn from; choose another setting or other robots",
+    )
+
+
+def check_own(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:
+    """Raises ConfigError if nothing that only these robots have would move, however long it is trained."""
+    shown = masking.setting != "passive" or masking.action_leak != "none"
+    require(
+        shown and any(robot.chunk for robot in robots),
+        f"train.only: nothing that {', '.join(robot.name for robot in robots)} alone has would be trained: all of it is of "
+        f"actions, and {'these robots have none' if shown else 'train.masking.setting passive shows none'}; leave train.only "
+        "out, which in hma adapt is --everything",
     )
 
 

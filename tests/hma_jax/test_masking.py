@@ -305,6 +305,20 @@ def test_robots_of_which_nothing_is_predicted_are_refused(setting: str, only: st
     make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only, "arm")))
 
 
+@pytest.mark.parametrize(
+    "setting, only, why", [("forward", "film", "these robots have none"), ("passive", "arm", "passive shows none")]
+)
+def test_robots_that_have_nothing_to_train_alone_are_refused(setting: str, only: str, why: str):
+    """Training ended well, and had moved no parameter."""
+    config, masking = shallow_config(), MaskingConfig(setting=setting)
+    declared = declare_model(config, MIXED)
+    with pytest.raises(ConfigError, match=f"nothing that {only} alone has would be trained: .*{why}"):
+        make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only,)))
+    make_train_step(declared, MIXED, config, train_config(masking=masking))
+    if setting == "forward":
+        make_train_step(declared, MIXED, config, train_config(masking=masking, only=(only, "arm")))
+
+
 def test_only_the_named_robots_own_parameters_are_trained():
     config = shallow_config()
     declared, params = lively_params(config)
