@@ -110,7 +110,9 @@ class MaskingConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    learning_rate: float = 1e-4  # at the muP base width
+    # At the muP base width. DIFFERS: the release multiplies what it is told by batch / 64, between 1 and 8; here the rate
+    # is what is said, so that runs of several batch sizes say what differs.
+    learning_rate: float = 1e-4
     schedule: Literal["constant", "cosine", "wsd"] = "constant"  # of the learning rate, after the warmup
     warmup_steps: int = 500  # over which the learning rate rises from 0
     final_fraction: float = 0.1  # of the learning rate, at the end of cosine and wsd

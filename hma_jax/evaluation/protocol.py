@@ -200,7 +200,8 @@ def _after_recorded(
 def _likelihood(
     model: HMA, out: jax.Array, truth: jax.Array, key_B: jax.Array, real_BT: jax.Array | None
 ) -> dict[str, jax.Array]:
-    """Per window [B]: what `out` says of the true tokens."""
+    """Per window [B]: what `out` says of the true tokens. DIFFERS: accuracy is that of the likeliest ids of the wholly
+    masked frame; the release's is that of the ids after all unmasking steps (reference section 6.3)."""
     if model.config.diffusion:
         return {"diffusion_loss": mean_over_frames(frame_diffusion_loss(model, out, truth, key_B), real_BT)}
     guess = compose(model.frame_head.factors_in_turn(out, likeliest)[0], model.config.factor_vocab)

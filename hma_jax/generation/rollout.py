@@ -56,7 +56,7 @@ def rollout(
     chunk of the last prompt frame on; what comes before is read from the first sequence and
     computed once. All R sequences use the same random numbers (a function of the example's key
     and the frame), so a difference between them is the actions' doing. `hidden_BT` marks recorded
-    chunks that the model is not shown.
+    chunks that the model is not shown; which it was trained without, says `objective.masking.never_shown`.
     """
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape

@@ -34,7 +34,8 @@ class Block(nnx.Module):
     """Spatial attention, conditioning on the action, temporal attention, MLP.
 
     The order is the release's (reference section 1.4). There is no norm before temporal
-    attention: the released checkpoints were trained so.
+    attention: the released checkpoints were trained so. DIFFERS: the MLP has no dropout; the release's continuous
+    configurations train with 0.05.
     """
 
     def __init__(self, config: ModelConfig, embodiments: int, execution: ExecutionConfig):

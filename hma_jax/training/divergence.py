@@ -1,4 +1,7 @@
-"""A step whose numbers are not finite: what is said of it, and of the batch that it was given."""
+"""A step whose numbers are not finite: what is said of it, and of the batch that it was given.
+
+DIFFERS: the release goes on after a loss that is NaN, with a gradient of zeros (reference section 4.1).
+"""
 
 from __future__ import annotations
 
