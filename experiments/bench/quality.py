@@ -18,7 +18,7 @@ from experiments.bench.models import EXECUTION, Subject
 from experiments.bench.record import Stage, make_stages
 from experiments.bench.rollout import compile_rollout
 from experiments.bench.timing import time_by_turns
-from hma_jax.config import EvalConfig, ModelConfig
+from hma_jax.config import EvalConfig, ModelConfig, Setting
 from hma_jax.evaluation.evaluate import evaluate
 from hma_jax.evaluation.summary import paired_difference
 
@@ -74,15 +74,17 @@ def judge(
     settings: dict[str, EvalConfig],
     frames: int,
     repeats: int,
+    setting: Setting,
     progress: Callable[[str, int], None],
 ) -> tuple[list[Judged], list[Stage]]:
-    """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time."""
+    """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time, `setting` is what
+    the model was trained for."""
     rows, calls, reference = [], {}, None
     for done, (name, config) in enumerate(settings.items()):
         progress(name, done)
         evaluation = evaluate(
             subject.params, subject.config, subject.table, tokenizer, batches(), config,
-            execution=subject.execution, samples_per_dataset=0,
+            setting=setting, execution=subject.execution, samples_per_dataset=0,
         )  # fmt: skip
         found, windows = evaluation.summary.overall, evaluation.windows
         stats = {metric: found[metric] for metric in ("psnr", "psnr_last", "ssim", "delta_psnr")}

@@ -10,8 +10,8 @@ from experiments.bench import beside
 from experiments.bench import generate as bench_generate
 from experiments.bench import rollout as bench_rollout
 from experiments.bench.evaluate import time_evaluation
-from experiments.bench.models import make_subject
-from experiments.bench.quality import decodings
+from experiments.bench.models import Subject, make_subject
+from experiments.bench.quality import decodings, judge
 from experiments.bench.record import Stage, make_record, read_record, write_record
 from experiments.bench.report import markdown
 from experiments.bench.rollout import agreement, time_rollouts
@@ -21,6 +21,8 @@ from experiments.cli.main import main
 from hma_jax.config import ConfigError, DecodeConfig, EvalConfig, ExecutionConfig, SamplerConfig
 from hma_jax.model.flops import denoiser_flops
 from tests.data_pipelines.fakes import REAL_DATA
+from tests.hma_jax.evaluation.fakes import GreyTokenizer, make_batches
+from tests.tiny import SMALLER, TABLE, lively_params, model_config
 
 
 @pytest.fixture(scope="module")
@@ -183,6 +185,16 @@ def test_decodings_vary_what_the_model_leaves_open():
     samplers = decodings(latents, EvalConfig(), 12)
     assert list(samplers)[:2] == ["ddpm 100", "ddpm 50"] and {"ddim 4", "dpm++ 8"} < set(samplers)
     assert samplers["dpm++ 8"].decode.sampler.kind == "dpm++"
+
+
+def test_a_model_that_was_trained_without_actions_is_judged_without():
+    config = model_config(**SMALLER)
+    declared, params = lively_params(config)
+    subject = Subject(config, ExecutionConfig(), TABLE, declared, params, 0)
+    settings = {"M = 1": EvalConfig(prompt_frames=1, random_actions=2, other_actions=0, decode=DecodeConfig(1))}
+    args = subject, GreyTokenizer(), lambda: make_batches(config), settings, config.frames, 1
+    judged = {setting: judge(*args, setting, lambda *_: None)[0][0] for setting in ("passive", "forward")}
+    assert judged["passive"].delta_psnr == judged["passive"].delta_psnr_sem == 0 < judged["forward"].delta_psnr_sem
 
 
 @pytest.mark.slow

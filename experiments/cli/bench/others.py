@@ -64,7 +64,7 @@ def quality(
 
     with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
         rows, stages = judge(
-            subject, materials.tokenizer, batches, settings, frames, repeats,
+            subject, materials.tokenizer, batches, settings, frames, repeats, trained.train.masking.setting,
             lambda name, done: update(done, len(settings), name),
         )  # fmt: skip
     table = tidy_table(
