@@ -10,7 +10,7 @@ from data_pipelines.errors import NAMED
 from data_pipelines.inspection.action_stats import WRAPPING
 from data_pipelines.inspection.duplicates import Fingerprint
 from data_pipelines.inspection.inspect import ActionFacts, Facts
-from data_pipelines.inspection.suggest import WindowFacts
+from data_pipelines.inspection.suggest import NO_CAMERA, WindowFacts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import TURN
 from data_pipelines.sources.rlds.schema import field_slice
@@ -106,7 +106,7 @@ def _windows(facts: Facts, windows: WindowFacts | None) -> list[Remark]:
 
 
 def _cameras(facts: Facts, entry: DatasetSpec | None) -> list[Remark]:
-    remarks = []
+    remarks = [] if facts.cameras else [Remark("bad", "no camera", NO_CAMERA)]
     for camera in facts.cameras:
         used = entry is not None and camera.key == entry.image_key
         whose = "the camera in use" if used else "not in use"

@@ -23,6 +23,12 @@ NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
 NO_RATE = 0.0
 """Stands in an entry for a rate that nobody gave; a `DatasetSpec` refuses it."""
 
+NO_CAMERA = (
+    "none of its fields is an image of three colours; pictures that are kept as plain numbers are to be written as "
+    "images (docs/own_data.md, Writing RLDS)"
+)
+"""Why a dataset without one is given no entry."""
+
 
 @dataclass(frozen=True)
 class Suggestion:

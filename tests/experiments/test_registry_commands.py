@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from dataclasses import replace
 
@@ -92,6 +93,33 @@ def test_inspection_of_episodes_without_a_window_leads_to_every_frame(robot, tmp
     assert "about 0 windows" in said and "hma tokenize" not in said
     assert f"next: hma data view {robot} --stride 1 --registry {tmp_path}/my.toml" in said
     assert "no episode that was read has the 40 steps that the shortest window takes at stride 20" in said
+
+
+def test_inspection_says_that_nothing_is_a_camera_and_not_that_the_rate_is_missing(robot, tmp_path, capsys):
+    features = robot / "features.json"
+    changed = re.sub(r'("dimensions": \[\s*"8",\s*"8",\s*)"3"', r'\1"1"', features.read_text())
+    assert changed != features.read_text()
+    features.write_text(changed)
+    arguments = ["--hz", "4", "--out", str(tmp_path)]
+    assert main(["data", "inspect", str(robot), *arguments, "--entry", str(tmp_path / "my.toml")]) == 2
+    said = capsys.readouterr()
+    assert "no entry to write: none of its fields is an image of three colours" in said.err and "--hz" not in said.err
+    assert "observation/image" in said.out and not (tmp_path / "my.toml").exists()
+    assert main(["data", "view", str(robot), "--hz", "4", "--out", str(tmp_path / "view.html")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "no camera: none of its fields" in said and "next for my_robot: leave it out" in said
+
+
+def test_a_single_episode_does_not_lead_to_a_command_that_refuses_it(tmp_path, capsys):
+    """Nothing of it can be held out: `hma tokenize` of it alone is refused, with a tokenizer too."""
+    one = write_rlds(tmp_path / "data", make_spec("lonely", (4,)), [40])
+    entries = str(tmp_path / "my.toml")
+    assert main(["data", "inspect", str(one), "--hz", "4", "--entry", entries, "--out", str(tmp_path)]) == 0
+    inspected = capsys.readouterr().out
+    viewed = ["data", "view", str(one), "--registry", entries, "--out", str(tmp_path / "view.html")]
+    assert main(viewed) == 0
+    for said in (inspected, capsys.readouterr().out):
+        assert said.splitlines()[-1].startswith("next: name another dataset beside it")
 
 
 def test_inspection_of_short_episodes_suggests_a_prompt_that_leaves_a_frame_to_judge(robot, tmp_path, capsys):

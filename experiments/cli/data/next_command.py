@@ -40,6 +40,16 @@ def tokenize_command(
     return command("tokenize", *asked.words())
 
 
+def single_episode(directories: Sequence[Facts]) -> str | None:
+    """What to do where the datasets hold a single episode together, of which none can be held out; else None."""
+    if sum(facts.episodes for facts in directories) != 1 or len(directories[0].splits) > 1:
+        return None
+    return (
+        "name another dataset beside it (hma tokenize --data DIR OTHER), or record more: of a single episode none can "
+        "be held out, so no model can be judged on it"
+    )
+
+
 def no_window(facts: Facts, stride: int, registry: Path | None) -> str:
     """What to run instead for a dataset of which no episode has two frames at `stride`, and why."""
     longest, known = facts.lengths.longest, (("--registry", registry) if registry else ())

@@ -13,7 +13,7 @@ from rich.text import Text
 from tyro.conf import Positional, arg
 
 from data_pipelines.errors import NAMED
-from experiments.cli.data.next_command import no_window, other_rate, tokenize_command
+from experiments.cli.data.next_command import no_window, other_rate, single_episode, tokenize_command
 from experiments.progress import console, step, tidy_table
 from experiments.setting import say_unmatched, use_entries
 from experiments.wrote import wrote
@@ -113,7 +113,7 @@ def data_inspect(
         registry: TOML file with entries of your own.
     """
     from data_pipelines.inspection.inspect import inspect_dataset
-    from data_pipelines.inspection.suggest import suggest_entry, window_facts
+    from data_pipelines.inspection.suggest import NO_CAMERA, suggest_entry, window_facts
     from data_pipelines.registry.spec import stride_of
     from data_pipelines.registry.table import find_spec
     from experiments.contact_sheet import draw_sheet
@@ -134,9 +134,10 @@ def data_inspect(
     say_unmatched(registry, (facts.name,))
     suggested = hz or facts.hz or (known.hz if known else None)
     suggestion = suggest_entry(facts, suggested)
-    if entry is not None and (suggestion is None or not suggestion.hz):
-        raise ConfigError("--entry needs the native rate, which is not in the files: add --hz")
     print_facts(facts)
+    if entry is not None:
+        require(suggestion is not None, f"{facts.name}: no entry to write: {NO_CAMERA}")
+        require(bool(suggestion.hz), "--entry needs the native rate, which is not in the files: add --hz")
     taken = None if entry else known  # as the dataset is read afterwards
     rate, windows = hz or (taken.hz if taken else suggested), None
     if rate:
@@ -217,8 +218,10 @@ def print_facts(facts: Facts) -> None:
 
 
 def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> None:
+    from data_pipelines.inspection.suggest import NO_CAMERA
+
     if suggestion is None:
-        console.print("[yellow]no entry[/]: the dataset has no camera of three colours")
+        console.print(f"[yellow]no entry[/]: {NO_CAMERA}", soft_wrap=True)
         return
     if known is None:
         console.print("[bold]not in the registry.[/] The entry that its contents suggest:")
@@ -268,7 +271,7 @@ def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, f
         words = first
     elif windows.total:
         spans = facts.lengths.longest // windows.stride
-        words = tokenize_command((facts.directory,), windows.frames, entries, spans)
+        words = single_episode([facts]) or tokenize_command((facts.directory,), windows.frames, entries, spans)
     else:
         words = no_window(facts, windows.stride, entries)
     console.print(Text(f"next: {words}"), soft_wrap=True)

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.text import Text
 from tyro.conf import Positional, arg
 
-from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, tokenize_command
+from experiments.cli.data.next_command import ENTRIES, no_window, other_rate, single_episode, tokenize_command
 from experiments.progress import console, step
 from experiments.setting import command, say_unmatched, use_entries
 from experiments.wrote import wrote
@@ -140,7 +140,9 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
     longest: dict[float | None, int] = {}
     for v in viewed:
         f = v.facts
-        if not v.registered:
+        if not f.cameras:
+            after = "leave it out, or write it with its pictures as images: it has no camera"
+        elif not v.registered:
             words = command("data inspect", f.directory, "--hz", f"{v.hz:g}" if v.hz else "HZ", "--entry", file)
             after = f"{words}  (it is not in the registry; this writes its entry)"
         elif any(r.title == MISFIT for r in v.remarks):
@@ -161,5 +163,7 @@ def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> N
             continue
         console.print(Text(f"next for {f.name}: {after}"), soft_wrap=True)
     for rate, facts in usable.items():
-        words = tokenize_command([f.directory for f in facts], frames, registry, longest[rate], rate)
+        words = single_episode(facts) or tokenize_command(
+            [f.directory for f in facts], frames, registry, longest[rate], rate
+        )
         console.print(Text(f"next: {words}"), soft_wrap=True)
