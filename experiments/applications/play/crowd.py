@@ -32,6 +32,10 @@ REPLIES = 16
 SEND_SECONDS = 10.0
 """That a message may take until the visitor's computer has it."""
 
+WORKING_SECONDS = 3.0
+"""Of work on a round, after each of which those who wait are told of it: a page that hears nothing for three times as long
+takes its connection for lost."""
+
 PARTING_SECONDS = 1.0
 """That a page which loses its seat has to hear of it."""
 
@@ -191,8 +195,11 @@ class Crowd:
                 continue
             connections = [v.replies for v in asking]
             wishes = {i: (v.seat, v.wishes.popleft()) for i, v in enumerate(asking)}
+            made = loop.run_in_executor(self._thread, answer, self.simulator, self.truth, wishes)
             try:
-                replies = await loop.run_in_executor(self._thread, answer, self.simulator, self.truth, wishes)
+                while not (await asyncio.wait([made], timeout=WORKING_SECONDS))[0]:
+                    self._say_it_works(asking)
+                replies = made.result()
             except Exception:  # a fault of ours: this round's wishes are lost, the server is not
                 log.exception("a round of wishes could not be answered")
                 self._forget_lost()
@@ -214,6 +221,12 @@ class Crowd:
             visitor.acted = self._rounds
         waiting = acting[self.together :]
         return [v for v in asking if v not in waiting]
+
+    def _say_it_works(self, asking: list[Visitor]) -> None:
+        """To all who wait for an answer: those of this round, and those whose turn has not come."""
+        for visitor in self.visitors.values():
+            if visitor in asking or visitor.wishes:
+                visitor.tell({"type": "working"})
 
     def _forget_lost(self) -> None:
         """After a failure: visitors whose episode went with it have to begin one."""

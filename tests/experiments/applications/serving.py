@@ -44,11 +44,13 @@ def serving(
 
 
 async def hear(socket: ClientWebSocketResponse) -> dict[str, Any]:
-    """The next message; {"type": "closed"} where there is none any more."""
-    message = await asyncio.wait_for(socket.receive(), SECONDS)
-    if message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):
-        return {"type": "closed"}
-    return json.loads(message.data)
+    """The next message, but for words that one is worked on; {"type": "closed"} where there is none any more."""
+    while True:
+        message = await asyncio.wait_for(socket.receive(), SECONDS)
+        if message.type in (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR):
+            return {"type": "closed"}
+        if (heard := json.loads(message.data))["type"] != "working":
+            return heard
 
 
 async def ask(socket: ClientWebSocketResponse, **message: Any) -> dict[str, Any]:

@@ -10,6 +10,8 @@ import os
 import shutil
 import time
 from dataclasses import replace
+from importlib.resources import files
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ playwright = pytest.importorskip("playwright.async_api", reason="needs the extra
 
 from PIL import Image  # noqa: E402
 
+from experiments.applications.play import crowd, server  # noqa: E402
 from experiments.applications.play.server import CROWD  # noqa: E402
 from tests.experiments.applications.serving import serving  # noqa: E402
 from tests.experiments.applications.test_play_server import FakeTruth, until  # noqa: E402
@@ -254,13 +257,35 @@ def test_a_rewind_is_made_once_what_is_under_way_has_come_and_is_not_of_the_robo
     browsing(test)
 
 
+def test_a_model_that_takes_longer_than_the_page_waits_for_a_word_is_slow_and_not_lost(browsing, monkeypatch):
+    monkeypatch.setattr(crowd, "WORKING_SECONDS", 0.2)
+    hasty = files("experiments.applications.play").joinpath("page.html").read_text().replace("Y = 10e3", "Y = 1e3")
+    whole = SimpleNamespace(joinpath=lambda _: SimpleNamespace(read_text=lambda: hasty))
+    monkeypatch.setattr(server, "files", lambda _: whole)
+
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        connections, status = [], "document.getElementById('status').textContent"
+        page.on("websocket", lambda socket: connections.append(socket))
+        simulator = client.server.app[CROWD].simulator
+        step = simulator.step
+        simulator.step = lambda actions: (time.sleep(2.5), step(actions))[-1]
+        await page.wait_for_function(f"{status}.startsWith('slow: this frame has taken 2 s')")
+        simulator.step = step
+        here = await count(page)
+        await page.wait_for_function(f"document.body.dataset.count > {here} && {status} == 'connected'")
+        assert not connections, "it took the connection for lost, and made another"
+
+    browsing(test)
+
+
 async def overheard(page) -> list[str]:
     """Of the page's present connection from now on: types of what it says, "<" for each answer. A new connection."""
     talk: list[str] = []
 
     def listen(socket) -> None:
         socket.on("framesent", lambda text: talk.append(json.loads(text)["type"]))
-        socket.on("framereceived", lambda _: talk.append("<"))
+        socket.on("framereceived", lambda text: talk.append("<") if json.loads(text)["type"] != "working" else None)
 
     page.on("websocket", listen)
     await page.evaluate("state.socket.close()")
