@@ -17,6 +17,7 @@ from matplotlib.transforms import Bbox
 from experiments.applications.judging.agreement import count_interval
 from experiments.applications.judging.judge import Judged
 from experiments.applications.judging.outcomes import HEAD, LEARNED, SHUFFLED, STATE, TRUE, successes
+from experiments.applications.judging.recordings import LAST
 from experiments.applications.judging.summary import CONTROL, MODEL, REAL, REFERENCE, shown
 from experiments.report.clips import animate
 from experiments.report.pieces import data_uri, picture, section, table
@@ -227,11 +228,18 @@ def say_recorded(measured: dict[str, float]) -> str:
         if "learnt from" in measured
         else "Of the recordings "
     )
+    taken = (
+        " No recording says at which frames its goal is reached. It was taken for granted that none of a failure shows it, nor "
+        f"one of the first half of a success, and that the last {measured[LAST]:.0f} of a success do: where a failure passes "
+        "its goal, or a success is there early, the head was taught wrong. Rewards of every step (--reward) would say."
+        if LAST in measured
+        else ""
+    )
     return (
         f"It tells {told[0]} of {good} successes and {told[1]} of {n - good} failures: {accuracy.mean:.2f} "
         f"({accuracy.low:.2f} to {accuracy.high:.2f}) of all, {measured['episode accuracy, decoded']:.2f} when they are "
         f"shown as the model's tokenizer draws them. To call every one the same would be right in {usual:.2f}.{doubt} {learnt}"
-        f"left out were {measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short."
+        f"left out were {measured['unknown']:.0f} that do not say whether they succeeded, and {measured['too short']:.0f} that are too short.{taken}"
     )
 
 

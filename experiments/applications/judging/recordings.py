@@ -52,6 +52,9 @@ FIRST, CHECKPOINTS = 50, 12
 MOST = 0.9
 """This share of the recorded successes is not longer than an episode, where its length is not given."""
 
+LAST = "last frames taken for reached"
+"""Of each success that a head learnt from, where no reward says at which frames its goal was reached."""
+
 BEFORE = START_FRAMES - 1
 """Frames of a recording before the first that is looked at."""
 
@@ -156,6 +159,7 @@ class Recordings:
             "steps": float(best),
             "learnt from": float(len(self.learnt)),
             "successes among them": float(self._success[self.learnt].sum()),
+            **({LAST: float(self.config.task.hold)} if self._reached is None else {}),
         }
         return heads[best]
 

@@ -83,6 +83,8 @@ def test_from_recordings_to_the_page_without_a_simulator_and_with_counts_of_the_
     assert judge(study, out, "--frames", "3") == 0
     told = said(capsys)
     assert "Nothing outside the model was compared" in told and "wild (100%)" in told
+    assert "taken for granted that none of a failure shows it, nor one of the first half" in told
+    assert "and that the last 2 of a success do" in told
     rows = read_outcomes(out / "outcomes.csv")
     policies, starts = (
         ("random", "hma", "low", "high", "wild"),
@@ -256,7 +258,7 @@ def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp
     # From the third frame on: of one held-out success two without the goal, then five at it; of the other seven.
     assert head["frames"] == 4 * 7 and head["positive"] == pytest.approx((5 + 7) / 28)
     assert load_rollout(out / "rollouts" / "low.learned.npz").images.shape[0] == 3
-    assert "--reward 1.0" in (out / "judge.html").read_text()
+    assert "--reward 1.0" in (out / "judge.html").read_text() and "taken for granted" not in said(capsys)
     assert judge(study, tmp_path / "none", *asked, "2") == 2
     assert "of 20 recordings 0 succeeded and 20 failed" in said(capsys, error=True)
     always = write_rlds(tmp_path / "all", SPEC, [9] * 20, rewards=lambda i: np.r_[np.ones(3), np.full(6, i < 10)])
