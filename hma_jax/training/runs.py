@@ -87,8 +87,9 @@ def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[
 def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     """The parameters and description of a run's latest checkpoint; its moments are not read.
 
-    The parameters lie on this process's default device. Raises CheckpointError if there is no
-    checkpoint, or it is damaged or foreign, and ConfigError for an average that the run does not keep.
+    The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint while
+    it is read, a newer one is taken. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign, and
+    ConfigError for an average that the run does not keep.
     """
     run_dir = Path(run_dir)
     directory = run_dir.absolute() / "checkpoints"
@@ -96,7 +97,16 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     if not steps:
         found = "no finished checkpoint under" if directory.is_dir() else "no checkpoints at"
         raise CheckpointError(f"{found} {directory}; give the directory of a training run that has saved one")
-    checkpoint = directory / str(steps[-1])
+    while True:
+        try:
+            return _read_run(run_dir, directory / str(steps[-1]), weights)
+        except CheckpointError:
+            read, steps = steps[-1], list_steps(directory)
+            if not steps or steps[-1] == read:
+                raise
+
+
+def _read_run(run_dir: Path, checkpoint: Path, weights: Weights) -> Run:
     described = read_description(checkpoint)
     missing = {"model", "train", "table", "provenance"} - set(described)
     if missing:
@@ -121,7 +131,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
         from_dict(TrainConfig, described["train"]),
         table,
         load_items(checkpoint, {item: shapes})[item],
-        steps[-1],
+        int(checkpoint.name),
         described["provenance"],
         "ema" if item == "ema" else "last",
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -20,8 +21,9 @@ from hma_jax.config import ConfigError, ExecutionConfig, MeshConfig
 from hma_jax.config.json import to_dict
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import inference_params
+from hma_jax.training import runs
 from hma_jax.training.loop import LoopOptions
-from hma_jax.training.reading import CheckpointError
+from hma_jax.training.reading import CheckpointError, read_description
 from hma_jax.training.runs import describe_run, load_model, load_run, modernise
 from hma_jax.training.train import train_model
 from tests.tiny import DIFFUSION, SMALLER, TABLE, batches, lively_params, model_config, train_config
@@ -54,6 +56,23 @@ def averaged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, object]:
 
 def equal(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_a_checkpoint_that_training_removes_while_it_is_read_gives_way_to_the_newer_one(
+    averaged, tmp_path, monkeypatch
+):
+    """Training and evaluating go together; it was said to be damaged, or no run of this project."""
+    shutil.copytree(averaged[0], tmp_path / "run")
+    old, new = (tmp_path / "run" / "checkpoints" / step for step in "23")
+
+    def replaced(checkpoint: Path):
+        if old.is_dir():
+            os.replace(shutil.copytree(old, tmp_path / "3"), new)
+            shutil.rmtree(old)
+        return read_description(checkpoint)
+
+    monkeypatch.setattr(runs, "read_description", replaced)
+    assert load_run(tmp_path / "run").step == 3
 
 
 # --- Earlier versions ------------------------------------------------------------------------
