@@ -41,8 +41,11 @@ PEAKS = {
     "NVIDIA A100": Peak(312e12, 156e12, 19.5e12),
     "TPU v4": _tpu(275e12),
     "TPU v5 lite": _tpu(197e12),
+    "TPU v5e": _tpu(197e12),
+    "TPU v5": _tpu(459e12),  # so JAX calls a v5p
     "TPU v5p": _tpu(459e12),
     "TPU v6 lite": _tpu(918e12),
+    "TPU v6e": _tpu(918e12),
 }
 """From the makers' data sheets, without sparsity, by the start of a device's kind; the longest that fits
 counts."""

@@ -17,6 +17,9 @@ from hma_jax.runtime.devices import default_device, find_peak, peak_flops
         ("NVIDIA H200 NVL", 835.5e12, 417.5e12),
         ("NVIDIA A100-SXM4-80GB", 312e12, 156e12),
         ("TPU v5 lite", 197e12, 197e12),
+        ("TPU v5", 459e12, 459e12),
+        ("TPU v5e", 197e12, 197e12),
+        ("TPU v6e", 918e12, 918e12),
     ],
 )
 def test_a_device_is_measured_by_its_own_data_sheet(kind: str, bfloat16: float, float32: float):
