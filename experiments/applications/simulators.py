@@ -57,7 +57,7 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
     require(
         bool(simulator.starts),
         f"{run}: there is no {STARTS} beside the run, and neither a robot with a true simulator nor held-out frames in "
-        f"{study.store} to start from",
+        f"{study.store} to start from; move the run into the directory of a study that has tokens of its robots",
     )
     return simulator
 

@@ -243,7 +243,7 @@ def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
 
 def find_blind(run: Path, robot: Robot) -> Simulator:
     """The simulator of a model that was trained without actions. Raises ConfigError for another one."""
-    blind = load_simulator(run, episodes=BATCH, history=1)
+    blind = load_simulator(run, own_starts=True, episodes=BATCH, history=1)
     setting = blind.model.run.train.masking.setting
     require(
         setting == "passive", f"{run} was trained with train.masking.setting={setting}, not without actions (passive)"
@@ -273,7 +273,7 @@ def main() -> None:
     )
     asked = parser.parse_args()
     run, out = asked.run, asked.out
-    simulator = load_simulator(run, episodes=BATCH, history=1)
+    simulator = load_simulator(run, own_starts=True, episodes=BATCH, history=1)
     lessons = find_lessons(asked, simulator)  # a mistyped name claims nothing
     second = out / SECOND
     require(

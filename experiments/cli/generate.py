@@ -74,8 +74,9 @@ def generate(
     asked = {"unmask_steps": unmask_steps, "temperature": temperature}
     decode = replace(find_decode(run), **{key: x for key, x in asked.items() if x is not None})
     simulator = load_simulator(
-        run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch, decode=decode, history=1
-    )
+        run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,
+        decode=decode, history=1,
+    )  # fmt: skip
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)

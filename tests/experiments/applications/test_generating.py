@@ -165,6 +165,16 @@ def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
         open_trajectories(str(recorded), "val", None, {gripper.name: gripper}, tokenizer, tmp_path)
 
 
+def test_a_run_outside_a_study_begins_with_the_recordings_it_is_given(recorded, tmp_path, capsys):
+    """As one that was converted: there are neither starts beside it nor held-out frames of its robot."""
+    mine = EmbodimentTable((replace(TABLE.entries[0], name="my_robot"),))
+    run = make_run(tmp_path / "converted", table=mine)
+    with pytest.raises(ConfigError, match="to start from; move the run into the directory of a study"):
+        load_simulator(run)
+    assert generate(run, recorded, tmp_path / "out", "--robot", "my_robot", "--episodes", "2") == 0
+    assert "2 episodes. PSNR against the recording" in " ".join(capsys.readouterr().out.split())
+
+
 def test_clips_that_cannot_be_written_are_refused_at_once(run, recorded, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "av", None)
     assert generate(run, recorded, tmp_path / "out", "--clips", "1") == 2
