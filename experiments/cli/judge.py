@@ -75,7 +75,8 @@ def judge(
         cloned: Checkpoints of behaviour cloning, 0 for none. Default: 6, with --recordings none.
         diffusion: Checkpoints of the Diffusion Policy. Default: 3, with --recordings none.
         seed: Of recordings, training and episodes.
-        labels: Saved by the blind page: only says how often that person agrees with the judges of --out.
+        labels: Saved by the blind page: only says how often that person agrees with what lies in --out, whatever else is
+            given.
     """
     from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
     from experiments.applications.judging.config import JudgeConfig
@@ -94,6 +95,9 @@ def judge(
         for name, found in agreed.items():
             table.add_row(name, f"{found.mean:.2f} ({found.low:.2f} to {found.high:.2f})", str(found.n))
         console.print(table)
+        console.print(
+            f"the judges of {out}; nothing was judged anew, and no other option was looked at", soft_wrap=True
+        )
         return
     require(starts >= 2, f"--starts must be at least 2, got {starts}")
     require(frames is None or frames >= 1, f"--frames must be at least 1, got {frames}")

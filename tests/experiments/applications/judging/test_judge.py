@@ -21,6 +21,7 @@ from experiments.applications.judging.summary import COLUMNS, summarise
 from experiments.applications.policies import find_task
 from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.network import EncoderConfig
+from experiments.cli.main import main
 from experiments.progress import step
 from hma_jax.config import ConfigError, TrainConfig
 from hma_jax.convert.run_directory import write_run
@@ -211,7 +212,7 @@ def test_a_name_in_the_figure_is_beside_its_own_policy_alone():
     plt.close(figure)
 
 
-def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path):
+def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path, capsys):
     root, found = judged
     page = write_blind(found, root / "out", clips=10).read_text()
     assert page.count("<img") == 10 and not any(name in page for name in ("cloned", "random", LEARNED))
@@ -222,6 +223,11 @@ def test_labels_of_a_person_are_compared_with_the_judges(judged, tmp_path):
     path.write_text(json.dumps({"page": key["page"], "labels": labels}))
     agreed = compare_labels(read_labels(path, root / "out"), found.outcomes)
     assert agreed["head, learned world"].mean == 1 == agreed["head, true world"].mean
+    write_outcomes(found.outcomes, root / "out" / "outcomes.csv")
+    asked = ["--robot", "any", "--out", str(root / "out"), "--starts", "3", "--labels", str(path)]
+    assert main(["judge", str(tmp_path / "nowhere"), *asked]) == 0
+    told = " ".join(capsys.readouterr().out.split())
+    assert "1.00" in told and "nothing was judged anew, and no other option was looked at" in told
     path.write_text(json.dumps({"page": "another", "labels": labels}))
     with pytest.raises(ConfigError, match="labels of another page"):
         read_labels(path, root / "out")
