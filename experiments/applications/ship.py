@@ -73,8 +73,11 @@ def ship(
 ) -> None:
     """Replaces `out`, whole or not at all, by the model and by what `add` writes beside it.
 
-    Raises ConfigError for a robot outside the suite, and if it would be too large.
+    Raises ConfigError where `out` is something else than what was shipped before, for a robot outside the suite, and if it
+    would be too large.
     """
+    shipped = not out.exists() or (out / REPORT).is_file() or not any(out.iterdir())
+    require(shipped, f"--out {out} holds no {REPORT}, so that it is no shipped model; all of it would be removed")
     run = load_run(source, "auto")
     simulator = load_simulator(source)
     strange = [name for name, robot in simulator.robots.items() if not in_suite(robot)]

@@ -150,6 +150,15 @@ def test_what_is_there_stays_until_all_of_the_new_one_is(run, tmp_path):
     assert [path.name for path in tmp_path.rglob("*")] == ["simulator", "report.json"]
 
 
+def test_what_was_not_shipped_is_not_replaced(run):
+    """The run itself, the study that it is in."""
+    before = sorted(run.parent.rglob("*"))
+    for out in (run, run.parent):
+        with pytest.raises(ConfigError, match=r"holds no report.json, .* all of it would be removed"):
+            ship(run, out)
+    assert sorted(run.parent.rglob("*")) == before
+
+
 def test_a_robot_without_a_truth_to_be_compared_with_is_not_shipped(tmp_path):
     table = EmbodimentTable((*TABLE.entries, Embodiment("stranger", 2, 1, (0.0, 0.0), (1.0, 1.0))))
     with pytest.raises(ConfigError, match="stranger: not of the suite"):
