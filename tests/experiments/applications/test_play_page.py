@@ -271,6 +271,8 @@ def test_a_model_that_takes_longer_than_the_page_waits_for_a_word_is_slow_and_no
         step = simulator.step
         simulator.step = lambda actions: (time.sleep(2.5), step(actions))[-1]
         await page.wait_for_function(f"{status}.startsWith('slow: this frame has taken 2 s')")
+        shown = "+document.getElementById('fps').textContent"
+        await page.wait_for_function(f"{shown} > 0 && {shown} < 0.5")
         simulator.step = step
         here = await count(page)
         await page.wait_for_function(f"document.body.dataset.count > {here} && {status} == 'connected'")
