@@ -189,7 +189,8 @@ class RldsDataset(EpisodeSource):
                 raise DataError(message)
             self.lose(str(problem or message), count - shard.records)
         if not len(self):
-            raise DataError(f"{self.directory}: split {self.split!r} has no readable episode.")
+            why = next(iter(self.skipped), "it is said to have none.")
+            raise DataError(f"{self.directory}: split {self.split!r} has no readable episode: {why}")
 
     def _place(self, i: int) -> tuple[Location, int, int]:
         if not 0 <= i < len(self):

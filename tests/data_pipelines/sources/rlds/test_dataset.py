@@ -298,6 +298,13 @@ def test_skip_counts_a_missing_shard_in_full(directory):
     assert len(dataset) == 3 and sum(dataset.skipped.values()) == 3
 
 
+def test_skip_of_every_episode_says_what_is_wrong_with_them(directory):
+    for shard in shards(directory):
+        shard.unlink()
+    with pytest.raises(DataError, match="no readable episode: .*00000-of-00002: the shard is missing. Fetch it again"):
+        RldsDataset(directory, corrupt="skip")
+
+
 def test_skip_is_bounded(directory):
     shards(directory)[1].unlink()
     with pytest.raises(DataError, match="3 episodes are unusable, more than max_skipped=2"):
