@@ -81,8 +81,7 @@ def make_train_step(
         gradient = jax.grad(sums, has_aux=True)
         if accumulate == 1:
             return gradient(params, batch, counts)
-        # Micro-batch a takes rows a, a + A, ...: every device keeps the rows it has.
-        micro = jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=accumulate), batch)
+        micro = micro_batches(batch, accumulate)
         zero = jax.tree.map(jnp.zeros_like, params)
 
         def body(carry: tuple[Any, LossSums], one: Batch) -> tuple[tuple[Any, LossSums], None]:
@@ -125,6 +124,11 @@ def make_train_step(
         return TrainState(state.step + 1, params, opt_state, ema), metrics
 
     return step
+
+
+def micro_batches(batch: Any, accumulate: int) -> Any:
+    """Rows [B, ...] as [A, B / A, ...]: micro-batch a takes rows a, a + A, ..., so that every device keeps the rows it has."""
+    return jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=accumulate), batch)
 
 
 def check_targets(robots: Sequence[Embodiment], masking: MaskingConfig) -> None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, require
+from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, check_micro_batches, require
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
@@ -20,6 +20,7 @@ from hma_jax.objective.losses import LossSums, TargetCounts, loss_metrics, maske
 from hma_jax.objective.masking import mask_batch
 from hma_jax.training.loop import Watch
 from hma_jax.training.state import TrainState
+from hma_jax.training.step import micro_batches
 
 SEED = 0
 """Of masks and noise: the same for every run, so that runs compare."""
@@ -29,7 +30,7 @@ SEED = 0
 class Validation:
     """What a run is validated on.
 
-    `batches()` yields this process's rows of a few global batches, as for training, perhaps with `valid`
+    `batches()` yields this process's rows of a few global batches, as large as in training, perhaps with `valid`
     bool [B] (False: a row that only fills up) and `real` bool [B, T] (False: such a frame). It is read once; the
     windows stay in memory of the host.
     """
@@ -77,15 +78,17 @@ def _jitted_sums(
 ) -> Callable:
     """`make_sums` on a mesh, which may be empty; kept for the next run of the same process, as its step is."""
     everywhere = None if device_mesh.empty else NamedSharding(device_mesh, PartitionSpec())
-    return jax.jit(make_sums(declare_model(model, table, execution), table, model, masking), out_shardings=everywhere)
+    declared = declare_model(model, table, execution)
+    return jax.jit(make_sums(declared, table, model, masking, execution.accumulate), out_shardings=everywhere)
 
 
 def make_sums(
-    declared: Declared, table: EmbodimentTable, model: ModelConfig, masking: MaskingConfig
+    declared: Declared, table: EmbodimentTable, model: ModelConfig, masking: MaskingConfig, accumulate: int = 1
 ) -> Callable[[Params, Mapping[str, jax.Array], jax.Array], tuple[LossSums, TargetCounts]]:
     """sums(params, batch, number) -> loss sums and target counts over the batch's valid rows; a pure function.
 
-    Tokens count alike whatever `masking.change_weight` is: runs that weigh them differently compare."""
+    In as many micro-batches as a training step: where that fits into memory, this does too. Tokens count alike whatever
+    `masking.change_weight` is: runs that weigh them differently compare."""
     masking = replace(masking, change_weight=1.0)
 
     def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:
@@ -93,11 +96,20 @@ def make_sums(
         valid_B, real_BT = batch["valid"], batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         masked = masked.among(jnp.broadcast_to(valid_B[:, None], masked.hidden_T.shape))
-        keys = noise_keys(key, len(valid_B))
-        found = masked_loss(
-            declared.merge(params), masked, batch["tokens"], batch["actions"], batch["embodiment"], masking, keys,
-            real_BT=real_BT,
-        )  # fmt: skip
+        rows = {name: batch[name] for name in ("tokens", "actions", "embodiment", "real") if name in batch}
+        rows |= {"masked": masked, "key": noise_keys(key, len(valid_B))}
+
+        def of_rows(one: Mapping[str, Any]) -> LossSums:
+            return masked_loss(
+                declared.merge(params), one["masked"], one["tokens"], one["actions"], one["embodiment"], masking,
+                one["key"], real_BT=one.get("real"),
+            )  # fmt: skip
+
+        if accumulate == 1:
+            found = of_rows(rows)
+        else:
+            check_micro_batches(len(valid_B), accumulate)
+            found = jax.tree.map(jnp.sum, jax.lax.map(of_rows, micro_batches(rows, accumulate)))
         return found, TargetCounts(jnp.sum(masked.targets_TS), jnp.sum(masked.action_targets_T))
 
     return sums

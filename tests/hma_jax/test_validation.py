@@ -100,6 +100,20 @@ def test_points_are_comparable_and_rows_that_fill_up_do_not_count(changes, maski
     assert weighed.lower(params, whole, 0).as_text() == sums.lower(params, whole, 0).as_text()
 
 
+def test_held_out_loss_is_of_micro_batches_where_training_is():
+    """A run whose steps just fitted into memory ended at its first look at held-out windows."""
+    declared, params = lively_params(MODEL)
+    batch = random_batch(0, MODEL, 32) | {"valid": np.arange(32) < 30}
+    batch["real"] = np.arange(MODEL.frames) < np.random.default_rng(0).integers(2, MODEL.frames + 1, 32)[:, None]
+    ways = [jax.jit(make_sums(declared, TABLE, MODEL, MaskingConfig(), n)) for n in (1, 8)]
+    whole, parts = (way.lower(params, batch, 0).compile() for way in ways)
+    for a, b in zip(*(jax.tree.leaves(way(params, batch, 0)) for way in (whole, parts)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5)
+    assert parts.memory_analysis().temp_size_in_bytes < 0.6 * whole.memory_analysis().temp_size_in_bytes
+    with pytest.raises(ConfigError, match="32 is not a multiple of execution.accumulate 5"):
+        make_sums(declared, TABLE, MODEL, MaskingConfig(), 5)(params, batch, 0)
+
+
 def test_a_validation_without_windows_is_refused_by_words(tmp_path: Path):
     watch = make_watch(Validation(1, list), MODEL, TABLE, MaskingConfig(), ExecutionConfig(), lambda batch: batch)
     with pytest.raises(ConfigError, match="no window to validate on"):
