@@ -70,7 +70,7 @@ def sample_tokens(
     return jax.vmap(one)(said_BS, key_B)
 
 
-def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_masked: int) -> Frame:
+def unmask(frame: Frame, sampled_BS: jax.Array, score_BS: jax.Array, still_masked: int | jax.Array) -> Frame:
     """Fills masked positions of a discrete frame but for the `still_masked` ones with the lowest score.
 
     Known positions are never drawn again.
@@ -105,16 +105,22 @@ def decode_frame(model: HMA, first: jax.Array, predict: Predict, key_B: jax.Arra
 
 def _decode_tokens(model: HMA, said: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
     batch, size = said.shape[:2]
-    frame = blank_frame(model.config, batch)
-    for step, still_masked in enumerate(masked_counts(model.config, decode.unmask_steps)):
-        keys = jax.vmap(lambda k, s=step: jax.random.split(jax.random.fold_in(k, s)))(key_B)
+
+    def fill(frame: Frame, said: jax.Array, step: int | jax.Array, still_masked: int | jax.Array) -> Frame:
+        keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, step)))(key_B)
         sampled, score = sample_tokens(model.frame_head, said, keys[:, 0], decode.temperature, decode.top_k)
         if decode.order == "random":
             score = jax.vmap(lambda k: jax.random.uniform(k, (size,)))(keys[:, 1])
-        frame = unmask(frame, sampled, score, still_masked)
-        if still_masked:
-            said = predict(frame)
-    return frame.values
+        return unmask(frame, sampled, score, still_masked)
+
+    def look(frame: Frame, at: tuple[jax.Array, jax.Array]) -> tuple[Frame, None]:
+        return fill(frame, predict(frame), *at), None
+
+    counts = masked_counts(model.config, decode.unmask_steps)
+    frame = fill(blank_frame(model.config, batch), said, 0, counts[0])
+    # A loop, so that one pass is compiled and not one for each of M.
+    later = jnp.arange(1, len(counts)), jnp.asarray(counts[1:], jnp.int32)
+    return jax.lax.scan(look, frame, later)[0].values
 
 
 def _decode_latents(model: HMA, z: jax.Array, predict: Predict, key_B: jax.Array, decode: DecodeConfig) -> jax.Array:
