@@ -12,6 +12,7 @@ import numpy as np
 from hma_jax.config import require
 from hma_jax.evaluation.controllability import OPTIONAL
 from hma_jax.evaluation.statistics import (
+    Clusters,
     Estimate,
     Stat,
     clusters_of,
@@ -62,7 +63,7 @@ def summarise(windows: WindowTable, perplexity_group: int) -> Summary:
         own = windows.of(name)
         clusters = clusters_of(own.episode)
         found[name] = {m: stat_of(e, clusters) for m, e in _estimates(own, perplexity_group).items()}
-        found[name] |= _of_some(own, own.metrics)
+        found[name] |= _of_some(own, own.metrics, clusters)
     return Summary(found)
 
 
@@ -83,7 +84,7 @@ def paired_difference(a: WindowTable, b: WindowTable, perplexity_group: int) -> 
         clusters = clusters_of(mine.episode)
         found[name] = {m: stat_of(e.minus(theirs[m]), clusters) for m, e in ours.items() if m in theirs}
         both = [m for m in OPTIONAL if m in mine.metrics and m in other.metrics]
-        found[name] |= _of_some(mine, {m: mine.metrics[m] - other.metrics[m] for m in both})
+        found[name] |= _of_some(mine, {m: mine.metrics[m] - other.metrics[m] for m in both}, clusters)
     return Summary(found)
 
 
@@ -98,8 +99,13 @@ def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimat
     return estimates
 
 
-def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray]) -> dict[str, Stat]:
-    """Means of the optional metrics in `columns`, of the windows that have them."""
-    known = {metric: ~np.isnan(columns[metric]) for metric in OPTIONAL if metric in columns}
-    there = {metric: which for metric, which in known.items() if which.any()}
-    return {m: mean_and_sem(columns[m][which], windows.episode[which]) for m, which in there.items()}
+def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray], clusters: Clusters) -> dict[str, Stat]:
+    """Means of the optional metrics in `columns`, of the windows that have them; `clusters` are those of all windows."""
+    found = {}
+    for metric, column in ((m, columns[m]) for m in OPTIONAL if m in columns):
+        there = ~np.isnan(column)
+        if there.all():
+            found[metric] = stat_of(estimate_mean(column), clusters)
+        elif there.any():
+            found[metric] = mean_and_sem(column[there], windows.episode[there])
+    return found
