@@ -74,7 +74,8 @@ class TokenEmbed(nnx.Module):
 
 
 class LatentEmbed(nnx.Module):
-    """A linear map of a patch's values; masked cells hold one learned vector instead."""
+    """A linear map of a patch's values; masked cells hold one learned vector instead. DIFFERS: it starts at Xavier; the
+    release draws it from N(0, 0.02)."""
 
     def __init__(self, config: ModelConfig):
         self.diffusion = config.diffusion

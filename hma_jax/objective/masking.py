@@ -126,7 +126,8 @@ def mask_tokens(u_rate_T: jax.Array, u_mask: jax.Array, first_masked: jax.Array,
     """bool like `u_mask` [T, ...]: a frame's rate is cos(pi/2 u), its mean 2 / pi for u over [0, 1).
 
     Frames before `first_masked`, at least frame 0, are never masked (reference sections 1.9 and 2.3). A minimum m
-    that is not 0 makes the rate m + (1 - m) cos(pi/2 u) (`min_mask_ratio`).
+    that is not 0 makes the rate m + (1 - m) cos(pi/2 u) (`min_mask_ratio`). DIFFERS: the release draws again where
+    nothing of a batch was masked; here such a batch, which only tiny ones are, has a loss of 0.
     """
     angle = masking.mask_angle_min + (1 - masking.mask_angle_min) * u_rate_T
     rate = jnp.cos(jnp.pi / 2 * angle)
