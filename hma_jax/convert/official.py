@@ -10,6 +10,8 @@ multiplies with is folded into the weights where the release would multiply othe
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +73,14 @@ def read_official(directory: Path) -> Run:
         is_continuous(config) == any(name.startswith("diffloss.") for name in tensors),
         f"{directory}: {CONFIG} describes the {_variant(config)} variant, the tensors are the other's",
     )
-    model = read_model(config, where)
+    with _of_file(where):
+        model, masking = read_model(config, where), read_masking(config)
     names = config["action_domains"] if isinstance(config.get("action_domains"), list) else []
     missing = [name for robot in names for name in _statistics(robot) if name not in tensors]
     require(not missing, f"{directory}: missing tensors {', '.join(missing[:10])}")
     statistics = {robot: tuple(tensors[name].read() for name in _statistics(robot)) for robot in names}
-    table = read_table(config, statistics, where)
+    with _of_file(where):
+        table = read_table(config, statistics, where)
     check_names(
         official_shapes(model, table),
         {name: tensor.shape for name, tensor in tensors.items()},
@@ -94,7 +98,16 @@ def read_official(directory: Path) -> Run:
             "halves": {n: t.dtype.name for n, t in tensors.items() if t.dtype.name != "float32"},
         }
     }
-    return Run(model, TrainConfig(masking=read_masking(config)), table, params, 0, provenance)
+    return Run(model, TrainConfig(masking=masking), table, params, 0, provenance)
+
+
+@contextmanager
+def _of_file(where: str) -> Iterator[None]:
+    """What a configuration of ours says of itself does not name the file that asked for it."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(str(error) if where in str(error) else f"{where}: {error}") from error
 
 
 def read_config(directory: Path) -> dict[str, Any]:

@@ -137,13 +137,15 @@ def test_many_wrong_tensors_are_counted_and_ten_are_shown(tmp_path):
         ({"action_domains": None}, "missing field.*action_domains"),
         ({"d_actions": ["2"]}, "d_actions must list one value per robot"),
         ({"S": None}, "S must be a positive integer, got None"),
+        ({"num_prompt_frames": 0}, "prompt_frames must be at least 1"),
     ],
 )
 def test_a_configuration_that_cannot_work_is_refused_by_name(changes, message, tmp_path):
     config = official_config(DISCRETE, ONE)
     folder = write_checkpoint(tmp_path / "a", config | changes, random_tensors(config, ONE))
-    with pytest.raises(ConfigError, match=message):
+    with pytest.raises(ConfigError, match=message) as caught:
         read_official(folder)
+    assert str(folder / "config.json") in str(caught.value)
 
 
 def test_the_variant_is_told_by_configuration_and_tensors_alike(tmp_path):
