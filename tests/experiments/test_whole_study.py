@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import experiments
 from experiments.rows import curve, read_csv
 from experiments.running.closure import closure_hash
 from experiments.running.provenance import read_record, trial_closure
@@ -20,8 +21,8 @@ def hma(*arguments: str) -> list[str]:
     return [sys.executable, "-m", "experiments.cli", *arguments]
 
 
-def finish(command: list[str]) -> None:
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+def finish(command: list[str], **where) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, **where)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -43,12 +44,24 @@ def test_one_command_goes_from_nothing_to_a_page(tmp_path):
     assert [record.besides for record in closures] == [{}, {}]  # the closure is all that was imported
 
 
+@pytest.fixture
+def copied(tmp_path_factory) -> dict:
+    """Where a command runs a copy of the sources. Rows name the sources that made them, and trials refuse to run where
+    these changed since their study began, as they do in a repository that somebody works in meanwhile."""
+    here, there = Path(experiments.__file__).parents[1], tmp_path_factory.mktemp("sources")
+    for package in ("hma_jax", "data_pipelines", "experiments"):
+        left_out = shutil.ignore_patterns("__pycache__", "results")
+        shutil.copytree(here / package, there / package, ignore=left_out)
+    (there / "experiments" / "results").symlink_to(here / "experiments" / "results")  # the page reads of it
+    return {"cwd": there, "env": os.environ | {"PYTHONPATH": str(there)}}
+
+
 @pytest.mark.slow
-def test_killed_study_ends_with_the_same_csv(tmp_path):
+def test_killed_study_ends_with_the_same_csv(tmp_path, copied):
     """kill -9 in the middle, the same command again: nothing runs twice, a trial that is made
     again gives the same bytes."""
     command = hma("study", "--preset", "smoke", "--out", str(tmp_path))
-    study = subprocess.Popen(command, start_new_session=True)
+    study = subprocess.Popen(command, start_new_session=True, **copied)
     deadline = time.monotonic() + 400
     while not ((tmp_path / "ledger.jsonl").exists() and starts(tmp_path) == 2):
         assert time.monotonic() < deadline and study.poll() is None
@@ -57,25 +70,25 @@ def test_killed_study_ends_with_the_same_csv(tmp_path):
     os.kill(study.pid, signal.SIGKILL)
     study.wait()
 
-    finish(command)
+    finish(command, **copied)
     csv = (tmp_path / "results.csv").read_bytes()
     assert starts(tmp_path) == 6  # five trials, one of them twice
-    finish(command)
+    finish(command, **copied)
     assert starts(tmp_path) == 6 and (tmp_path / "results.csv").read_bytes() == csv
 
     ledger = map(json.loads, (tmp_path / "ledger.jsonl").read_text().splitlines())
     (lost,) = (line["trial"] for line in ledger if line["event"] == "lost")
     shutil.rmtree(tmp_path / "trials" / lost)  # never killed, this time
-    finish(command)
+    finish(command, **copied)
     assert starts(tmp_path) == 7 and (tmp_path / "results.csv").read_bytes() == csv
 
 
 @pytest.mark.slow
-def test_a_study_that_is_judged_otherwise_trains_nothing_again(tmp_path):
+def test_a_study_that_is_judged_otherwise_trains_nothing_again(tmp_path, copied):
     command = hma("sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path), "--set", "trajectory_counts=4")
-    finish(command)
+    finish(command, **copied)
     before = {p.name: json.loads((p / "result.json").read_text()) for p in (tmp_path / "trials").iterdir()}
-    finish([*command, "--set", "eval.random_actions=3", "--replace", "study"])
+    finish([*command, "--set", "eval.random_actions=3", "--replace", "study"], **copied)
     now = [
         json.loads((path / "result.json").read_text())
         for path in (tmp_path / "trials").iterdir()
