@@ -70,7 +70,7 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     metrics = [m for m in SHOWN if any(row.metric == m for row in rows)]
     found = {(row.scope, row.metric): row for row in rows}
     ratio = "cross_entropy" in metrics
-    columns = ["robot", *(f"{m} ({_unit(m)})" for m in metrics), *["perplexity"] * ratio]
+    columns = ["robot", *(_heading(m, ids=ratio) for m in metrics), *["perplexity"] * ratio]
     table = tidy_table(escape(f"{a.name} - {b.name}"), *columns)
     for scope in dict.fromkeys(row.scope for row in rows):
         cells = [_cell(found.get((scope, metric))) for metric in metrics]
@@ -95,8 +95,11 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     return table
 
 
-def _unit(metric: str) -> str:
-    return {"cross_entropy": "nats", "action_nats": "nats", "diffusion_loss": "loss"}.get(metric, "dB")
+def _heading(metric: str, ids: bool) -> str:
+    """A metric with its unit, if it has one. Where tokens are latents, and not `ids`, action-nats are of the loss."""
+    units = {"cross_entropy": "nats", "diffusion_loss": "loss", "action_nats": "nats" if ids else "loss", "lpips": ""}
+    unit = units.get(metric, "dB")
+    return f"{metric} ({unit})" if unit else metric
 
 
 def _cell(row: Difference | None) -> str:
