@@ -62,7 +62,7 @@ from experiments.applications.generating.lessons import (
     others_actions,
 )
 from experiments.applications.generating.source import replay
-from experiments.applications.generating.trajectories import open_trajectories, require_layout
+from experiments.applications.generating.trajectories import open_trajectories, require_layout, told_of_frames
 from experiments.applications.made_with import claim, write_settings
 from experiments.applications.policies.acting import STILL, Scale, scale_of
 from experiments.applications.policies.cloning import BcConfig, clone
@@ -78,7 +78,7 @@ from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
-from experiments.progress import Pace, step
+from experiments.progress import Pace, console, step
 from experiments.running.workspace import Workspace
 from experiments.setting import use_entries
 from experiments.wrote import wrote
@@ -238,6 +238,8 @@ def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
     trained_on, driven = open_trajectories(asked.actions, asked.split or "train", *place)
     held_out, _ = open_trajectories(asked.actions, asked.held_out or "val", *place)
     require_layout(trained_on, driven, simulator.model.table)
+    for note in filter(None, map(told_of_frames, (trained_on, held_out))):
+        console.print(note, markup=False, soft_wrap=True)
     return RecordedLessons(training, driven, trained_on, held_out)
 
 

@@ -58,7 +58,7 @@ def generate(
     from data_pipelines.sources.units import require_module
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
-    from experiments.applications.generating.trajectories import open_trajectories
+    from experiments.applications.generating.trajectories import open_trajectories, told_of_frames
     from experiments.applications.simulators import load_simulator
     from experiments.running.workspace import Workspace
     from hma_jax.simulator.folder import find_decode
@@ -80,6 +80,8 @@ def generate(
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)
+    if note := told_of_frames(recorded):
+        console.print(note, markup=False, soft_wrap=True)
     count = len(recorded) if episodes is None else min(episodes, len(recorded))
     mark = checkpoint_hash(run, simulator.model.step)
     source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)

@@ -15,6 +15,7 @@ from data_pipelines.sources.identity import episode_ids
 from data_pipelines.sources.open import open_source, source_name
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.sources.source import INSTRUCTION_KEY, REWARD_KEY
+from data_pipelines.tokens.episode_record import StoredEpisode
 from data_pipelines.tokens.manifest import FILE as MANIFEST
 from data_pipelines.tokens.store import TokenStore
 from hma_jax.config import ConfigError, require
@@ -54,6 +55,7 @@ class Trajectories(ABC):
     split: str
     fingerprint: str  # of its contents
     spec: DatasetSpec  # which camera and actions of it, at which rate
+    reconstructed: bool = False  # whether images are what the tokenizer makes of tokens, for want of recorded ones
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -137,17 +139,22 @@ class StoredTrajectories(Trajectories):
         self._every = robot.stride // manifest.frame_step
         self.name, self.split, self.fingerprint, self.spec = name, split, manifest.hash(), manifest.spec
         self._count = len(manifest.split(split).episodes)
+        self.reconstructed = self._count > 0 and not self._keeps(store.episode(name, split, 0))
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, i: int) -> Trajectory:
         episode = self._store.episode(self.name, self.split, i)
-        if episode.frames is not None and episode.frames.shape[1:3] == self._tokenizer.image_shape:
+        if self._keeps(episode):
             images = np.array(episode.frames[:: self._every])
         else:
             images = np.asarray(self._tokenizer.decode(np.array(episode.tokens[:: self._every])))
         return _trajectory(self.origin(i), images, episode.actions, self._robot, "")
+
+    def _keeps(self, episode: StoredEpisode) -> bool:
+        """Whether there are the recorded frames of an episode, of the size that the model's have."""
+        return episode.frames is not None and episode.frames.shape[1:3] == self._tokenizer.image_shape
 
     def outline(self, i: int) -> Outline:
         episode = self._store.episode(self.name, self.split, i)
@@ -186,6 +193,17 @@ def open_trajectories(
     if stored:
         return StoredTrajectories(TokenStore(path.parent), name, split, tokenizer, chosen), chosen
     return RldsTrajectories(place, split, get_spec(name), chosen, tokenizer.image_size), chosen
+
+
+def told_of_frames(recorded: Trajectories) -> str:
+    """What people are to be told where no recorded frames are at hand; nothing where they are."""
+    if not recorded.reconstructed:
+        return ""
+    return (
+        f"note: the token store keeps no frames of {recorded.name}, split {recorded.split}: what the tokenizer makes of "
+        "its tokens stands for the recording, and hides the tokenizer's own error; give the directory of the recordings "
+        "instead"
+    )
 
 
 def _require_fit(spec: DatasetSpec, robot: Robot) -> None:

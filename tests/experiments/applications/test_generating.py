@@ -141,7 +141,7 @@ def episode_seed(i: int) -> int:
     return source_module.episode_seed(0, f"pusher_sand/val/{i}")
 
 
-def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path):
+def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path, capsys):
     tokenizer, robots = load_tokenizer(run.parent / "tokenizer"), {ROBOT.name: ROBOT}
     tokenize_dataset(get_spec("pusher_sand"), recorded, tokenizer, tmp_path, min_val=1, keep_frames="val")
     for split in ("train", "val"):
@@ -152,6 +152,12 @@ def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path):
         np.testing.assert_array_equal(stored[0].chunks, truth.chunks)
         seen = truth.images if split == "val" else tokenizer.decode(tokenizer.encode(truth.images))
         np.testing.assert_array_equal(stored[0].images, seen)
+        asked = ["--actions", str(tmp_path / "pusher_sand"), "--split", split, "--episodes", "1", "--clips", "0"]
+        assert main(["generate", str(run), *asked, "--out", str(tmp_path / split)]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert (f"keeps no frames of pusher_sand, split {split}: what the tokenizer makes" in said) == (
+            split == "train"
+        )
     with pytest.raises(ConfigError, match=f"pusher: no such directory, and {tmp_path} has tokens of pusher_sand$"):
         open_trajectories("pusher", "val", None, robots, tokenizer, tmp_path)
 
