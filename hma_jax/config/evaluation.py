@@ -131,6 +131,7 @@ def check_decoding(model: ModelConfig, decode: DecodeConfig) -> None:
         )
         return
     require(decode.order == "random", "decode.order 'confidence' needs probabilities: continuous tokens have none")
+    require(decode.top_k == 0, "decode.top_k draws among the entries of a factor: continuous tokens have none")
     steps, most = decode.sampler.steps, model.diffusion.steps
     require(
         steps <= most,
