@@ -94,8 +94,13 @@ def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConf
 
 
 def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
-    """Raises ConfigError if `directory` exists or the frames do not fit the model's window."""
-    model, table = run.model, run.table
+    """Raises ConfigError if `directory` exists, the model predicts no frames or they do not fit its window."""
+    model, table, masking = run.model, run.table, run.train.masking
+    require(
+        masking.predicts_frames,
+        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are none to "
+        "generate",
+    )
     require(
         config.frames <= model.frames,
         f"{config.frames} frames do not fit the model's window of {model.frames}",
@@ -104,7 +109,7 @@ def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
     weights = {path: jax.ShapeDtypeStruct(spec.shape, jnp.float32) for path, spec in leaves.items()}
     inputs = input_shapes(model, table, config)
     with written_aside(directory) as aside:
-        program = jax.jit(generate_function(model, table, run.train.masking.setting, config))
+        program = jax.jit(generate_function(model, table, masking.setting, config))
         exported = export.export(program, platforms=config.platforms)(weights, *inputs.values())
         (aside / PROGRAM).write_bytes(exported.serialize())
         write_safetensors(aside / WEIGHTS, {path: np.asarray(x) for path, x in flat(run.params).items()})

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hma_jax.config import ConfigError, DecodeConfig, DiffusionConfig, SamplerConfig
+from hma_jax.config import ConfigError, DecodeConfig, DiffusionConfig, MaskingConfig, SamplerConfig
 from hma_jax.convert import (
     ProgramConfig,
     read_neutral,
@@ -214,6 +214,9 @@ def test_a_program_shows_no_action_that_its_model_was_trained_without():
 def test_a_program_that_cannot_be_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="9 frames do not fit the model's window of 4"):
         write_stablehlo(small_run(), tmp_path / "out", ProgramConfig(frames=9))
+    policy = replace(small_run(), train=train_config(masking=MaskingConfig(setting="policy")))
+    with pytest.raises(ConfigError, match="'policy', which predicts no frames"):
+        write_stablehlo(policy, tmp_path / "out", ProgramConfig(prompt=2, frames=4))
     with pytest.raises(ConfigError, match="frames must exceed prompt"):
         ProgramConfig(prompt=3, frames=3)
     with pytest.raises(ConfigError, match="choose some of cpu, cuda"):
