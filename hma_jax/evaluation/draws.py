@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hma_jax.kernels.random import draw_flat
 from hma_jax.model.embodiments import EmbodimentTable
 
 Purpose = Literal["actions", "decoding", "likelihood", "policy"]
@@ -61,10 +62,8 @@ def random_actions(
     """
 
     of_window = jax.vmap(jax.random.fold_in, (None, 0))
-    keys = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
-    # In one row: nested rows of keys take XLA three times as long to compile.
-    noise = jax.vmap(lambda key: _normal(key, (draws * frames,)))(keys.reshape(-1))
-    noise = jnp.moveaxis(noise.reshape(*keys.shape, draws, frames), 1, -1)
+    key_BU = jax.vmap(of_window, (0, None))(key_B, jnp.arange(table.action_width))
+    noise = jnp.moveaxis(draw_flat(_normal, key_BU, (draws, frames)), 1, -1)
     mean_BU, std_BU = statistics or own_statistics(embodiment_B, table)
     # Behind a barrier, or compilers join product and sum where that suits the shape, and round once less.
     from_mean = jax.lax.optimization_barrier(std_BU[:, None, None] * noise)

@@ -11,6 +11,7 @@ from flax import nnx
 from hma_jax.config import ModelConfig
 from hma_jax.kernels.dense import contract, look_up
 from hma_jax.kernels.pointwise import gelu
+from hma_jax.kernels.random import draw_flat
 from hma_jax.model.initial import readout_init, trunk_init
 from hma_jax.model.layers import LayerNorm, Linear
 from hma_jax.model.params import normal, param, zeros
@@ -84,7 +85,7 @@ def drawing(key: jax.Array, shape: tuple[int, ...], temperature: float = 1.0, to
     """
     if temperature == 0:
         return likeliest
-    noise = jax.random.gumbel(key, shape)
+    noise = draw_flat(jax.random.gumbel, key, shape)
 
     def choose(factor: int, logits: jax.Array) -> jax.Array:
         scaled = logits / temperature

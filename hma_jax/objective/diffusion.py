@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hma_jax.config import SamplerConfig, require
+from hma_jax.kernels.random import draw_flat
 from hma_jax.objective.process import Process, multistep
 
 Network = Callable[[jax.Array, jax.Array], jax.Array]
@@ -161,12 +162,8 @@ def sample_with_key(
     )
 
     def draw(index: jax.Array | int) -> jax.Array:
-        def one(k: jax.Array) -> jax.Array:
-            return jax.random.normal(jax.random.fold_in(k, index), shape[key.ndim :])
-
-        for _ in range(key.ndim):
-            one = jax.vmap(one)
-        return one(key)
+        keys = jax.vmap(lambda k: jax.random.fold_in(k, index))(key.reshape(-1))
+        return draw_flat(jax.random.normal, keys.reshape(key.shape), shape[key.ndim :])
 
     return _run(network, draw(process.steps), draw, process, sampler, clip)
 

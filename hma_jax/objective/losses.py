@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from hma_jax.config import MaskingConfig
+from hma_jax.kernels.random import draw_flat
 from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
@@ -181,7 +182,7 @@ def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float 
     if shift != 1:
         u = (time + 0.5) / steps
         time = (steps * shift * u / (1 + (shift - 1) * u)).astype(jnp.int32)
-    return time, jax.random.normal(noise_key, shape)
+    return time, draw_flat(jax.random.normal, noise_key, shape)
 
 
 def action_loss_per_step(
