@@ -25,8 +25,14 @@ from tests.tiny import TABLE, model_config, random_batch
 
 
 @pytest.mark.parametrize("diffusion", [None, DIFFUSION], ids=["ids", "latents"])
-@pytest.mark.parametrize("context", ["generated", "recorded"])
-@pytest.mark.parametrize("setting", ["forward", "policy"])
+@pytest.mark.parametrize(
+    ("context", "setting"),
+    [
+        ("generated", "forward"),
+        ("recorded", "policy"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in (("generated", "policy"), ("recorded", "forward"))),
+    ],
+)
 def test_evaluation_counts_what_the_protocol_multiplies(diffusion, context, setting):
     config = model_config(width=64, diffusion=diffusion, action_heads=setting == "policy")
     steps = replace(EvalConfig().decode.sampler, steps=5)

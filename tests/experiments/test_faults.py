@@ -76,6 +76,7 @@ LONG = {
 }
 
 
+@pytest.mark.slow
 def test_sigterm_ends_every_long_command_with_one_code_and_it_goes_on(where, tmp_path, monkeypatch, capsys):
     where = (*where[:3], str(tmp_path / "out"), *where[4:])
     model = str(tmp_path / "out" / "model")

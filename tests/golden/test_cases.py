@@ -97,7 +97,9 @@ def test_unknown_kinds_are_named(tmp_path, capsys):
     ("name", "weight"),
     [
         ("09b_tokenizer_five_levels", "encoder.down.3.downsample.bias"),
-        ("10b_vae_decoder_32groups", "decoder.up_blocks.1.resnets.2.time_mixer.mix_factor"),
+        pytest.param(
+            "10b_vae_decoder_32groups", "decoder.up_blocks.1.resnets.2.time_mixer.mix_factor", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_other_weights_of_a_tokenizer_fail(name, weight, copy, capsys):

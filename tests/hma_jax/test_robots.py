@@ -31,7 +31,7 @@ def compiled(batch: int):
     return jax.jit(step, donate_argnums=0).lower(*given).compile()
 
 
-@pytest.mark.parametrize("batch", [1, 2])
+@pytest.mark.parametrize("batch", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_step_writes_robots_slices_in_place(batch: int):
     """A copy of all robots' arrays at every step takes most of the time of a small batch."""
     _, entry = compiled(batch).as_text().split("\nENTRY ")

@@ -20,6 +20,8 @@ from data_pipelines.suite.world import EDGE, World
 
 BY_NAME = {spec.name: spec for spec in EMBODIMENTS}
 every_robot = pytest.mark.parametrize("name", list(BY_NAME))
+FIRST = {spec.family: spec.name for spec in reversed(EMBODIMENTS)}.values()
+"""One robot of each family."""
 
 
 def short(spec: EmbodimentSpec) -> EmbodimentSpec:
@@ -52,7 +54,7 @@ def test_a_robot_simulates_soundly(name):
     assert (moved > 0.1).any(1).mean() > 0.25, "objects are hardly ever touched"
 
 
-@every_robot
+@pytest.mark.parametrize("name", [n if n in FIRST else pytest.param(n, marks=pytest.mark.slow) for n in BY_NAME])
 def test_actions_decide_what_is_seen(name):
     """From the same start, one's own actions give the same frames, another's give others."""
     spec, n, steps = short(BY_NAME[name]), 6, max(2 * BY_NAME[name].hz, 4)

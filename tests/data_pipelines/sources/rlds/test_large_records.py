@@ -109,10 +109,8 @@ def test_frames_under_way_are_bounded_in_bytes(tmp_path, monkeypatch):
     assert [type(x).__name__ for x in items].count("ndarray") == 600
 
 
-@pytest.mark.parametrize(
-    "records, size",
-    [(2, 150), pytest.param(7, 300, marks=pytest.mark.slow)],  # the second 2 GB, of disk too
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("records, size", [(2, 150), (7, 300)])  # the second 2 GB, of disk too
 def test_memory_does_not_grow_with_records(tmp_path, records, size):
     """Peak memory of a process that tokenises, JAX and the tokenizer included; and its growth by
     frames that are under way, but not by whole records (480 MB for the larger ones)."""
