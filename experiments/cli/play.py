@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 from experiments.applications import DRIVEN
 from experiments.progress import console
 from experiments.setting import UNSET
+from experiments.words import few
 from hma_jax.config import ConfigError, ExecutionConfig, require
 from hma_jax.runtime.exits import raise_lost_request
 
@@ -71,7 +72,14 @@ def play(
         run, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=visitors, decode=decode
     )
     keep_places(simulator, run)
-    console.print(f"{run}: {len(simulator.robots)} robots; compiling")
+    begins = {start.robot for start in simulator.starts}
+    if missing := [name for name in simulator.robots if name not in begins]:
+        console.print(
+            f"note: not on the page: {few(missing)}; there are no held-out frames here to start from, as of robots that "
+            "the model knew before it was given others",
+            soft_wrap=True,
+        )
+    console.print(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling", soft_wrap=True)
     warm_up(simulator, together=1)
     raise_lost_request()
 

@@ -33,7 +33,7 @@ from hma_jax.runtime.exits import Exit
 from hma_jax.simulator.folder import DECODE, USUAL, save_decode
 from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving
-from tests.hma_jax.simulator.small import simulator
+from tests.hma_jax.simulator.small import simulator, start
 
 
 def test_the_page_and_what_it_must_know_are_served():
@@ -180,6 +180,22 @@ def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp
     monkeypatch.setattr(server, "serve", serve)
     play(tmp_path, visitors=2)
     assert first == [1]
+
+
+def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, capsys):
+    """Those of a model that robots were added to: there are frames of these alone."""
+    from experiments.applications import simulators
+    from hma_jax.simulator import warm_up
+
+    model = simulator(episodes=1)
+    model.starts = (start(0, 2),)
+    first, *others = model.robots
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: model)
+    monkeypatch.setattr(warm_up, "warm_up", lambda *_, **__: require(False, "enough is said"))
+    assert main(["play", str(tmp_path)]) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"not on the page: {', '.join(others)}; there are no held-out frames" in said
+    assert said.endswith(f"{tmp_path}: {first}; compiling")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
