@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import FlagCreatePairsOff, UseAppendAction, arg
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, UseAppendAction, arg
 
 from experiments.preparing.made_from import Step
 from experiments.running.launchers.registry import LAUNCHERS
-from experiments.setting import UNSET, require_local
+from experiments.running.run_options import RunOptions
+from experiments.setting import UNSET, StudyArguments, require_local
 
 
 @dataclass(frozen=True)
@@ -61,3 +62,10 @@ class OneModel:
         """`run`. Raises ConfigError for a URL."""
         require_local("--run", self.run)
         return self.run
+
+
+# As commands take them: `--help` shows those of each under its name.
+StudyOptions = Annotated[OmitArgPrefixes[StudyArguments], arg(name="study")]
+ModelOptions = Annotated[OmitArgPrefixes[OneModel], arg(name="model")]
+SavingOptions = Annotated[OmitArgPrefixes[RunOptions], arg(name="saving")]
+RemakeOptions = Annotated[OmitArgPrefixes[Remake], arg(name="replacement")]

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
+from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.progress import console, step, tidy_table
 from experiments.running.attempts import JOB
-from experiments.setting import UNSET, Setting, StudyArguments, make_setting, require_local, short
+from experiments.setting import UNSET, Setting, make_setting, require_local, short
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, Weights, require
@@ -36,7 +37,7 @@ windows.parquet those of every window."""
 
 def evaluate(
     run: Annotated[Positional[Path], arg(metavar="RUN")],
-    asked: OmitArgPrefixes[StudyArguments],
+    asked: StudyOptions,
     hosts: OmitArgPrefixes[Hosts],
     weights: Weights = "auto",
     to: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="(default: RUN)")] = None,

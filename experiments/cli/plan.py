@@ -53,7 +53,7 @@ class Shape:
 
 
 def plan(
-    asked: OmitArgPrefixes[Planned],
+    asked: Annotated[OmitArgPrefixes[Planned], arg(name="study")],
     shape: OmitArgPrefixes[Shape],
     topology: Annotated[tuple[str, ...], arg(metavar="NAME ...")] = ("local",),
     memory: Annotated[str | None, arg(metavar="SIZE")] = None,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from experiments.cli.arguments import Remake, RunningArguments
+from experiments.cli.arguments import Remake, RemakeOptions, RunningArguments, StudyOptions
 from experiments.progress import console
 from experiments.running.launchers.registry import Launching
 from experiments.setting import StudyArguments, make_setting
@@ -16,9 +16,9 @@ from hma_jax.config import ConfigError, require
 
 
 def study(
-    asked: OmitArgPrefixes[StudyArguments],
+    asked: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
-    remake: OmitArgPrefixes[Remake],
+    remake: RemakeOptions,
 ) -> None:
     """Run a whole scaling study: data, tokenizer, its sweeps, CSV, figures and a report page.
 
@@ -31,9 +31,9 @@ def study(
 
 def sweep(
     axis: Annotated[Positional[str], arg(metavar="|".join((*AXES, "FILE.py")))],
-    asked: OmitArgPrefixes[StudyArguments],
+    asked: StudyOptions,
     running: OmitArgPrefixes[RunningArguments],
-    remake: OmitArgPrefixes[Remake],
+    remake: RemakeOptions,
 ) -> None:
     """Run one axis: datasets, trajectories, width; settings, conditioning; lr; or one of your own, from its file.
 

@@ -7,21 +7,21 @@ from contextlib import ExitStack
 from typing import Annotated
 
 from rich.markup import escape
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import arg
 
 from data_pipelines.errors import NAMED
-from experiments.cli.arguments import Remake
+from experiments.cli.arguments import RemakeOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.progress import console, tidy_table
 from experiments.running.workspace import Busy, Workspace
-from experiments.setting import Setting, StudyArguments, make_setting, short
+from experiments.setting import Setting, make_setting, short
 from experiments.wrote import wrote
 from hma_jax.config import require
 
 
 def tokenize(
-    asked: OmitArgPrefixes[StudyArguments],
-    remake: OmitArgPrefixes[Remake],
+    asked: StudyOptions,
+    remake: RemakeOptions,
     batch: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 256)")] = None,
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: one per core, up to 8)")] = None,
 ) -> None:

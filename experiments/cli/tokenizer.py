@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
-from experiments.cli.arguments import Remake
+from experiments.cli.arguments import RemakeOptions, StudyOptions
 from experiments.preparing.made_from import Step
 from experiments.progress import console, step
-from experiments.setting import Setting, StudyArguments, command, make_setting, short
+from experiments.setting import Setting, command, make_setting, short
 from experiments.wrote import wrote
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ HELP = "The image tokenizer: trained here, made of published weights, or none."
 
 
 @tokenizer_app.command(name="train")
-def tokenizer_train(asked: OmitArgPrefixes[StudyArguments], remake: OmitArgPrefixes[Remake]) -> None:
+def tokenizer_train(asked: StudyOptions, remake: RemakeOptions) -> None:
     """Train the study's image tokenizer on its datasets."""
     train_tokenizer(make_setting(asked), remake.replace)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 
-from experiments.cli.arguments import OneModel, Remake
+from experiments.cli.arguments import ModelOptions, RemakeOptions, SavingOptions, StudyOptions
 from experiments.cli.begin import known, require_another_place, require_known, setting_of, strangers
 from experiments.cli.hosts import Hosts
 from experiments.preparing.made_from import Step
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 
 def train(
-    asked: OmitArgPrefixes[StudyArguments],
-    one: OmitArgPrefixes[OneModel],
-    options: OmitArgPrefixes[RunOptions],
-    remake: OmitArgPrefixes[Remake],
+    asked: StudyOptions,
+    one: ModelOptions,
+    options: SavingOptions,
+    remake: RemakeOptions,
     hosts: OmitArgPrefixes[Hosts],
     begin: Annotated[Path | None, arg(name="from", metavar="RUN"), UNSET] = None,
     dry_run: Annotated[FlagCreatePairsOff[bool], arg(name="dry-run"), UNSET] = False,
@@ -70,10 +70,10 @@ def train(
 
 def adapt(
     source: Annotated[Positional[Path], arg(metavar="RUN")],
-    asked: OmitArgPrefixes[StudyArguments],
-    one: OmitArgPrefixes[OneModel],
-    options: OmitArgPrefixes[RunOptions],
-    remake: OmitArgPrefixes[Remake],
+    asked: StudyOptions,
+    one: ModelOptions,
+    options: SavingOptions,
+    remake: RemakeOptions,
     hosts: OmitArgPrefixes[Hosts],
     everything: Annotated[FlagCreatePairsOff[bool], UNSET] = False,
 ) -> None:

@@ -116,7 +116,7 @@ def require_same(step: Step, place: Path, lines: Sequence[str], asked: Step | No
     after = [IN_WORDS[s] for s in get_args(Step) if may_replace(s, step) and s != step]
     follows = f", and {', '.join(after)} where they depend on it" if after else ""
     raise ConfigError(
-        f"{place}: {IN_WORDS[step]} there were made from other inputs (there -> asked for):\n  "
+        f"{place} holds {IN_WORDS[step]}, made from other inputs (there -> asked for):\n  "
         + "\n  ".join(lines)
         + "\nNothing was changed. Choose another --out, or give the settings that it was made with"
         + (f", or {otherwise}" if otherwise else "")

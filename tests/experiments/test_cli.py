@@ -300,7 +300,7 @@ def test_a_study_of_other_settings_is_not_drawn_over(instant_trials, tmp_path, c
     other = ["sweep", "conditioning", *smoke, "--set", "train.steps=7"]
     assert main(other) == 2
     said = capsys.readouterr().err
-    assert f"{tmp_path / 'study.json'}: " in said and "train.steps: 3 -> 7" in said and "--replace study" in said
+    assert f"{tmp_path / 'study.json'} holds " in said and "train.steps: 3 -> 7" in said and "--replace study" in said
     assert (tmp_path / "report.html").read_bytes() == page
     assert load_record(Workspace(tmp_path)).axes == ("settings",)
     assert main([*other, "--replace", "study"]) == 0

@@ -5,18 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import Positional, arg
 
+from experiments.cli.arguments import StudyOptions
 from experiments.cli.bench.record import write
 from experiments.progress import console, step, tidy_table
-from experiments.setting import StudyArguments, make_setting
+from experiments.setting import make_setting
 from hma_jax.config import ConfigError, require
 from hma_jax.config.execution import Dtype
 
 
 def quality(
     run: Positional[Path],
-    asked: OmitArgPrefixes[StudyArguments],
+    asked: StudyOptions,
     frames: int | None = None,
     windows: int = 12,
     repeats: int = 30,

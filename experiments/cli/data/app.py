@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from tyro.conf import OmitArgPrefixes
 from tyro.extras import SubcommandApp
 
-from experiments.cli.arguments import Remake
+from experiments.cli.arguments import RemakeOptions, StudyOptions
 from experiments.cli.data import convert, registry, sim
 from experiments.cli.data.view import view
-from experiments.setting import StudyArguments, make_setting
+from experiments.setting import make_setting
 from experiments.wrote import wrote
 
 HELP = "The registry, what a directory holds, other formats, the simulated suites."
@@ -19,7 +18,7 @@ CONVERT_HELP = (
 )
 
 
-def suite(asked: OmitArgPrefixes[StudyArguments], remake: OmitArgPrefixes[Remake]) -> None:
+def suite(asked: StudyOptions, remake: RemakeOptions) -> None:
     """Write the study's simulated datasets as RLDS directories."""
     from experiments.preparing.suite import make_suite
 
