@@ -38,19 +38,21 @@ PER_CORE = -n auto --maxprocesses 8 --dist worksteal
 
 # Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py: in a process beside the
 # others, which takes what time they leave (they wait for files and browsers now and then) and says what it found after them.
-EXACT = $(shell grep -rl --include='test_*.py' 'mark.exact' tests)
-EXACT_LOG = $(VENV)/exact.log
+# A whole study, which is processes one after another, is run there too.
+files_with = $(shell grep -rlE --include='test_*.py' 'mark\.($(1))' tests)
+BESIDE_LOG = $(VENV)/beside.log
 
 test: $(VENV)/installed-test
-	@echo "beside these tests, those of equal numbers run in a process of their own"; \
-	nice -n 19 env XLA_FLAGS= $(PYTEST) -m "exact and not slow" $(EXACT) >$(EXACT_LOG) 2>&1 & exact=$$!; \
-	$(PYTEST) $(PER_CORE) -m "not exact and not slow" && others=0 || others=$$?; \
-	wait $$exact && found=0 || found=$$?; \
-	echo "tests of equal numbers:"; cat $(EXACT_LOG); \
+	@echo "beside these tests, those of equal numbers and of a whole study run in a process of their own"; \
+	nice -n 19 env XLA_FLAGS= $(PYTEST) -m "(exact or beside) and not slow" $(call files_with,exact|beside) \
+	    >$(BESIDE_LOG) 2>&1 & beside=$$!; \
+	$(PYTEST) $(PER_CORE) -m "not (exact or beside or slow)" && others=0 || others=$$?; \
+	wait $$beside && found=0 || found=$$?; \
+	echo "tests of equal numbers and of a whole study:"; cat $(BESIDE_LOG); \
 	exit $$((others > found ? others : found))
 
 test-slow: $(VENV)/installed-test
-	XLA_FLAGS= $(PYTEST) $(PER_CORE) -m exact $(EXACT)
+	XLA_FLAGS= $(PYTEST) $(PER_CORE) -m exact $(call files_with,exact)
 	$(PYTEST) $(PER_CORE) -m "not exact"
 
 # constraints.txt pins what was tested on Python 3.11; other versions take what pip resolves. uv installs in a quarter of the

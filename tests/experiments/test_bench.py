@@ -187,6 +187,7 @@ def test_decodings_vary_what_the_model_leaves_open():
     assert samplers["dpm++ 8"].decode.sampler.kind == "dpm++"
 
 
+@pytest.mark.slow
 def test_a_model_that_was_trained_without_actions_is_judged_without():
     config = model_config(**SMALLER)
     declared, params = lively_params(config)

@@ -30,7 +30,9 @@ def test_a_training_case_without_mup_is_trained_without_it(copy, capsys):
     assert verify.main([str(case)]) == 0, said(capsys)
 
 
-@pytest.mark.parametrize("sizes", [pytest.param([(12, 20)], marks=pytest.mark.slow), [(20, 12), (4, 2)], []], ids=str)
+@pytest.mark.parametrize(
+    "sizes", [*(pytest.param(s, marks=pytest.mark.slow) for s in ([(12, 20)], [(20, 12), (4, 2)])), []], ids=str
+)
 def test_images_of_any_size_that_the_levels_can_halve_are_compared(sizes, tmp_path, capsys):
     """Of a tokenizer of two levels; without images there are ids to decode."""
     case = write_published(tmp_path / "case", "magvit2")

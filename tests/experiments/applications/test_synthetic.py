@@ -154,6 +154,7 @@ def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordin
     assert "success" not in (tmp_path / "table.md").read_text()
 
 
+@pytest.mark.slow
 def test_the_second_control_is_a_model_without_actions_which_shows_the_same_under_all(tmp_path):
     run = make_run(tmp_path / "study")
     robot = load_simulator(run, history=1).robot("pusher_sand")

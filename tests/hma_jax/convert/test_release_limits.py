@@ -88,9 +88,13 @@ def test_a_discrete_model_keeps_mup_at_the_base_width_of_the_release(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"diffusion": RELEASED, "mup": MupConfig()}, "continuous models of width 256 only"),
+        pytest.param(
+            {"diffusion": RELEASED, "mup": MupConfig()}, "continuous models of width 256 only", marks=pytest.mark.slow
+        ),
         ({"qkv_bias": True, "mup": MupConfig(base_width=64, attention_scale=3.0)}, "attention scales of 8 /"),
-        ({"qk_norm": True, "mup": MupConfig(attention_scale=3.0)}, "attention scales of 8 /"),
+        pytest.param(
+            {"qk_norm": True, "mup": MupConfig(attention_scale=3.0)}, "attention scales of 8 /", marks=pytest.mark.slow
+        ),
     ],
     ids=["continuous", "attention_scale", "attention_scale-qk_norm"],
 )

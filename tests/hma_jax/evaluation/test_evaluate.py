@@ -131,6 +131,7 @@ def test_latents_that_are_no_numbers_are_not_decoded_into_images():
         evaluate(broken, config, TABLE, TOKENIZER, batches, EVAL, setting="full")
 
 
+@pytest.mark.slow
 def test_a_model_deaf_to_actions_has_no_delta_psnr(params):
     """Common random numbers: only actions may make a difference."""
     deaf = jax.tree.map(lambda x: x, params)

@@ -354,6 +354,7 @@ def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
     assert compiled == reached == [n for n in sizes(16) if n > 1][:2] and len(sizes(16)) > 3
 
 
+@pytest.mark.slow
 def test_a_model_trained_without_actions_goes_on_alike_under_all_of_them():
     model, tokenizer = parts()
     passive = replace(model.run, train=TrainConfig(masking=MaskingConfig(setting="passive")))

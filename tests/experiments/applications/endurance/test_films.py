@@ -39,7 +39,8 @@ def watch(name: str, frames: np.ndarray) -> SimpleNamespace:
     return SimpleNamespace(position=grey[:, None, None] * [[[1, 2]]], confidence=grey[:, None] / 255)
 
 
-@pytest.mark.parametrize("slide", ["exact", pytest.param("streaming", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("slide", ["exact", "streaming"])
 def test_films_that_a_kill_cut_short_go_on_and_come_out_the_same(slide, tmp_path, monkeypatch):
     monkeypatch.setattr(films, "BLOCK", 4)
     decode = DecodeConfig(2, temperature=1.0, slide=slide)

@@ -246,6 +246,7 @@ def test_rewards_are_read_in_every_format_that_has_them(tmp_path):
         assert all(len(r) == recorded.outline(i).frames for i, r in enumerate(rewards) if r is not None)
 
 
+@pytest.mark.slow
 def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp_path, capsys, few_draws):
     """Whatever the flag of success says: of these 20 the first 10 stay at the goal, seven of them from the first frame on,
     three from their fifth. Policies begin where it is not reached yet."""
