@@ -36,19 +36,20 @@ play: $(VENV)/installed-play
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q
 PER_CORE = -n auto --maxprocesses 8 --dist worksteal
 
-# Promises of equal numbers are tested as users compile, without the flags of tests/conftest.py: in a process beside the
-# others, which takes what time they leave (they wait for files and browsers now and then) and says what it found after them.
-# A whole study, which is processes one after another, is run there too.
-files_with = $(shell grep -rlE --include='test_*.py' 'mark\.($(1))' tests)
+# Tests in a process beside the others take what time these leave (they wait for files and browsers now and then), and what
+# they found is said after them: promises of equal numbers, which are tested as users compile, without the flags of
+# tests/conftest.py; then some long ones.
+files_with = $(shell grep -rl --include='test_*.py' 'mark.$(1)' tests)
 BESIDE_LOG = $(VENV)/beside.log
 
 test: $(VENV)/installed-test
-	@echo "beside these tests, those of equal numbers and of a whole study run in a process of their own"; \
-	nice -n 19 env XLA_FLAGS= $(PYTEST) -m "(exact or beside) and not slow" $(call files_with,exact|beside) \
+	@echo "beside these tests, those of equal numbers and some long ones run in a process of their own"; \
+	(XLA_FLAGS= nice -n 19 env $(PYTEST) -m "exact and not slow" $(call files_with,exact) && equal=0 || equal=$$?; \
+	nice -n 19 env $(PYTEST) -m "beside and not slow" $(call files_with,beside) && exit $$equal) \
 	    >$(BESIDE_LOG) 2>&1 & beside=$$!; \
 	$(PYTEST) $(PER_CORE) -m "not (exact or beside or slow)" && others=0 || others=$$?; \
 	wait $$beside && found=0 || found=$$?; \
-	echo "tests of equal numbers and of a whole study:"; cat $(BESIDE_LOG); \
+	echo "tests of equal numbers, and long ones:"; cat $(BESIDE_LOG); \
 	exit $$((others > found ? others : found))
 
 test-slow: $(VENV)/installed-test

@@ -15,7 +15,6 @@ import experiments
 from experiments.rows import curve, read_csv
 from experiments.running.closure import closure_hash
 from experiments.running.provenance import read_record, trial_closure
-from tests.conftest import FAST_COMPILATION
 
 
 def hma(*arguments: str) -> list[str]:
@@ -34,8 +33,7 @@ def starts(out: Path) -> int:
 @pytest.mark.beside
 def test_one_command_goes_from_nothing_to_a_page(tmp_path):
     """Not marked slow, though it takes half a minute: the only fast test of the whole chain."""
-    command = hma("sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path), "--set", "trajectory_counts=4")
-    finish(command, env=os.environ | {"XLA_FLAGS": " ".join(FAST_COMPILATION)})
+    finish(hma("sweep", "trajectories", "--preset", "smoke", "--out", str(tmp_path), "--set", "trajectory_counts=4"))
     rows = read_csv(tmp_path / "results.csv")
     assert {(r.role, r.status) for r in rows} == {(r, "finished") for r in ("point", "control", "untrained")}
     (untrained,) = curve(rows, "trajectories", "perplexity", "untrained")

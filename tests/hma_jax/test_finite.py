@@ -54,6 +54,7 @@ def test_a_gradient_that_is_no_number_is_refused_though_the_loss_is_fine(tmp_pat
     assert load_run(tmp_path).step == 2
 
 
+@pytest.mark.slow
 def test_an_update_that_is_infinite_is_refused_though_the_gradient_is_fine(tmp_path: Path, monkeypatch):
     usual = step_module.apply_update
 

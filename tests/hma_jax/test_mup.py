@@ -111,6 +111,7 @@ def test_at_the_base_width_mup_is_the_standard_parametrisation_bit_for_bit(name)
 # --- Activations -----------------------------------------------------------------------------
 
 
+@pytest.mark.beside
 @pytest.mark.parametrize("name", ["discrete", pytest.param("continuous", marks=pytest.mark.slow)])
 def test_activations_and_what_training_changes_keep_their_size_at_every_width(name):
     rows = measured(variant(name), 6)

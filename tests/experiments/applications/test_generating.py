@@ -141,6 +141,7 @@ def episode_seed(i: int) -> int:
     return source_module.episode_seed(0, f"pusher_sand/val/{i}")
 
 
+@pytest.mark.slow
 def test_a_token_store_gives_the_same_trajectories(run, recorded, tmp_path, capsys):
     tokenizer, robots = load_tokenizer(run.parent / "tokenizer"), {ROBOT.name: ROBOT}
     tokenize_dataset(get_spec("pusher_sand"), recorded, tokenizer, tmp_path, min_val=1, keep_frames="val")

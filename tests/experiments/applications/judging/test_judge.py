@@ -31,6 +31,8 @@ from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.training.runs import Run
 from tests.hma_jax.simulator.small import CONFIG, parts
 
+pytestmark = pytest.mark.beside
+
 SMALL = EncoderConfig(8, (4, 4, 4), 8)
 ASKED = JudgeConfig(
     find_task("gripper_wood", frames=2, hold=1),

@@ -28,6 +28,8 @@ from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import write_rlds
 from tests.experiments.applications.runs import make_run
 
+pytestmark = pytest.mark.beside
+
 SPEC = get_spec("berkeley_gnm_cory_hall")
 TABLE = EmbodimentTable((Embodiment(SPEC.name, 2, 1, (0.0,) * 2, (1.0,) * 2, low=(-2.0,) * 2, high=(2.0,) * 2),))
 
