@@ -41,9 +41,7 @@ class Done:
     provenance: Provenance = UNKNOWN
     finished: frozenset[str] = frozenset()
     left: Mapping[str, str] = field(default_factory=dict)  # that ended without a result and are not run again, and how
-    steps: Mapping[str, int] = field(
-        default_factory=dict
-    )  # that trials have made, or go on from, of those not finished
+    steps: Mapping[str, int] = field(default_factory=dict)  # of trials not finished: made, or gone on from
 
 
 NOTHING = Done()
