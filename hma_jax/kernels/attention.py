@@ -41,6 +41,9 @@ BACKENDS = {
 
 OF_PLATFORM = {"cpu": "cpu", "gpu": "cudnn", "cuda": "cudnn", "tpu": "splash"}
 
+ONLY_ON = {"cudnn": "an NVIDIA GPU", "splash": "a TPU"}
+"""Backends with a kernel that no other platform runs."""
+
 
 def backend_of(platform: str) -> str:
     """The name of what `auto` means on a platform as JAX calls it."""
@@ -48,8 +51,16 @@ def backend_of(platform: str) -> str:
 
 
 def find_backend(name: str) -> Backend:
-    """The backend called `name`; `auto` is the one of the default device's platform."""
-    if name == "auto":
-        name = backend_of(jax.default_backend())
+    """The backend called `name`; `auto` is the one of the platform that is compiled for: of the mesh, or else of the default
+    device. Raises ConfigError for a name that is unknown, or a kernel that the platform has not."""
+    mesh_device = jax.sharding.get_abstract_mesh().abstract_device
+    platform = mesh_device.platform if mesh_device else jax.default_backend()
+    suits = backend_of(platform)
+    name = suits if name == "auto" else name
     require(name in BACKENDS, f"execution.attention {name!r} is unknown; known: auto, {', '.join(BACKENDS)}")
+    require(
+        name == suits or name not in ONLY_ON,
+        f"execution.attention {name!r} runs on {ONLY_ON.get(name)} alone, and the device here is a {platform.upper()}; "
+        "choose auto, which takes what suits the device",
+    )
     return BACKENDS[name]

@@ -110,12 +110,28 @@ def test_on_a_tpu_no_array_of_attention_weights_is_made():
     assert "320x320xf32" in lowered_for_tpu(plain.within)
 
 
-def test_every_backend_on_offer_is_known_and_another_is_refused():
-    for name in ("plain", "cpu", "cudnn", "splash"):
+@pytest.mark.parametrize(("platform", "own"), [("cpu", "cpu"), ("gpu", "cudnn"), ("tpu", "splash"), ("metal", "plain")])
+def test_every_backend_on_offer_is_known_where_it_runs_and_another_is_refused(platform, own, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    for name in ("plain", "cpu", own):
         assert attention.find_backend(name) is attention.BACKENDS[name]
-    assert attention.find_backend("auto") in attention.BACKENDS.values()
+    assert attention.find_backend("auto") is attention.BACKENDS[own]
     with pytest.raises(ConfigError, match="'flash' is unknown"):
         attention.find_backend("flash")
+    for name, where in {"cudnn": "an NVIDIA GPU", "splash": "a TPU"}.items():
+        if name != own:
+            said = f"attention '{name}' runs on {where} alone, and the device here is a {platform.upper()}; choose auto"
+            with pytest.raises(ConfigError, match=said):
+                attention.find_backend(name)
+
+
+def test_the_backend_is_that_of_the_devices_that_are_compiled_for(monkeypatch):
+    """`hma plan` compiles for others than the default one."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
+    with jax.set_mesh(jax.make_mesh((1,), ("data",), devices=jax.devices("cpu")[:1])):
+        found = []
+        jax.jit(lambda x: found.append(attention.find_backend("auto")) or x)(0.0)
+    assert found == [attention.BACKENDS["cpu"]]
 
 
 def test_large_frames_attend_one_by_one_on_cpu_and_say_the_same():
