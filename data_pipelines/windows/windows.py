@@ -100,8 +100,8 @@ def require_windows(sets: Mapping[str, WindowSet]) -> None:
     reasons = "; ".join(f"{name}: {s.shortage()}" for name, s in sets.items())
     if not any(s.longest for s in sets.values()):
         raise DataError(
-            f"there is no {split} episode to cut windows of. {reasons}. store.val_fraction, store.min_val and "
-            "store.max_val say how many are held out, of all that there should be."
+            f"there is no {split} episode to cut windows of. {reasons}. Of a single episode none can be held out: add more. "
+            "Of several, store.val_fraction, store.min_val and store.max_val say how many are, of all that there should be."
         )
     shorter = " or a shorter prompt" if any(s.least > TO_TRAIN for s in sets.values()) else ""
     raise DataError(

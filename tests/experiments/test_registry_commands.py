@@ -170,7 +170,7 @@ def test_inspection_counts_at_the_rate_that_a_study_takes(tmp_path, capsys):
         (["{robot}", "--hz", "nan"], 2, "--hz must be positive and finite, got nan"),
         (["{robot}", "--frames", "0"], 2, "--frames must be at least 2, got 0"),
         (["{robot}", "--episodes", "0"], 2, "--episodes must be at least 1, got 0"),
-        (["{robot}", "--split", "test"], 2, "splits there: train"),
+        (["{robot}", "--split", "test"], 2, "splits there: train. Choose with --split"),
         (["{robot}/none"], 1, "no such directory"),
         (["{robot}", "--registry", "none.toml"], 2, "none.toml: the registry file cannot be read"),
     ],

@@ -130,7 +130,8 @@ def read_metadata(directory: Location, split: str) -> SplitMetadata:
     for part in parts:
         require(
             part in info.splits,
-            f"{info.name}: no split {part!r} in {directory}; splits there: {listing(sorted(info.splits))}",
+            f"{info.name}: no split {part!r} in {directory}; splits there: {listing(sorted(info.splits))}. Choose with "
+            "--split, or with split in the dataset's entry where a command has no such option.",
         )
     try:
         shards = [name for part in parts for name in info.shard_names(part)]

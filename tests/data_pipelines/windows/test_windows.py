@@ -110,9 +110,8 @@ def test_nothing_long_enough_says_what_is_needed():
 
 
 def test_a_dataset_without_episodes_is_not_a_crash():
-    with pytest.raises(
-        DataError, match="no val episode to cut .* toy: it has no val episode.* store.min_val and store"
-    ):
+    said = "no val episode to cut .* toy: it has no val episode. Of a single .* add more. .* store.min_val and store"
+    with pytest.raises(DataError, match=said):
         require_windows({"toy": val_windows(OneDataset([10]), "toy", 4, 2)})
 
 
