@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from experiments.cost import declared_table
 from experiments.done import UNKNOWN
 from experiments.running.launchers.registry import Launching
 from experiments.study import Study
@@ -37,7 +38,8 @@ def devices_of(mesh: MeshConfig, share: float | None) -> float:
 
 def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> float:
     """`devices_of` each trial. Raises ConfigError also for one whose batch or model does not divide over them, whose
-    learning rate would not do what is said of it, or that is to train robots alone that it does not have."""
+    learning rate would not do what is said of it, or that is to train robots alone that it does not have, or that have
+    nothing to themselves."""
     from hma_jax.runtime.mesh import check_sizes, mesh_sizes
     from hma_jax.training.optimizer import check_schedule
 
@@ -47,11 +49,27 @@ def check_trials(study: Study, sweeps: Sequence[Sweep], share: float | None) -> 
     for trial in unique_trials(sweeps, UNKNOWN).values():
         check_sizes(sizes, trial.model, trial.train.batch, execution.accumulate)
         check_schedule(trial.train.optimizer, trial.train.steps)
-        require_only(trial.train, [name for one in trial.with_source() for name in one.datasets])
+        if trial.source:  # each is judged as a robot that the model was adapted to
+            _require_actions(trial.train.only, trial.rate)
+        require_only(trial.train, [name for one in trial.with_source() for name in one.datasets], trial.rate)
     return devices
 
 
-def require_only(train: TrainConfig, robots: Sequence[str]) -> None:
-    """Raises ConfigError where `train.only` names others than the `robots` that a model is trained on."""
+def _require_actions(robots: Sequence[str], rate: float | None) -> None:
+    without = [name for name in robots if not declared_table((name,), rate).entries[0].chunk]
+    require(
+        not without,
+        f"{few(without)}: no model can be adapted to robots without actions, since all that a robot has to itself is of "
+        "them; leave them out (the axis fewshot adapts to --set unseen=...)",
+    )
+
+
+def require_only(train: TrainConfig, robots: Sequence[str], rate: float | None) -> None:
+    """Raises ConfigError, as training would, where `train.only` names others than the `robots` that a model is trained
+    on, and where none of those that it names has anything to itself that would be trained."""
     without = [name for name in train.only if name not in robots]
     require(not without, f"train.only: there is no robot {few(without)} to train, but {few(robots)}")
+    if train.only:
+        from hma_jax.training.step import check_own
+
+        check_own(declared_table(train.only, rate).entries, train.masking)

@@ -141,30 +141,29 @@ def adapt_model(
     """Trains a model further that has first been given slices for the study's new datasets."""
     from experiments.running.newcomers import add_robots
     from experiments.running.run_trial import open_materials
+    from experiments.trainable import require_only
     from hma_jax.training.runs import load_run
 
     trained = load_run(source, "auto")
     setting = setting_of(source, trained, asked)
+    study, new = setting.study, strangers(trained, setting)
     require(
-        bool(strangers(trained, setting)),
-        f"{short(source)} already knows {few(setting.study.dataset_names())}: there is nothing to add. To train it on: "
+        bool(new),
+        f"{short(source)} already knows {few(study.dataset_names())}: there is nothing to add. To train it on: "
         f"{setting.command('train', '--from', source)} --run NEW",
     )
     require(
-        not setting.study.train.only,
+        not study.train.only,
         "train.only: leave it out; the new robots alone are trained, or, with --everything, all",
     )
     run = run or setting.workspace.root / "model"
     require_another_place(source, run)
     origin = _check(setting, run, trajectories, options, trained)
+    train = dataclasses.replace(study.train, seed=study.seeds[0], only=() if everything else tuple(new))
+    require_only(train, new, study.rate)
     _require_devices(setting)
     _prepare(setting, replace)
-    study, new = setting.study, strangers(trained, setting)
-    only = () if everything else tuple(new)
-    trial = dataclasses.replace(
-        _single_trial(setting, trajectories),
-        train=dataclasses.replace(study.train, seed=study.seeds[0], only=only),
-    )
+    trial = dataclasses.replace(_single_trial(setting, trajectories), train=train)
     beginning = add_robots(trained, trial, open_materials(setting.workspace)) | {"origin": origin}
     console.print(f"new: {', '.join(new)}; training {'everything' if everything else 'these alone'}")
     del trained  # its arrays are not needed while the new model trains
@@ -183,7 +182,7 @@ def _check(
     require_plain(run)
     _require_no_trial(setting, run)
     check_schedule(setting.study.train.optimizer, setting.study.train.steps)
-    require_only(setting.study.train, setting.study.dataset_names())
+    require_only(setting.study.train, setting.study.dataset_names(), setting.study.rate)
     require(trajectories is None or trajectories >= 1, f"--trajectories must be at least 1, got {trajectories}")
     _require_trained_here(setting, run)
     return _taken(run, begin)

@@ -179,6 +179,24 @@ def test_robots_that_are_to_be_trained_alone_and_are_not_there_are_refused_befor
         assert not (tmp_path / "out").exists()
 
 
+def test_robots_without_actions_that_are_to_be_trained_alone_are_refused_before_anything_is_made(capsys, tmp_path):
+    """Trials of a study failed after its data, tokenizer and other trials were made."""
+    video, one = "gripper_sky", ["--set", "designs.shots_after=1", "--set", "designs.judged=1"]
+    fewshot = ["sweep", "fewshot", *one, "--set", f"unseen={video},omni_mint"]
+    only = ["--set", f"datasets={video},picker_sand,arm_sky", "--set", f"train.only={video}"]
+    nothing = f"train.only: nothing that {video} alone has would be trained"
+    for command, words in (
+        (fewshot, f"{video}: no model can be adapted to robots without actions"),
+        (["study", *only], nothing),
+        (["train", *only], nothing),
+    ):
+        for dry in ([], ["--dry-run"]):
+            assert main([*command, *dry, "--preset", "smoke", "--out", str(tmp_path / "out")]) == 2
+            assert words in capsys.readouterr().err
+            assert not (tmp_path / "out").exists()
+    assert main([*fewshot, "--dry-run", "--preset", "smoke", "--set", "unseen=omni_mint"]) == 0
+
+
 def test_what_nobody_knows_of_the_preparation_is_said_to_be_unknown(capsys):
     before = estimate_preparing(PAPER)
     words = describe(before, lambda seconds: f"{seconds:.0f} s")

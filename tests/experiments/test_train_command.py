@@ -386,6 +386,8 @@ def test_a_model_goes_on_with_its_own_tokenizer_robots_and_rates(released, where
     only = ("--set", f"train.only={BASE.name}")
     said = refused("adapt", str(beside), "--data", *data, *only)
     assert "train.only: leave it out; the new robots alone are trained" in said
+    said = refused("adapt", str(beside), "--data", *data, "--set", "train.masking.setting=passive")
+    assert f"nothing that {BASE.name} alone has would be trained" in said
     asked, trained = StudyArguments("smoke", out, tuple(data)), load_run(beside)
     setting = setting_of(beside, trained, asked)
     assert setting.tokenizer == tokenizer and strangers(trained, setting) == [BASE.name]
