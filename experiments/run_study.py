@@ -14,7 +14,7 @@ from experiments.running.attempts import RESULT, State, read_states
 from experiments.running.closure import Closure
 from experiments.running.launchers.base import Launcher
 from experiments.running.launchers.registry import Launching
-from experiments.running.ledger import FINISHED, Ledger
+from experiments.running.ledger import FINISHED, MISSING, PREEMPTED, REFUSED, Ledger
 from experiments.running.provenance import Provenance
 from experiments.running.runner import Job, run_missing
 from experiments.running.shared_runs import share_runs
@@ -173,5 +173,14 @@ def require_results(jobs: Sequence[Job], states: dict[str, State], again: str) -
     """Raises TrialsFailed, naming every trial without a result, and the command that tries them again."""
     bad = [(job, states[job.id]) for job in jobs if states[job.id].event != FINISHED]
     if bad:
-        lines = "\n".join(f"  {s.event}: {job.title}: {s.message}" for job, s in bad)
+        refused = any(state.event == REFUSED for _, state in bad)
+        lines = "\n".join(f"  {_without_result(job, state, refused)}" for job, state in bad)
         raise TrialsFailed(f"{len(bad)} of {len(jobs)} trials have no result:\n{lines}\nTo try them again: {again}")
+
+
+def _without_result(job: Job, state: State, refused: bool) -> str:
+    """A trial, its state and why it has it. `refused`: another one was, after which the runner starts none."""
+    why = state.message
+    if not why and refused and state.event in (MISSING, PREEMPTED):
+        why = "not started, since another trial was refused"
+    return ": ".join(filter(None, (state.event, job.title, why)))

@@ -133,6 +133,10 @@ def test_a_change_to_the_code_in_mid_sweep_is_refused_by_the_next_trial(checkout
     states = run_missing(jobs, tmp_path / "trials", ledger, LocalLauncher(tmp_path, 1, command=command))
     assert [states[f"t{i}"].event for i in range(3)] == ["refused", "missing", "missing"]
     assert "sources changed since this sweep was started: hma_jax.objective.losses." in states["t0"].message
+    with pytest.raises(study_runs.TrialsFailed) as failed:
+        study_runs.require_results(jobs, states, "hma study")
+    for line in ("missing: trial 1", "missing: trial 2"):
+        assert f"  {line}: not started, since another trial was refused\n" in str(failed.value)
     assert not (tmp_path / "trials" / "t0" / "run").exists()
     (tmp_path / "trials" / "t0" / "failure.json").unlink()
     assert subprocess.run(command(tmp_path / "trials" / "t0")).returncode == Exit.REFUSED
