@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import sys
+import traceback
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hma_jax.config import require
+from data_pipelines.errors import DataError
+from hma_jax.config import ConfigError, require
 
 
 def find_function(path: Path, signature: str, what: str, page: str) -> Callable[..., Any]:
@@ -35,3 +38,24 @@ def run_file(path: Path, signature: str, what: str, page: str) -> types.ModuleTy
     sys.modules[module.__name__] = module  # dataclasses of the file look themselves up there
     exec(compile(path.read_bytes(), path, "exec"), vars(module))
     return module
+
+
+@contextmanager
+def naming_line(path: Path, page: str) -> Iterator[None]:
+    """What the file at `path`, or what it calls, raises becomes a ConfigError in the exception's own words that names the
+    line of the file. Errors of data and of the system have a message of their own."""
+    try:
+        yield
+    except (DataError, OSError):
+        raise
+    except Exception as error:  # the boundary of somebody else's code
+        syntax = isinstance(error, SyntaxError) and error.filename == str(path)
+        lines = [at.lineno for at in traceback.extract_tb(error.__traceback__) if at.filename == str(path)]
+        line = error.lineno if syntax else lines[-1] if lines else None
+        where = f"{path}, line {line}" if line else str(path)
+        if isinstance(error, ConfigError):  # it says what to do
+            raise ConfigError(f"{where}: {error}" if line else str(error)) from error
+        words = ": ".join(filter(None, (type(error).__name__, error.msg if syntax else str(error))))
+        raise ConfigError(
+            f"{where}: {words}; mend it there ({page}), or add --debug to see what called what"
+        ) from error

@@ -13,8 +13,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from experiments.own_file import find_function
+from experiments.own_file import find_function, naming_line
 from experiments.running.trial import Trial
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, POINT, STANDARD, Point, Sweep, judge_less
@@ -31,6 +32,8 @@ DESIGNS = ("dilution", "transfer", "newcomers", "fewshot", "episodes", "compute"
 
 AXES = (*SCALING, "settings", "conditioning", "ladder", "lr", *DESIGNS)
 """Each is `experiments.sweeps.<name>`."""
+
+PAGE = "docs/own_axis.md"
 
 KEPT = "axes"
 """The directory of a study that holds the files of its axes."""
@@ -65,10 +68,12 @@ def keep_axes(axes: Mapping[str, str], root: Path) -> tuple[str, ...]:
 def find_axis(axis: str, root: Path = Path()) -> Plan:
     """The function that plans an axis, of its name or of a user's file, relative to `root`.
 
-    Raises ConfigError without any.
+    Raises ConfigError without any, and for what the user's file raises, then or when it plans.
     """
     if is_file(axis):
-        return find_function(root / axis, "plan(study)", "an axis is", "docs/own_axis.md")
+        with naming_line(root / axis, PAGE):
+            plan = find_function(root / axis, "plan(study)", "an axis is", PAGE)
+        return naming_line(root / axis, PAGE)(plan)
     if axis not in AXES:
         near = difflib.get_close_matches(axis, AXES, n=1)
         meant = f"did you mean {near[0]}?" if near else f"known: {', '.join(AXES)}; or a file of your own, AXIS.py"
@@ -99,8 +104,12 @@ def plan_sweeps(study: Study, axes: Sequence[str], root: Path = Path()) -> list[
 
 
 def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
-    """Raises ConfigError for a point of a user's file that is none, for one whose trial would fail once it is trained,
-    and for one whose number would be of other robots, or of another position, than it says."""
+    """Raises ConfigError for a field of a user's sweep that is not of its kind, for a point that is none, for one whose
+    trial would fail once it is trained, and for one whose number would be of other robots, or of another position, than
+    it says."""
+    listed = isinstance(sweep.points, Sequence)
+    require(listed, f"{where}: points has to be a tuple of Point, and is a {type(sweep.points).__name__}")
+    _require_kinds(replace(sweep, points=()), f"{where}: the sweep")
     for number, p in enumerate(sweep.points, start=1):
         of_trial = isinstance(p, Point) and isinstance(p.trial, Trial)
         what = type(p.trial if isinstance(p, Point) else p).__name__
@@ -111,7 +120,10 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
         require(named, f"{where}: position {p.x:g} has no label; x counts into the {len(sweep.labels)} labels, from 0")
         known = (POINT, CONTROL, STANDARD)
         require(p.role in known, f"{where}: the role of point {number} has to be one of {known}, and is {p.role!r}")
-        _require_trial(study, p.trial, p.scope or sweep.scope, f"{where}: the trial at {p.x:g}")
+        at = f"{where}: the trial at {p.x:g}"
+        same = _require_kinds(p, at) == p
+        require(same, f"{at} has a setting of a wrong kind: a list where a tuple belongs, or a number that is none")
+        _require_trial(study, p.trial, p.scope or sweep.scope, at)
     drawn = {bool(p.series) for p in sweep.points if p.role != CONTROL}
     require(
         len(drawn) < 2, f"{where}: some points have a series and others none, which no figure shows beside each other"
@@ -132,12 +144,15 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
         )
 
 
-def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str) -> None:
-    try:  # as its process reads it
-        same = from_dict(Trial, json.loads(json.dumps(to_dict(trial)))) == trial
+def _require_kinds(given: Any, where: str) -> Any:
+    """What is `given`, as a trial's process reads it. Raises ConfigError for a field of a wrong kind."""
+    try:
+        return from_dict(type(given), json.loads(json.dumps(to_dict(given))))
     except (TypeError, ValueError) as error:  # ConfigError is a ValueError
         raise ConfigError(f"{where} has a setting of a wrong kind ({error})") from error
-    require(same, f"{where} has a setting of a wrong kind: a list where a tuple belongs, or a number that is none")
+
+
+def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str) -> None:
     for one in trial.with_source():
         _require_fits(study, one, where)
     known = {name for one in trial.with_source() for name in one.datasets}

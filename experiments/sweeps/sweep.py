@@ -42,7 +42,7 @@ class Sweep:
     gain: str = ""  # what a model may gain from along it, for the headline
     title: str = ""  # of its section on the page; sweeps over one number share a section
     labels: tuple[str, ...] = ()  # an axis of names: x counts into these
-    reference_x: int | None = None  # of its default: the reference trial, or one that takes its place on this axis
+    reference_x: float | None = None  # of its default: the reference trial, or one that takes its place on this axis
     base: str = ""  # of several series, the one whose best x the others are to use
     valley: bool = False  # the loss is expected to be lowest within, not at the end
 

@@ -184,6 +184,8 @@ def plan(study):
         (EDITED.format("series='long'"), "some points have a series and others none"),
         (EDITED.format("x=0, series='long'") + LABELLED, "has labels and several series"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
+        (NAMED.replace('"own"', "3"), "the sweep has a setting of a wrong kind .Sweep.name: expected str, got 3"),
+        (EDITED.format("scope=3"), "trial at 8 has a setting of a wrong kind .Point.scope: expected a list, got 3"),
         (TWICE, "returned 2 points at 8, point, seed 0; give each a position or a series of its own"),
     ],
 )
@@ -194,3 +196,34 @@ def test_a_file_that_is_no_axis_is_refused(text, words, tmp_path):
         plan_sweeps(STUDY, [str(path)])
     with pytest.raises(ConfigError, match="no such file"):
         plan_sweeps(STUDY, [str(tmp_path / "other.py")])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (
+            OWN.format("replace(\n        trial, tua=x)"),
+            "line 6: TypeError: Trial.__init__() got .* argument 'tua'; mend",
+        ),
+        (OWN.replace("gain=", "gian="), "line 5: TypeError: make_sweep() got .*'gian'; mend"),
+        (
+            "def plan(study):\n    assert study.seed",
+            "line 2: AttributeError: 'Study' object has no attribute 'seed'; mend",
+        ),
+        ("def plan(study):\n    assert study.unseen", "line 2: AssertionError; mend"),
+        ("import replace", "line 1: ModuleNotFoundError: No module named 'replace'; mend"),
+        ("\ndef plan(study)\n    return 3", "line 2: SyntaxError: expected ':'; mend"),
+        ("def plan(): return 3", "mine.py: TypeError: plan() takes 0 positional arguments but 1 was given; mend"),
+        (OWN.format("replace(trial, train=replace(trial.train, steps=0))"), "line 6: train.steps must be at least 1"),
+    ],
+)
+def test_what_a_file_raises_names_its_line(text, words, tmp_path, capsys):
+    """It was a traceback, as of a bug of the program."""
+    path = tmp_path / "mine.py"
+    path.write_text(text)
+    assert main(["sweep", str(path), "--preset", "smoke", "--dry-run"]) == 2
+    said = capsys.readouterr().err
+    assert re.search(words.replace("(", r"\(").replace(")", r"\)"), said) and said.count(str(path)) == 1
+    with pytest.raises(ConfigError) as debugged:
+        main(["--debug", "sweep", str(path), "--preset", "smoke", "--dry-run"])
+    assert debugged.value.__cause__ is not None
