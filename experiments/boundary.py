@@ -21,11 +21,13 @@ def guarded(
     own_process: bool = True,
     *,
     resumes: bool = True,
+    keeps: str = "",
     skipping: str = "",
 ) -> int:
     """Does `work` and returns the exit code; what a user can mend is one message on stderr, with `debug` or HMA_DEBUG=1
     a traceback, as of a bug. `own_process`: the process has nothing else to do; `resumes`: after a stop the same command
-    goes on where it was; `skipping`: the option that leaves out records that cannot be read."""
+    goes on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves out records
+    that cannot be read."""
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
         _silence_background()
@@ -48,7 +50,8 @@ def guarded(
     except KeyboardInterrupt as request:
         code = exit_of_interrupt(request)
         what = "stopped by SIGTERM" if code == Exit.STOPPED else "interrupted"
-        _say(f"{what}; the same command {'goes on from here' if resumes else 'begins anew'}")
+        anew = f"begins anew, but keeps {keeps}" if keeps else "begins anew"
+        _say(f"{what}; the same command {'goes on from here' if resumes else anew}")
         _end_together(request, code)
         return code
     except Exception as error:  # the boundary of the program

@@ -8,17 +8,21 @@ Expected: it finds tools and visible objects of held-out true frames within 2 pi
 The suite says where everything is; half of the frames it learns from are as RUN's tokenizer shows them, and in some an
 object is missing, so that it learns what nothing looks like. It sees frames of 64 pixels; those of a run that has fewer
 are enlarged.
-Writes detector.npz (half precision) and errors.csv, its own errors on held-out episodes.
+Writes detector.npz (half precision) and errors.csv, its own errors on held-out episodes. The same command goes on where
+it was stopped, and keeps a detector that is there.
 """
 
 from __future__ import annotations
 
 import argparse
 import io
+import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,11 +32,13 @@ import optax
 from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from data_pipelines.suite.spec import IMAGE_SIZE
+from experiments.applications.made_with import FILE, claim
 from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
-from experiments.progress import step
+from experiments.progress import console, step
+from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
@@ -42,12 +48,16 @@ from hma_jax.tokenizers.shared import BaseTokenizer
 
 COMMITTED, OUT = Path("experiments/results/detector"), Path("runs/detector")
 WEIGHTS, ERRORS = "detector.npz", "errors.csv"
+UNFINISHED = f"{WEIGHTS}.unfinished"
 EPISODES, FEWEST, PER_EPISODE, HELD_OUT = 1920, 48, 16, (24, 16)
 """Of all robots together, but so many of each, from the suite's training split, and frames of each episode; of each
 robot the same of the held-out split."""
 
 STEPS, MORE, BATCH, RATE = 1000, 125, 32, 2e-3
 """Steps, and how many more for each robot."""
+
+KEEP_EVERY = 100
+"""Steps after which what is trained is kept."""
 
 MISSING = 0.2
 NOISE = 16.0
@@ -103,11 +113,10 @@ class Detector:
             ) from error
 
 
-def batches(scenes: Sequence[Scenes], seed: int, count: int, size: int) -> Iterator[tuple]:
-    """What `points_loss` takes, of random frames of random robots, with noise."""
-    rng = np.random.default_rng(seed)
+def batches(scenes: Sequence[Scenes], rng: np.random.Generator, size: int) -> Iterator[tuple]:
+    """What `points_loss` takes, of random frames of random robots, with noise; without end."""
     points, side = max(own.there.shape[-1] for own in scenes), scenes[0].images.shape[1]
-    for _ in range(count):
+    while True:
         images, robots = np.zeros((size, side, side, 3), np.float32), rng.integers(len(scenes), size=size)
         position, known = np.zeros((size, points, 2), np.float32), np.zeros((size, points), np.float32)
         there = np.zeros((size, points), np.float32)
@@ -121,15 +130,17 @@ def batches(scenes: Sequence[Scenes], seed: int, count: int, size: int) -> Itera
 
 def train_detector(
     scenes: Mapping[str, Scenes],
+    unfinished: Path,
     *,
     steps: int,
     size: int = BATCH,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Detector:
-    """Raises ConfigError without scenes, or where training diverges."""
+    """Goes on from the file `unfinished`, where a process that was killed has left it, and comes out as if it never had
+    been. Raises ConfigError without scenes, for a damaged file, or where training diverges."""
     require(bool(scenes), "there is no robot to train a detector on")
-    own = list(scenes.values())
+    own, rng = list(scenes.values()), np.random.default_rng(seed)
     weights = init_detector(jax.random.key(seed), len(own), max(x.there.shape[-1] for x in own))
     schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, min(100, steps // 4), steps)
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(schedule, weight_decay=1e-3))
@@ -140,12 +151,38 @@ def train_detector(
         change, state = optimizer.update(gradient, state, weights)
         return optax.apply_updates(weights, change), state, loss
 
-    state = optimizer.init(weights)
-    for i, batch in enumerate(batches(own, seed, steps, size)):
+    state, begun = optimizer.init(weights), 0
+    if unfinished.exists():
+        begun, (weights, state) = _go_on(unfinished, (weights, state), rng)
+    for done, batch in enumerate(islice(batches(own, rng, size), steps - begun), begun + 1):
         weights, state, loss = update(weights, state, batch)
-        progress(i + 1, steps)
-    require(bool(jnp.isfinite(loss)), "the detector's loss is not finite; lower RATE")
+        if done < steps and done % KEEP_EVERY == 0 and jnp.isfinite(loss):
+            _keep(unfinished, done, (weights, state), rng)
+        progress(done, steps)
+    if not jnp.isfinite(loss):
+        unfinished.unlink(missing_ok=True)  # from there it would come to the same
+        raise ConfigError("the detector's loss is not finite; lower RATE")
     return Detector(weights, list(scenes))
+
+
+def _keep(path: Path, done: int, trained: Any, rng: np.random.Generator) -> None:
+    """All that the steps after `done` ones depend on, besides the scenes."""
+    arrays = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(trained))}
+    content = io.BytesIO()
+    np.savez(content, done=done, rng=json.dumps(rng.bit_generator.state), **arrays)
+    write_file(path, content.getvalue())
+
+
+def _go_on(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]:
+    """(steps, what is trained) as `_keep` left them, in the structure of `fresh`; `rng` stands there again."""
+    leaves, structure = jax.tree.flatten(fresh)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            kept = [jnp.asarray(file[f"leaf/{i}"]) for i in range(len(leaves))]
+            rng.bit_generator.state = json.loads(str(file["rng"]))
+            return int(file["done"]), jax.tree.unflatten(structure, kept)
+    except UNREADABLE as error:
+        raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command trains anew") from error
 
 
 def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:
@@ -220,10 +257,10 @@ def make_detector(robots: Sequence[str], tokenizer: BaseTokenizer, out: Path) ->
             train[name] = as_shown(tokenizer, drawn, every=2)
             held[name] = draw_scenes(SPECS[name], "val", *HELD_OUT, 1)
             update(i + 1, len(robots), name)
-    with step("train the detector") as update:
-        steps = STEPS + MORE * len(robots)
-        detector = train_detector(train, steps=steps, progress=lambda done, total: update(done, total, ""))
     out.mkdir(parents=True, exist_ok=True)
+    unfinished, steps = out / UNFINISHED, STEPS + MORE * len(robots)
+    with step("train the detector") as update:
+        detector = train_detector(train, unfinished, steps=steps, progress=lambda done, total: update(done, total, ""))
     aside = out / f".{WEIGHTS}"
     detector.save(aside)
     detector, rows = Detector.load(aside), []  # as it was saved
@@ -232,6 +269,7 @@ def make_detector(robots: Sequence[str], tokenizer: BaseTokenizer, out: Path) ->
             rows += [{"frames_of": frames} | row for row in errors(detector, name, given(tokenizer, scenes))]
     write_rows(out / ERRORS, rows)
     aside.replace(out / WEIGHTS)  # last: whoever finds the weights does not measure them again
+    unfinished.unlink(missing_ok=True)
     return detector
 
 
@@ -239,14 +277,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--out", type=Path, default=OUT)
-    arguments = parser.parse_args()
-    simulator = load_simulator(arguments.run)
-    make_detector(list(known_robots(simulator.robots)), simulator.tokenizer, arguments.out)
-    print((arguments.out / ERRORS).read_text())
-    weights = arguments.out / WEIGHTS
-    then = f"python -m experiments.applications.endurance {arguments.run} --detector {weights}"
-    wrote(weights, arguments.out / ERRORS, then=then)
+    asked = parser.parse_args()
+    simulator, weights, table = load_simulator(asked.run), asked.out / WEIGHTS, asked.out / ERRORS
+    robots = list(known_robots(simulator.robots))
+    require(
+        not weights.exists() or (asked.out / FILE).exists(),
+        f"{weights} is there already, and nothing says of which run; choose another --out or remove it",
+    )
+    claim(asked.out, asked.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
+    if there := weights.exists():
+        said = f"{short(weights)} of this run is there already; remove it to have it made again"
+        console.print(said, markup=False, soft_wrap=True)
+    else:
+        make_detector(robots, simulator.tokenizer, asked.out)
+    print(table.read_text())
+    then = f"python -m experiments.applications.endurance {asked.run} --detector {weights}"
+    wrote(*(() if there else (weights, table)), then=then)
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main, resumes=False))
+    sys.exit(guarded(main))

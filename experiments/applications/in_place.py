@@ -136,4 +136,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(guarded(main, resumes=False))
+    sys.exit(guarded(main, resumes=False, keeps="what there is of the detector"))

@@ -1,6 +1,8 @@
 """Where things stand at the end of a window, and a detector for frames of any size."""
 
+import runpy
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -11,7 +13,17 @@ from data_pipelines.sources.rlds.images import fit_images
 from data_pipelines.suite.simulator import SPECS
 from experiments.applications import detector as detector_module
 from experiments.applications import in_place as in_place_module
-from experiments.applications.detector import Detector, as_given, as_shown, chosen, enlarged, make_detector, shown_by
+from experiments.applications import simulators
+from experiments.applications.detector import (
+    Detector,
+    as_given,
+    as_shown,
+    chosen,
+    enlarged,
+    make_detector,
+    shown_by,
+    train_detector,
+)  # fmt: skip
 from experiments.applications.in_place import CLOSE, EPISODES, VIEWS, in_place, watch_ends
 from experiments.applications.scenes import draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
@@ -19,6 +31,8 @@ from hma_jax.config import ConfigError, DecodeConfig
 from hma_jax.evaluation.detector import Found, init_detector
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, parts
+
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +98,8 @@ def test_a_detector_is_not_there_before_its_errors_are(simulator, tmp_path, monk
     def stopped(*_):
         raise KeyboardInterrupt
 
-    def untrained(scenes, **_):
+    def untrained(scenes, unfinished, **_):
+        unfinished.touch()
         return Detector(init_detector(jax.random.key(0), 1, 5), list(scenes))
 
     for name, value in (("EPISODES", 1), ("FEWEST", 1), ("HELD_OUT", (1, 1)), ("train_detector", untrained)):
@@ -113,19 +128,90 @@ def test_where_all_episodes_are_too_short_that_is_said(tmp_path, monkeypatch, ca
     assert f"left out, their episodes are too short or nothing is seen at the end: {ROBOTS[0].name}" in said
 
 
-def test_a_detector_of_one_s_own_leaves_the_committed_one(simulator, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def ask(simulator, tmp_path, monkeypatch):
+    """`python -m experiments.applications.detector`, in an empty directory, where training takes no time."""
+
     def make(robots, tokenizer, out):
-        out.mkdir(parents=True)
+        out.mkdir(parents=True, exist_ok=True)
+        (out / detector_module.WEIGHTS).write_text(f"{robots}")
         (out / detector_module.ERRORS).write_text("errors")
+
+    def ask(*arguments: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["detector", *arguments])
+        detector_module.main()
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(detector_module, "load_simulator", lambda run: simulator)
     monkeypatch.setattr(detector_module, "make_detector", make)
-    monkeypatch.setattr(sys, "argv", ["detector", "RUN"])
-    detector_module.main()
+    return ask
+
+
+def test_a_detector_of_one_s_own_leaves_the_committed_one(ask, tmp_path, capsys):
+    ask("RUN")
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
     said = " ".join(capsys.readouterr().out.split())
     assert "python -m experiments.applications.endurance RUN --detector runs/detector/detector.npz" in said
+
+
+def test_a_detector_takes_no_other_one_s_place(ask, tmp_path, monkeypatch, capsys):
+    """That of another run was written over, and the one of this run trained again."""
+    ask("RUN")
+    assert "wrote runs/detector/detector.npz" in capsys.readouterr().out
+    monkeypatch.setattr(detector_module, "make_detector", lambda *_: pytest.fail("it is made again"))
+    ask("RUN")
+    said = capsys.readouterr().out
+    assert "runs/detector/detector.npz of this run is there already; remove it to" in said and "wrote" not in said
+    with pytest.raises(ConfigError, match="runs/detector holds .*.run: 'RUN' -> 'OTHER'.; choose another --out"):
+        ask("OTHER")
+    (tmp_path / "runs/detector/settings.json").unlink()  # as an earlier version left it
+    with pytest.raises(ConfigError, match="detector.npz is there already, and nothing says of which run; choose"):
+        ask("RUN")
+
+
+def test_a_detector_whose_training_was_killed_comes_out_as_if_it_had_not_been(tmp_path, monkeypatch):
+    monkeypatch.setattr(detector_module, "KEEP_EVERY", 2)
+    scenes = {name: draw_scenes(SPECS[name], "train", 2, 2, 0) for name in ("pusher_sand", "gripper_wood")}
+    made, unfinished = [], tmp_path / "unfinished"
+
+    def train(stop_after: int = 9) -> Detector:
+        def progress(done: int, total: int) -> None:
+            made.append(done)
+            if done == stop_after:
+                raise KeyboardInterrupt
+
+        return train_detector(scenes, unfinished, steps=6, size=2, progress=progress)
+
+    whole = train().weights
+    unfinished.unlink()
+    for stop_after in (3, 4):
+        with pytest.raises(KeyboardInterrupt):
+            train(stop_after)
+    resumed = train().weights
+    assert made == [*range(1, 7), 1, 2, 3, 3, 4, 5, 6]
+    assert all((np.asarray(resumed[name]) == np.asarray(whole[name])).all() for name in whole)
+    unfinished.write_bytes(unfinished.read_bytes()[:1000])
+    with pytest.raises(ConfigError, match="unfinished cannot be read .*; remove it"):
+        train()
+
+
+def test_what_a_stop_leaves_is_said_as_it_is(monkeypatch, capsys):
+    """It was said to begin anew, detector and all."""
+
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setenv("HMA_DEBUG", "1")  # the test's process is not the program's own
+    monkeypatch.setattr(simulators, "load_simulator", stopped)
+    for program, words in (
+        ("in_place", "begins anew, but keeps what there is of the detector"),
+        ("detector", "goes on from here"),
+    ):
+        monkeypatch.setattr(sys, "argv", [program, "RUN"])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(f"{ROOT}/experiments/applications/{program}.py", run_name="__main__")
+        assert end.value.code == 130
+        assert capsys.readouterr().err == f"interrupted; the same command {words}\n"
 
 
 @pytest.mark.slow
