@@ -138,13 +138,17 @@ def _headline(
     study = record.study
     metrics = drawn_metrics(rows, [s.name for s in sweeps])
     cards = []
-    if shown and "perplexity" in metrics:
-        cards.append(
-            card(f"perplexity, {shown.name}", _at_default(rows, shown.by, "perplexity"), "s.e. over episodes and seeds")
-        )
-        untrained = _at_default(rows, shown.by, "perplexity", UNTRAINED)
+    said = {
+        "perplexity": ("perplexity", f"vocabulary size is {study.model.vocab_size:,}"),
+        "diffusion_loss": ("diffusion loss", "before the first step"),
+        "action_error": ("error of actions", "in variances of actions, before the first step"),
+    }
+    for metric in (m for m in metrics if shown and m in said):
+        name, of_untrained = said[metric]
+        cards.append(card(f"{name}, {shown.name}", _at_default(rows, shown.by, metric), "s.e. over episodes and seeds"))
+        untrained = _at_default(rows, shown.by, metric, UNTRAINED)
         if untrained or shown.name == REFERENCE:  # of others nobody asks it
-            cards.append(card("perplexity, untrained", untrained, f"vocabulary size is {study.model.vocab_size:,}"))
+            cards.append(card(f"{name}, untrained", untrained, of_untrained))
     if shown and "delta_psnr" in metrics:
         cards += [
             card(f"ΔPSNR, {shown.name}", _at_default(rows, shown.by, "delta_psnr"),

@@ -12,8 +12,10 @@ from experiments.optima import diverged, ends, lowest
 from experiments.report.plot_style import (
     LABELS,
     MUTED,
+    ON_LOG,
     axis_of_points,
     count,
+    drawn_metrics,
     name_axis,
     plain_log,
     show_legend,
@@ -26,7 +28,7 @@ from experiments.sweeps.sweep import POINT, STANDARD, Sweep
 ROLES = {POINT: "muP", STANDARD: "standard parametrisation"}
 DRAWN = {
     LOSS: (TRAINING, "training loss, last tenth of steps"),
-    "perplexity": (OVERALL, "perplexity, held out"),
+    **{metric: (OVERALL, f"{LABELS[metric]}, held out") for metric in ON_LOG},
 }
 """Metrics with their scope and label, where curves are compared by where they are lowest."""
 CURVES = {metric: (OVERALL, label) for metric, label in LABELS.items()}
@@ -39,9 +41,10 @@ CAPTION = (
 def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     """A row of panels per role, a column per metric, a colour per series."""
     series = all_series(rows, sweep.name)
-    drawn = DRAWN if sweep.base else CURVES
-    measured = {r.metric for r in rows if r.sweep == sweep.name}
-    metrics = [m for m in drawn if m in measured] or list(drawn)
+    metrics = drawn_metrics(rows, [sweep.name])
+    if sweep.base:
+        measured = {r.metric for r in rows if r.sweep == sweep.name}
+        metrics = [m for m in DRAWN if m in measured] or [LOSS, "perplexity"]
     figure, panels = plt.subplots(
         len(series), len(metrics), figsize=(4.3 * len(metrics), 0.7 + 2.9 * len(series)),
         layout="constrained", sharex=True, sharey="col", squeeze=False,
@@ -53,7 +56,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
                 panel.set_title(ROLES[role], loc="left", fontsize=10)
     for column, metric in zip(panels.T, metrics, strict=True):
         name_axis(column[-1], sweep.axis)
-        if metric == "perplexity" and any(panel.containers for panel in column):
+        if metric in ON_LOG and any(panel.containers for panel in column):
             plain_log(column[-1], column[-1].yaxis)
     show_tally(panels[0, -1], rows, sweep.name)
     show_legend(figure, panels[0, 0])

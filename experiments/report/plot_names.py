@@ -12,6 +12,7 @@ from experiments.report.plot_style import (
     DEFAULT,
     LABELS,
     MUTED,
+    ON_LOG,
     drawn_metrics,
     plain_log,
     show_nothing,
@@ -59,7 +60,7 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
         show_nothing(panel)
     for control in curve(rows, sweep.name, metric, CONTROL):
         panel.axvline(control.mean, **CONTROL_LINE)
-    if metric == "perplexity":
+    if metric in ON_LOG:
         plain_log(panel, panel.xaxis)
     else:
         panel.axvline(0, color=MUTED, linewidth=0.9, zorder=1)

@@ -20,13 +20,19 @@ from hma_jax.runtime.files import write_file
 
 INK, MUTED, GRID = "#22262b", "#6f7780", "#e4e7ea"
 COLOURS = {"perplexity": "#2b5c8a", "delta_psnr": "#b3541e"}
+COLOURS |= dict.fromkeys(("diffusion_loss", "action_error"), COLOURS["perplexity"])  # in its place, never beside it
 DEFAULT = "#6b3fa0"
 """Of the variant that the presets use, as in the paper's figure 5."""
 LABELS = {
     "perplexity": "perplexity",
+    "diffusion_loss": "diffusion loss",
     "delta_psnr": "ΔPSNR, last frame (dB)",
+    "action_error": "squared error of actions (variances)",
 }
 """The metrics that are drawn, where there are any."""
+USUAL = ["perplexity", "delta_psnr"]
+ON_LOG = ("perplexity", "diffusion_loss")
+"""Those whose axis is logarithmic."""
 CONTROL_LINE = dict(color=MUTED, linewidth=1.3, linestyle=(0, (4, 2)), zorder=1)
 STYLE = {
     "font.size": 10,
@@ -50,10 +56,11 @@ STYLE = {
 
 
 def drawn_metrics(rows: Iterable[Row], sweeps: Collection[str]) -> list[str]:
-    """Those of LABELS that a trial of the sweeps has (a continuous model has no perplexity), or
-    all of them while none has finished."""
+    """Those of LABELS that a trial of the sweeps has (latents have a diffusion loss in place of a perplexity), or the
+    usual ones while none has finished. Errors of actions are drawn where no frames are predicted."""
     measured = {r.metric for r in rows if r.sweep in sweeps}
-    return [m for m in LABELS if m in measured] or list(LABELS)
+    there = [m for m in LABELS if m in measured]
+    return [m for m in there if m != "action_error"] or there or USUAL
 
 
 def save(figure: plt.Figure, path: Path) -> None:

@@ -20,6 +20,7 @@ from experiments.report.plot_style import (
     COLOURS,
     LABELS,
     MUTED,
+    ON_LOG,
     STYLE,
     axis_of_points,
     count,
@@ -99,10 +100,11 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     else:
         show_nothing(panel)
     show_control(panel, curve(rows, sweep.name, metric, CONTROL, drawn=sweep.drawn))
-    if metric == "perplexity":
+    if metric in ON_LOG:
         plain_log(panel, panel.yaxis)
         for p in curve(rows, sweep.name, metric, UNTRAINED):  # far above: a line would flatten the curve
-            panel.set_title(f"untrained: {p.mean:.0f}", loc="left", fontsize=8.5, color=MUTED)
+            said = f"{p.mean:.0f}" if metric == "perplexity" else f"{p.mean:.3g}"
+            panel.set_title(f"untrained: {said}", loc="left", fontsize=8.5, color=MUTED)
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     show_tally(panel, rows, sweep.name)

@@ -20,8 +20,9 @@ from hma_jax.evaluation.statistics import mean_and_sem
 from hma_jax.evaluation.windows import WindowTable
 
 COLUMNS = {
-    "perplexity": "perplexity", "accuracy": "accuracy", "psnr": "PSNR (dB)", "psnr_copy": "copying (dB)",
-    "ssim": "SSIM", "lpips": "LPIPS", "lpips_copy": "LPIPS of copying",
+    "perplexity": "perplexity", "diffusion_loss": "diffusion loss", "accuracy": "accuracy", "psnr": "PSNR (dB)",
+    "psnr_copy": "copying (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips_copy": "LPIPS of copying",
+    "action_error": "error of actions (variances)", "action_error_of_mean": "of the mean action",
 }  # fmt: skip
 FOLLOWS = {
     "action_nats": "action-nats", "retrieval": "retrieval", "delta_psnr": "ΔPSNR (dB)",
@@ -134,10 +135,10 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
     lines.append(["<b>all</b>", *blank, *means, "", *(cell(OVERALL, m) for m in metrics), "", ""])
     head = ["robot", *["decided by actions"] * bool(shares), "s.e. above zero", *(FOLLOWS[m] for m in follows)]
     head += ["ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"]
-    return f"<p>{_words(robots, follows, bool(shares))}</p>" + table(head, lines)
+    return f"<p>{_words(robots, follows, bool(shares), 'psnr' in metrics)}</p>" + table(head, lines)
 
 
-def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool) -> str:
+def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames: bool) -> str:
     lines = [line for robot in robots for line in robot.follows.values()]
     counted = {m: (*beyond(lines, m), by_chance(lines, m)) for m in follows}
     parts = [
@@ -156,6 +157,8 @@ def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool) -> str
             "<em>Counterfactual</em>: dB that frames under other actions are nearer to the simulator's under these "
             "than frames under the recorded ones. "
         )
+    if not frames:
+        return said + "Errors are standard errors over episodes and seeds."
     return said + (
         "PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of repeating the "
         "last given frame. Errors are standard errors over episodes and seeds; those of <em>ahead</em> over episodes."

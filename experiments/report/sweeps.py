@@ -18,7 +18,10 @@ from experiments.report.plot_style import drawn_metrics
 from experiments.rows import CurvePoint, Row, all_series, curve, difference
 from experiments.sweeps.sweep import CONTROL, POINT, Sweep
 
-HEADINGS = {"perplexity": "perplexity", "delta_psnr": "ΔPSNR (dB)"}
+HEADINGS = {
+    "perplexity": "perplexity", "diffusion_loss": "diffusion loss", "delta_psnr": "ΔPSNR (dB)",
+    "action_error": "error of actions (variances)",
+}  # fmt: skip
 CHANGED = {"cross_entropy": "nats per token", "action_nats": "action-nats", "delta_psnr": "ΔPSNR (dB)"}
 LOSSES = {"cross_entropy": "held out", "loss": "training"}
 

@@ -76,10 +76,11 @@ def check_study(
 ) -> list[Check]:
     """`robots` are those of the trials called `whose`; `numbers` is what `check_numbers` found; `vocabulary` V of a
     discrete model."""
-    checks = [_trials(states), _seeds(sweeps, rows), numbers]
-    checks += _untrained(rows, vocabulary)
-    checks += [_controls(rows, metric) for metric in CONTROLLED if any(r.metric == metric for r in rows)]
-    checks.append(_copying(robots, whose))
+    checks, measured = [_trials(states), _seeds(sweeps, rows), numbers], {r.metric for r in rows}
+    if "psnr" in measured or "action_error" not in measured:  # else no frames were predicted
+        checks += _untrained(rows, vocabulary)
+        checks += [_controls(rows, metric) for metric in CONTROLLED if metric in measured]
+        checks.append(_copying(robots, whose))
     checks += _optima(optima) + [_prediction(o) for o in outcomes]
     return checks
 

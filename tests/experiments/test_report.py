@@ -18,6 +18,7 @@ from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, count, save
 from experiments.report.robots import read_data, robots_of
 from experiments.report.sweeps import Along, describe
+from experiments.report.validity import Check, check_study
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace
@@ -217,6 +218,34 @@ def test_a_point_at_zero_is_drawn(drawn, series, tmp_path, monkeypatch):
         low, high = panel.get_xlim()
         assert low < 0 < high and any(line.get_marker() == "o" and 0 in line.get_xdata() for line in panel.lines)
         assert [t.get_text() for t in panel.get_xticklabels()] == ["0", "8"]
+
+
+@pytest.mark.parametrize(
+    ("measured", "shown", "title"),
+    [
+        ({"perplexity": "diffusion_loss", "delta_psnr": "delta_psnr"}, ["diffusion loss", "ΔPSNR"], "untrained: 256"),
+        ({"perplexity": "action_error"}, ["squared error of actions"], ""),
+    ],
+    ids=["latents", "policy"],
+)
+def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tmp_path, monkeypatch):
+    """Latents had no curve of their loss; a policy had one of the perplexity of a head that nothing trains."""
+    kept, sweep = [], plan_width(STUDY)
+    monkeypatch.setattr(plots, "save", lambda figure, _: kept.append(figure))
+    rows = [replace(r, metric=measured[r.metric]) for r in rows_of(drawn, [sweep]) if r.metric in measured]
+    plots.plot_sweep(rows, sweep, tmp_path / "width.png")
+    assert all(p.get_ylabel().startswith(name) for p, name in zip(kept[0].axes, shown, strict=True))
+    assert kept[0].axes[0].get_title(loc="left") == title
+    assert (kept[0].axes[0].get_yscale() == "log") == bool(title)
+    several = replace(sweep, points=tuple(replace(p, series=f"width {p.x}") for p in sweep.points))
+    plots.plot_sweep([replace(r, series=f"width {r.x}") for r in rows], several, tmp_path / "several.png")
+    assert {p.get_ylabel() for p in kept[1].axes} == {p.get_ylabel() for p in kept[0].axes}
+    said = describe(sweep, rows, [], Along())
+    assert "perplexity" not in said and all(name.removeprefix("squared ") in said for name in shown)
+    checked = check_study([sweep], rows, [], {}, [], "reference", [], Check("", "good", ""), None)
+    assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
+    cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._Shown(sweep, "reference"), None)
+    assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
 
 
 @pytest.mark.parametrize("base", ["", "width 16"])
