@@ -86,19 +86,28 @@ def _declare(names: tuple[str, ...], rate: float | None) -> EmbodimentTable:
 
 
 def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
-    """The protocol on one window: likelihood under the recorded actions and other episodes', predicted frames, those under
-    random actions and (counted though users' data have none) under another episode's, and the policy."""
-    from hma_jax.evaluation.protocol import predicts_actions
+    """The protocol on one window: likelihood under the recorded actions and other episodes', predicted frames, those
+    under random actions and (counted though users' data have none) under another episode's, and the policy; of all that
+    what the model is trained for."""
+    from hma_jax.evaluation.protocol import predicts_actions, predicts_frames
     from hma_jax.generation.flops import rollout_flops, sampler_flops
     from hma_jax.model.flops import denoiser_flops, pass_flops
 
-    model, config, decode = trial.model, trial.eval, trial.eval.decode
-    frames, draws = model.frames, config.random_actions
+    model, config, decode, setting = trial.model, trial.eval, trial.eval.decode, trial.train.masking.setting
+    frames, draws, flops = model.frames, config.random_actions, 0.0
+    if predicts_actions(model, setting):
+        copies = 1 if model.action_alignment == "causal" else 2
+        flops += copies * pass_flops(model, table, frames, frames / 2, said=0)
+        if model.diffusion:
+            steps = decode.sampler.steps
+            flops += steps * denoiser_flops(model, frames, own_steps=False, channels=table.action_width)
+    if not predicts_frames(setting):
+        return flops
     beside = pass_flops(model, table, frames - 1, frames / 2)  # every frame but one, true or masked
     likelihood = 2 * beside
     if model.diffusion:
         likelihood += denoiser_flops(model, model.diffusion.repeats * (frames - 1) * model.tokens)
-    flops = (1 + config.other_actions) * likelihood
+    flops += (1 + config.other_actions) * likelihood
     if config.context == "recorded":
         flops += 2 * beside * (config.other_actions > 0)  # the likelihood once more, for decoding
         flops += (decode.unmask_steps - 1) * beside + (frames - 1) * sampler_flops(model, decode)
@@ -106,9 +115,6 @@ def evaluation_flops_per_window(trial: Trial, table: EmbodimentTable) -> float:
     else:
         sequences = 1 + draws + (config.other_actions > 0)
         flops += rollout_flops(model, table, decode, frames, config.prompt_frames, sequences=sequences)
-    if predicts_actions(model, trial.train.masking.setting):
-        copies = 1 if model.action_alignment == "causal" else 2
-        flops += copies * pass_flops(model, table, frames, frames / 2)
     return flops
 
 

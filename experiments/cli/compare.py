@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 DEFAULT = Path("comparison.csv")
 
-SHOWN = ("cross_entropy", "diffusion_loss", "action_nats", "psnr", "lpips", "delta_psnr", "counterfactual_gain")
+SHOWN = (
+    "cross_entropy", "diffusion_loss", "action_nats", "psnr", "lpips", "delta_psnr", "counterfactual_gain",
+    "action_error",
+)  # fmt: skip
 """Metrics in the table, as far as both have them; the CSV has all."""
 
 
@@ -97,7 +100,8 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
 
 def _heading(metric: str, ids: bool) -> str:
     """A metric with its unit, if it has one. Where tokens are latents, and not `ids`, action-nats are of the loss."""
-    units = {"cross_entropy": "nats", "diffusion_loss": "loss", "action_nats": "nats" if ids else "loss", "lpips": ""}
+    units = {"cross_entropy": "nats", "diffusion_loss": "loss", "action_nats": "nats" if ids else "loss"}
+    units |= {"lpips": "", "action_error": ""}
     unit = units.get(metric, "dB")
     return f"{metric} ({unit})" if unit else metric
 

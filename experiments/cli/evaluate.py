@@ -14,6 +14,7 @@ from experiments.cli.hosts import Hosts
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.progress import console, step, tidy_table
 from experiments.running.attempts import JOB
+from experiments.running.sealed import SAMPLES
 from experiments.setting import UNSET, Setting, make_setting, require_local, short
 from experiments.words import few, plus_minus
 from experiments.wrote import wrote
@@ -87,6 +88,13 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)
     frozen, untrained = set(materials.manifest.names), _not_trained_on(trained, materials)
+    masking = trained.train.masking
+    if not masking.predicts_frames:
+        console.print(
+            f"note: the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: "
+            "its actions alone are judged",
+            soft_wrap=True,
+        )
     left_out = [name for name in trained.table.names if name not in frozen]
     if left_out:
         console.print(f"note: not evaluated, for want of windows here: {', '.join(left_out)}", soft_wrap=True)
@@ -112,7 +120,7 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
             trained.table,
             materials,
             setting.study.eval,
-            trained.train.masking.setting,
+            masking.setting,
             execution=setting.study.execution,
             progress=lambda phase, done, total: update(done, total, phase),
         )
@@ -125,13 +133,14 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     table = tidy_table(f"{short(run)}{when}{which}", "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
         table.add_row(name, *(plus_minus(stats[m].mean, stats[m].sem) if m in stats else "" for m in metrics))
-    if alone := [n for n, stats in summary.datasets.items() if all(s.clusters == 1 for s in stats.values())]:
+    judged = {name: stats for name, stats in summary.datasets.items() if stats}
+    if alone := [name for name, stats in judged.items() if all(s.clusters == 1 for s in stats.values())]:
         table.caption = f"No error of {few(alone)}: one held-out episode does not say how they differ."
     console.print(table)
     write_evaluation(place, evaluation)
     write_file(place / "evaluation.json", to_strict_json(summary.to_dict()))
     made_from.save(place, STAMP)
-    wrote(place / "evaluation.json", place / FILE, place / "samples.npz")
+    wrote(place / "evaluation.json", place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
 
 
 def _not_trained_on(trained: Run, materials: Materials) -> list[str]:

@@ -25,6 +25,8 @@ OF_SOME = {
         "train.masking.action_leak": "all",
     },
     "what rounding leaves is no scale of actions": {"train.action_scale": "quantiles"},
+    "frames of what predicts none are not judged: a policy": {"train.masking.setting": "policy"},
+    "frames of what predicts none are not judged: inverse dynamics": {"train.masking.setting": "inverse"},
     "the gain of recall does not decay in a policy": {"model.recall": True, "train.masking.setting": "policy"},
     "the gain of recall does not decay in inverse dynamics": {"model.recall": True, "train.masking.setting": "inverse"},
 }

@@ -3,7 +3,7 @@
 A trial's directory holds
     job.json        the trial and its provenance (written by the runner)
     run/            the training run (`hma_jax.training`): log, checkpoints
-    samples.npz     true and predicted frames of a few windows per dataset
+    samples.npz     true and predicted frames of a few windows per dataset, where frames are predicted
     windows.parquet every window's numbers (`hma_jax.evaluation.windows`), of which result.json has the means
     provenance.json what it ran with: sources, versions, machine (`experiments.running.provenance`)
     result.json     written last, sealed (`experiments.running.sealed`): a trial with this file is finished
@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from experiments.running.machine import describe_machine
 from experiments.running.provenance import record_end
 from experiments.running.run_options import UNWATCHED, RunOptions
+from experiments.running.sealed import SAMPLES
 from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
@@ -172,12 +173,15 @@ def evaluate_on(
 ) -> Evaluation:
     """The protocol over the frozen windows of `names`, or over the `first` ones of each.
 
-    Counterfactual PSNR needs simulated frames for this very prompt, and generated ones.
+    Counterfactual PSNR needs simulated frames for this very prompt, and generated ones. What was trained for actions
+    alone is shown none of other episodes.
     """
     from data_pipelines.windows.evalset import eval_batches
     from hma_jax.evaluation.evaluate import evaluate
+    from hma_jax.evaluation.protocol import predicts_frames
 
     manifest = materials.manifest
+    config = config if predicts_frames(setting) else dataclasses.replace(config, other_actions=0)
     truth = materials.truth if config.context == "generated" and config.other_actions else None
     truth = truth if truth and truth.prompt == config.prompt_frames else None
     batches = eval_batches(
@@ -272,11 +276,14 @@ def last_loss(losses: Sequence[float]) -> dict[str, Any]:
 
 
 def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
-    """Writes windows.parquet and samples.npz into `directory`."""
+    """Writes windows.parquet and, where there are samples, samples.npz into `directory`, in place of others."""
     from hma_jax.evaluation.windows import FILE
 
     evaluation.windows.save(directory / FILE, directory.name)
-    write_samples(directory / "samples.npz", evaluation.samples)
+    if evaluation.samples:
+        write_samples(directory / SAMPLES, evaluation.samples)
+    else:
+        (directory / SAMPLES).unlink(missing_ok=True)
 
 
 def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:

@@ -69,8 +69,9 @@ def evaluate(
     A batch holds `protocol.Batch`, images (uint8 [B, T, H, W, 3], recorded), dataset (the name of each row's)
     and valid (bool [B]: rows that are not padding); all batches have the same of what a batch may have. `setting` is
     what the model was trained for. `progress` is told the windows done so far. With several processes
-    (`runtime.processes`) all call this with the same batches, and each gets the whole result. Raises ConfigError if
-    there is no window, for a model whose predictions are not finite, or as `lpips.load_lpips`.
+    (`runtime.processes`) all call this with the same batches, and each gets the whole result. A model that was trained
+    for actions alone has no metrics of frames and no samples. Raises ConfigError if there is no window, for a model
+    whose predictions are not finite, or as `lpips.load_lpips`.
     """
     mesh = make_mesh(execution.mesh)
     evaluator = make_evaluator(model, table, config, setting, execution, tokenizer.decode_uint8_fn, tokenizer.piece)
@@ -79,7 +80,7 @@ def evaluate(
     judges = (tokenizer.params, load_lpips() if config.lpips else None)
     judges = lay_out(judges, NamedSharding(mesh, PartitionSpec()))
 
-    def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted]]]:
+    def dispatched() -> Iterator[tuple[dict[str, Any], tuple[dict[str, jax.Array], Predicted | None]]]:
         for batch in batches:
             groups, rows = plan_groups(len(batch["valid"]), execution.windows_at_once, batch_ways(mesh))
             _check_lengths(batch, config)
@@ -93,7 +94,7 @@ def evaluate(
     samples: dict[str, list[Sample]] = {}
     for batch, (found, predicted) in one_ahead(dispatched()):
         tables.append(_rows_of(batch, found))
-        for row in np.flatnonzero(batch["valid"]).tolist():
+        for row in np.flatnonzero(batch["valid"]).tolist() if predicted is not None else ():
             own = samples.setdefault(batch["dataset"][row], [])
             if len(own) < samples_per_dataset:
                 # Read whole: rows picked on the devices would wait for the next batch.
@@ -119,7 +120,7 @@ def make_evaluator(
     execution: ExecutionConfig,
     decode: Decode,
     piece: int,
-) -> Callable[[Params, Judges, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted]]:
+) -> Callable[[Params, Judges, dict[str, jax.Array]], tuple[dict[str, jax.Array], Predicted | None]]:
     """A jitted f(parameters, Judges, batch with images) -> (metrics {name: [B]}, Predicted).
 
     Runs under `jax.set_mesh`. Of B windows `plan_groups` says how many are in memory at a time; B is a
@@ -137,6 +138,8 @@ def make_evaluator(
     def evaluate_group(params: Params, judges: Judges, batch: dict[str, jax.Array]):
         batch = {name: constrain(x, ("B", *(None,) * (x.ndim - 1))) for name, x in batch.items()}
         metrics, predicted = predict(params, batch)
+        if predicted is None:
+            return metrics, None
         others = (batch["other_images"], batch["other_seen"]) if "other_images" in batch else None
         recorded = batch["images"], batch.get("real"), others
         compared = _on_each_device(compare, mesh)(judges, predicted, recorded)
@@ -230,7 +233,7 @@ def _rows_of(batch: dict[str, Any], found: dict[str, jax.Array]) -> WindowTable:
     finite = columns.pop("finite")
     require(
         bool(finite.all()),
-        f"predicted latents are not finite ({', '.join(sorted(set(dataset[~finite])))}); did the model diverge?",
+        f"predictions are not finite ({', '.join(sorted(set(dataset[~finite])))}); did the model diverge?",
     )
     episode, start = (np.asarray(batch[name], np.int64)[valid] for name in ("episode", "start"))
     real = batch.get("real", np.ones(np.shape(batch["tokens"])[:2], bool))

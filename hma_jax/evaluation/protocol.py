@@ -15,7 +15,8 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
   prompt, given the true frames and actions before it (inverse dynamics: all frames and no
   action), against that of the mean action.
 
-A model trained on passive video is shown no action anywhere.
+A model trained on passive video is shown no action anywhere. One that was trained for actions alone is not asked for
+frames: what it says of them was never trained.
 
 With `eval.context` "recorded" every frame is predicted from recorded ones and random actions
 replace all of a window's, as the release does: for comparison with published figures.
@@ -33,9 +34,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting, require
+from hma_jax.config import EvalConfig, ExecutionConfig, MaskingConfig, ModelConfig, Setting, require
 from hma_jax.evaluation.controllability import told_apart, under_each
-from hma_jax.evaluation.draws import own_statistics, random_actions, window_keys
+from hma_jax.evaluation.draws import Purpose, own_statistics, random_actions, window_keys
 from hma_jax.evaluation.metrics import factored_cross_entropy, last_frames, mean_over_frames
 from hma_jax.generation import next_frame_outputs, next_frames, predict_actions, predict_next_actions, rollout
 from hma_jax.model.embodiments import EmbodimentTable, normalise
@@ -68,7 +69,12 @@ class Predicted(NamedTuple):
 
 def predicts_actions(model: ModelConfig, setting: Setting) -> bool:
     """Whether a model so trained has a policy to evaluate."""
-    return model.action_heads and setting in ("full", "policy", "inverse")
+    return model.action_heads and MaskingConfig(setting=setting).predicts_actions
+
+
+def predicts_frames(setting: Setting) -> bool:
+    """Whether a model so trained has frames to evaluate."""
+    return MaskingConfig(setting=setting).predicts_frames
 
 
 def evaluation_inputs(batch: Batch, table: EmbodimentTable, config: EvalConfig) -> tuple[jax.Array, jax.Array]:
@@ -97,8 +103,10 @@ def make_predictor(
     config: EvalConfig,
     setting: Setting = "forward",
     execution: ExecutionConfig = ExecutionConfig(),
-) -> Callable[[Params, Batch], tuple[dict[str, jax.Array], Predicted]]:
-    """f(params, batch) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted.
+) -> Callable[[Params, Batch], tuple[dict[str, jax.Array], Predicted | None]]:
+    """f(params, batch) -> (metrics of tokens and actions {name: [B]}, Predicted), to be jitted. Where the model was
+    trained for actions alone, no Predicted, and among the metrics whether these are `finite`, as `image_metrics` says
+    of frames.
 
     Raises ConfigError for a prompt that fills the window.
     """
@@ -108,56 +116,73 @@ def make_predictor(
     )
     declared = declare_model(model, table, execution)
 
-    def predict(params: Params, batch: Batch) -> tuple[dict[str, jax.Array], Predicted]:
-        hma = declared.merge(params)
-        tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
-        hidden = never_shown(table, setting, robots, actions.shape[1])
-        keys = {
-            purpose: window_keys(config.seed, purpose, table, robots, batch["episode"], batch["start"])
-            for purpose in ("likelihood", "policy")
-        }
-        sequences, decoding = evaluation_inputs(batch, table, config)
-        window = tokens[:, : model.frames], actions[:, : model.frames], robots
-        real = batch.get("real")
+    def predict(params: Params, batch: Batch) -> tuple[dict[str, jax.Array], Predicted | None]:
+        hma, real = declared.merge(params), batch.get("real")
+        window = batch["tokens"][:, : model.frames], batch["actions"][:, : model.frames], batch["embodiment"]
         seen = None if real is None else real[:, : model.frames]
-        shown = None if hidden is None else hidden[:, : model.frames]
-        followed = None if seen is None else seen[:, 1:]
 
-        def judge(out: jax.Array) -> dict[str, jax.Array]:
-            return _likelihood(hma, out, window[0][:, 1:], keys["likelihood"], followed)
+        def keys(purpose: Purpose) -> jax.Array:
+            return window_keys(config.seed, purpose, table, window[2], batch["episode"], batch["start"])
 
-        def judge_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
-            return judge(next_frame_outputs(hma, window[0], actions_BTU, robots, shown))
-
-        if config.context == "recorded":
-            require(
-                tokens.shape[1] == model.frames,
-                f"with eval.context 'recorded' windows have the model's {model.frames} frames, got {tokens.shape[1]}",
-            )
-            out, predicted = _after_recorded(hma, window, sequences, decoding, config, hidden, real)
-        else:
-            if counterfactual := "other_images" in batch:
-                other = batch["other_actions"][:, :1]
-                before = jnp.arange(tokens.shape[1])[:, None] < config.first_predicted - 1
-                sequences = jnp.concatenate([sequences, jnp.where(before, actions[:, None], other)], axis=1)
-            prompt = tokens[:, : config.prompt_frames]
-            made = rollout(hma, prompt, sequences, robots, decoding, config.decode, hidden_BT=hidden)
-            ahead = None if real is None else real[:, config.prompt_frames :]
-            random = made[:, 1 : 1 + config.random_actions]
-            last = last_frames(random, ahead, axis=2)
-            predicted = Predicted(made[:, 0], last, random[:, 0], made[:, -1] if counterfactual else None)
-        if "other_actions" in batch:
-            found = under_each(judge_under, window[1], batch["other_actions"][:, :, : model.frames])
-            loss = found["diffusion_loss" if model.diffusion else "cross_entropy"]
-            metrics = {name: x[0] for name, x in found.items()} | told_apart(loss, batch["other_valid"])
-        else:
-            metrics = judge_under(window[1]) if config.context == "generated" else judge(out)
+        metrics, predicted = {}, None
+        if predicts_frames(setting):
+            metrics, predicted = _judge_frames(hma, window, batch, table, config, setting, keys("likelihood"))
         if predicts_actions(model, setting):
             causally, statistics = setting != "inverse", judged_by(batch, table)
-            metrics |= _policy_errors(hma, *window, keys["policy"], config, causally, statistics, seen)
+            metrics |= _policy_errors(hma, *window, keys("policy"), config, causally, statistics, seen)
+            if predicted is None:
+                metrics["finite"] = jnp.isfinite(metrics["action_error"]) | ~(statistics[1] > 0).any(-1)
         return metrics, predicted
 
     return predict
+
+
+def _judge_frames(
+    hma: HMA,
+    window: tuple[jax.Array, jax.Array, jax.Array],
+    batch: Batch,
+    table: EmbodimentTable,
+    config: EvalConfig,
+    setting: Setting,
+    key_B: jax.Array,
+) -> tuple[dict[str, jax.Array], Predicted]:
+    """(metrics of tokens, Predicted) of a model that was trained for frames; `window` is what of a batch fits it."""
+    model = hma.config
+    tokens, actions, robots = batch["tokens"], batch["actions"], batch["embodiment"]
+    hidden = never_shown(table, setting, robots, actions.shape[1])
+    sequences, decoding = evaluation_inputs(batch, table, config)
+    real = batch.get("real")
+    shown = None if hidden is None else hidden[:, : model.frames]
+    followed = None if real is None else real[:, 1 : model.frames]
+
+    def judge(out: jax.Array) -> dict[str, jax.Array]:
+        return _likelihood(hma, out, window[0][:, 1:], key_B, followed)
+
+    def judge_under(actions_BTU: jax.Array) -> dict[str, jax.Array]:
+        return judge(next_frame_outputs(hma, window[0], actions_BTU, robots, shown))
+
+    if config.context == "recorded":
+        require(
+            tokens.shape[1] == model.frames,
+            f"with eval.context 'recorded' windows have the model's {model.frames} frames, got {tokens.shape[1]}",
+        )
+        out, predicted = _after_recorded(hma, window, sequences, decoding, config, hidden, real)
+    else:
+        if counterfactual := "other_images" in batch:
+            other = batch["other_actions"][:, :1]
+            before = jnp.arange(tokens.shape[1])[:, None] < config.first_predicted - 1
+            sequences = jnp.concatenate([sequences, jnp.where(before, actions[:, None], other)], axis=1)
+        prompt = tokens[:, : config.prompt_frames]
+        made = rollout(hma, prompt, sequences, robots, decoding, config.decode, hidden_BT=hidden)
+        ahead = None if real is None else real[:, config.prompt_frames :]
+        random = made[:, 1 : 1 + config.random_actions]
+        last = last_frames(random, ahead, axis=2)
+        predicted = Predicted(made[:, 0], last, random[:, 0], made[:, -1] if counterfactual else None)
+    if "other_actions" in batch:
+        found = under_each(judge_under, window[1], batch["other_actions"][:, :, : model.frames])
+        loss = found["diffusion_loss" if model.diffusion else "cross_entropy"]
+        return {name: x[0] for name, x in found.items()} | told_apart(loss, batch["other_valid"]), predicted
+    return judge_under(window[1]) if config.context == "generated" else judge(out), predicted
 
 
 def _after_recorded(

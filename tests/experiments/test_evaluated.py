@@ -11,8 +11,12 @@ import pytest
 from experiments.cli.evaluate import trained_on_other_tokens
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
 from experiments.preparing.made_from import MadeFrom
+from experiments.running.run_trial import write_evaluation
+from experiments.running.sealed import SAMPLES
 from hma_jax.config import ConfigError, EvalConfig, TrainConfig
 from hma_jax.config.json import to_dict
+from hma_jax.evaluation.evaluate import Evaluation
+from hma_jax.evaluation.summary import summarise
 from hma_jax.evaluation.windows import FILE, WindowTable
 from tests.data_pipelines.windows.test_evalset import small_store
 
@@ -28,6 +32,15 @@ def test_the_same_evaluation_may_be_repeated_of_a_later_step_too(tmp_path):
     made_from().save(tmp_path, STAMP)
     require_same_evaluation(tmp_path, made_from())
     require_same_evaluation(tmp_path, made_from(step=9))
+
+
+def test_clips_of_an_evaluation_do_not_stay_beside_one_without(tmp_path):
+    """As of a model that predicts no frames, judged by an earlier version."""
+    (tmp_path / SAMPLES).write_bytes(b"of before")
+    one = np.zeros(1, np.int64)
+    windows = WindowTable(np.array(["arm"]), one, one, one + 4, {"action_error": np.ones(1)})
+    write_evaluation(tmp_path, Evaluation(windows, summarise(windows, 1), {}))
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
 
 
 @pytest.mark.parametrize(

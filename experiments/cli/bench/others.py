@@ -45,6 +45,12 @@ def quality(
 
     setting = make_setting(asked)
     trained = load_model(run).run
+    masking = trained.train.masking
+    require(
+        masking.predicts_frames,
+        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are "
+        "none to judge",
+    )
     require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)
@@ -65,7 +71,7 @@ def quality(
 
     with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
         rows, stages = judge(
-            subject, materials.tokenizer, batches, settings, frames, repeats, trained.train.masking.setting,
+            subject, materials.tokenizer, batches, settings, frames, repeats, masking.setting,
             lambda name, done: update(done, len(settings), name),
         )  # fmt: skip
     table = tidy_table(

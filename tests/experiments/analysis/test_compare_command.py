@@ -48,14 +48,16 @@ def test_two_trials_are_compared_per_robot_and_overall(table, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("loss", "nats"), [("cross_entropy", "nats"), ("diffusion_loss", "loss")])
-def test_every_column_has_its_own_unit_and_lpips_none(loss, nats, table, tmp_path, capsys):
+def test_every_column_has_its_own_unit_if_it_has_one(loss, nats, table, tmp_path, capsys):
     """Of latents action-nats are differences of the diffusion loss."""
     values = table.metrics["cross_entropy"]
-    table = replace(table, metrics={loss: values, "action_nats": values, "psnr": values, "lpips": values})
+    names = (loss, "action_nats", "psnr", "lpips", "action_error")
+    table = replace(table, metrics=dict.fromkeys(names, values))
     trial = write_trial(tmp_path / "a", reference_trial(STUDY, 0), table)
     assert main(["compare", str(trial), str(trial), "--to", str(tmp_path / "c.csv")]) == 0
     said = capsys.readouterr().out
-    assert f"action_nats ({nats})" in said and "psnr (dB)" in said and "lpips" in said and "lpips (" not in said
+    assert f"action_nats ({nats})" in said and "psnr (dB)" in said
+    assert all(name in said and f"{name} (" not in said for name in ("lpips", "action_error"))
 
 
 def test_two_studies_are_compared_by_their_reference_models_over_seeds(table, tmp_path, capsys):

@@ -122,12 +122,24 @@ def test_robots_without_actions_have_no_error_of_predicted_ones(monkeypatch):
         assert name not in of_robots["arm"] and overall[name].mean == of_robots["pusher"][name].mean != 0
 
 
+@pytest.mark.parametrize("setting", ["policy", "inverse"])
+def test_what_was_trained_for_actions_alone_is_judged_by_them_alone(params, setting):
+    """Its frames were said to have a perplexity and a PSNR, of a head that nothing had trained."""
+    batches = list(make_batches(CONFIG, each=2))
+    found = evaluate(params, CONFIG, TABLE, TOKENIZER, batches, EVAL, setting=setting)
+    actions = {"action_error", "action_error_of_mean", "action_gain"}
+    assert found.windows.metrics.keys() == found.summary.overall.keys() == actions and not found.samples
+    broken = jax.tree.map(lambda x: x * jnp.nan, params)
+    with pytest.raises(ConfigError, match=r"predictions are not finite \(arm, pusher\); did the model diverge"):
+        evaluate(broken, CONFIG, TABLE, TOKENIZER, batches, EVAL, setting=setting)
+
+
 @pytest.mark.slow
 def test_latents_that_are_no_numbers_are_not_decoded_into_images():
     config = shallow_config(diffusion=DIFFUSION)
     broken = jax.tree.map(lambda x: x * jnp.nan, lively_params(config)[1])
     batches = make_batches(config, names=("arm",), each=4)
-    with pytest.raises(ConfigError, match=r"predicted latents are not finite \(arm\); did the model diverge"):
+    with pytest.raises(ConfigError, match=r"predictions are not finite \(arm\); did the model diverge"):
         evaluate(broken, config, TABLE, TOKENIZER, batches, EVAL, setting="full")
 
 
