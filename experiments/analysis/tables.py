@@ -18,6 +18,7 @@ from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.sweep import reference_trial
 from hma_jax.config import ConfigError
 from hma_jax.evaluation.windows import FILE, WindowTable
+from hma_jax.training.claim import CHECKPOINTS
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ def _said_of(run: Path) -> tuple[str, int | None]:
 
     if (stamp := read_stamp(run, STAMP)) is not None:
         return stamp.inputs.get("tokenizer", ""), stamp.recorded.get("seed")
-    steps = list_steps(run / "checkpoints")
-    described = read_description(run / "checkpoints" / str(steps[-1])) if steps else {}
+    steps = list_steps(run / CHECKPOINTS)
+    described = read_description(run / CHECKPOINTS / str(steps[-1])) if steps else {}
     provenance = described.get("provenance", {})
     return provenance.get("tokenizer", ""), described["train"]["seed"] if "loader" in provenance else None

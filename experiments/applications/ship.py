@@ -45,6 +45,7 @@ from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
 from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.hashes import write_list
 from hma_jax.training.runs import describe_run, load_run
 
@@ -87,9 +88,9 @@ def ship(
     aside.mkdir(parents=True)
     try:
         described = describe_run(run.model, run.train, run.table, run.provenance)
-        with Checkpoints(aside / "checkpoints", described) as checkpoints:
+        with Checkpoints(aside / CHECKPOINTS, described) as checkpoints:
             checkpoints.save(run.step, Shipped(halved(run.params)))
-        forget_places(aside / "checkpoints" / str(run.step))
+        forget_places(aside / CHECKPOINTS / str(run.step))
         save_beside(simulator, aside, decode)
         add(aside)
         size = sum(path.stat().st_size for path in aside.rglob("*") if path.is_file())

@@ -22,7 +22,7 @@ from experiments.words import few
 from experiments.wrote import wrote
 from hma_jax.config import require
 from hma_jax.config.json import diff
-from hma_jax.training.claim import require_plain
+from hma_jax.training.claim import CHECKPOINTS, require_plain
 
 if TYPE_CHECKING:
     from experiments.running.run_trial import Materials
@@ -213,7 +213,7 @@ def _newest(run: Path) -> tuple[int, dict[str, Any]]:
     """(step, description) of the newest checkpoint of a run that says what it is; (0, {}) without any."""
     from hma_jax.training.reading import CheckpointError, list_steps, read_description
 
-    checkpoints = run.absolute() / "checkpoints"
+    checkpoints = run.absolute() / CHECKPOINTS
     for newest in reversed(list_steps(checkpoints)):
         with suppress(CheckpointError):  # damage is for what restores it to name, or to skip
             return newest, read_description(checkpoints / str(newest))

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from experiments.running.attempts import RUN
 from experiments.running.closure import Closure, changed, closure_hash
 from experiments.running.job import read_job
 from experiments.running.provenance import CodeChanged, inputs_of, read_record
@@ -14,6 +15,7 @@ from experiments.running.sealed import RESULT, read_result
 from experiments.running.trial import trial_id
 from experiments.words import few
 from hma_jax.config import ConfigError, require
+from hma_jax.training.claim import CHECKPOINTS
 
 
 @dataclass
@@ -92,7 +94,7 @@ def describe(groups: list[Sources]) -> list[str]:
 
 def _began(directory: Path) -> bool:
     """Whether something of what was computed is kept."""
-    return (directory / RESULT).exists() or any((directory / "run" / "checkpoints").glob("*"))
+    return (directory / RESULT).exists() or any((directory / RUN / CHECKPOINTS).glob("*"))
 
 
 def _join(groups: list[Sources], one: Sources) -> None:

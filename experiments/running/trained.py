@@ -15,6 +15,7 @@ from experiments.running.closure import Closure, changed
 from experiments.running.job import read_job
 from experiments.running.provenance import Provenance, inputs_of, read_record
 from experiments.running.trial import Trial, trial_id
+from hma_jax.training.claim import CHECKPOINTS
 
 
 def find_trained(
@@ -27,7 +28,7 @@ def find_trained(
     """
     found = {}
     for directory in sorted(path.parent for path in trials.glob(f"*/{RESULT}") if path.parent.name not in ids):
-        if not (directory / RUN / "checkpoints").is_dir():
+        if not (directory / RUN / CHECKPOINTS).is_dir():
             continue
         try:
             job = json.loads((directory / JOB).read_text())

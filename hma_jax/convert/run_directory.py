@@ -13,6 +13,7 @@ from hma_jax.convert.aside import written_aside
 from hma_jax.model.params import Use
 from hma_jax.runtime.files import write_file
 from hma_jax.training.checkpoints import Checkpoints
+from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.optimizer import AdamState
 from hma_jax.training.runs import Run, describe_run
 from hma_jax.training.state import TrainState
@@ -25,7 +26,7 @@ def write_run(run: Run, directory: Path, beside: Mapping[str, str] | None = None
     """
     with written_aside(directory) as aside:
         meta = describe_run(run.model, run.train, run.table, run.provenance)
-        with Checkpoints(aside / "checkpoints", meta) as checkpoints:
+        with Checkpoints(aside / CHECKPOINTS, meta) as checkpoints:
             checkpoints.save(0, fresh_state(run))
         for name, text in (beside or {}).items():
             write_file(aside / name, text)

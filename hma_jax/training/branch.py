@@ -11,9 +11,9 @@ import os
 import shutil
 from pathlib import Path
 
+from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.reading import list_steps
 
-CHECKPOINTS = "checkpoints"
 LOGS = ("metrics.jsonl", "validation.jsonl", "timing.jsonl")
 """Cut after the step from which a run goes on when it starts (`log.RunLog`)."""
 

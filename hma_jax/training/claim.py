@@ -12,6 +12,9 @@ from hma_jax.runtime.locks import Held, Lock, exclusive
 
 NAME, EVALUATION = ".lock", ".evaluation.lock"
 
+CHECKPOINTS = "checkpoints"
+"""The folder of a run directory with a folder for each; named here, where nothing is imported that reads them."""
+
 
 class RunBusy(Held):
     """Another process works in the directory."""

@@ -33,7 +33,7 @@ from hma_jax.runtime.exits import Exit, hand_on, lost_request
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer, meet
 from hma_jax.training.checkpoints import Checkpoints, Description, SaveError
-from hma_jax.training.claim import locked_run
+from hma_jax.training.claim import CHECKPOINTS, locked_run
 from hma_jax.training.divergence import Records, require_finite
 from hma_jax.training.log import Listener, Progress, RunLog, open_log
 from hma_jax.training.state import FINITE
@@ -125,7 +125,7 @@ def fit(
     with (
         locked_run(run_dir) if is_writer() else nullcontext() as lock,
         Checkpoints(
-            run_dir / "checkpoints", about.description, options.keep_checkpoints, about.modernise, options.keep_steps
+            run_dir / CHECKPOINTS, about.description, options.keep_checkpoints, about.modernise, options.keep_steps
         ) as checkpoints,
         _stop_requests() as stop,
     ):

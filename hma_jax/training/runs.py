@@ -15,6 +15,7 @@ from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params, inference_params
 from hma_jax.runtime.devices import default_device
+from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.reading import CheckpointError, has_item, list_steps, load_items, read_description
 
 
@@ -92,7 +93,7 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     ConfigError for an average that the run does not keep.
     """
     run_dir = Path(run_dir)
-    directory = run_dir.absolute() / "checkpoints"
+    directory = run_dir.absolute() / CHECKPOINTS
     steps = list_steps(directory)
     if not steps:
         found = "no finished checkpoint under" if directory.is_dir() else "no checkpoints at"

@@ -18,6 +18,7 @@ from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
 from hma_jax.simulator.starts import Start
+from hma_jax.training.claim import CHECKPOINTS
 from hma_jax.training.hashes import NAME as HASHES
 
 IMAGE, ACTION = "observation/image", "action"
@@ -133,5 +134,5 @@ def episode_seed(seed: int, origin: str) -> int:
 
 def checkpoint_hash(run: Path, step: int) -> str:
     """The hash of all files of a run's checkpoint, as listed beside them; "" for one of a version that made no list."""
-    path = run / "checkpoints" / str(step) / HASHES
+    path = run / CHECKPOINTS / str(step) / HASHES
     return str(json.loads(path.read_text())["sha256"]) if path.exists() else ""
