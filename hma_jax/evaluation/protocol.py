@@ -16,7 +16,7 @@ Paper section 4 (Metrics), reference section 6. For every window of a frozen man
   action), against that of the mean action.
 
 A model trained on passive video is shown no action anywhere. One that was trained for actions alone is not asked for
-frames: what it says of them was never trained.
+frames.
 
 With `eval.context` "recorded" every frame is predicted from recorded ones and random actions
 replace all of a window's, as the release does: for comparison with published figures.
