@@ -128,7 +128,7 @@ class Package:
             tree = parsed(path)
             self.modules[parts[:-1] if parts[-1] == "__init__" else parts] = set(_defined(tree.body))
             self.words |= words_of(tree) | set(parts)
-            for node in ast.walk(tree):
+            for node in nodes(tree):
                 if isinstance(node, ast.ClassDef):
                     attributes = (n for n in ast.walk(node) if isinstance(n, ast.Attribute))
                     own = {n.attr for n in attributes if isinstance(n.ctx, ast.Store)}
@@ -161,6 +161,12 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+@cache
+def nodes(tree: ast.Module) -> tuple[ast.AST, ...]:
+    """All of a file's; to walk over it takes longer than to parse it."""
+    return tuple(ast.walk(tree))
+
+
 def _defined(body: list[ast.stmt]) -> Iterator[str]:
     """Names that statements define, imported ones among them."""
     for node in body:
@@ -173,18 +179,19 @@ def _defined(body: list[ast.stmt]) -> Iterator[str]:
             yield from (n.id for t in targets for n in ast.walk(t) if isinstance(n, ast.Name))
 
 
-def identifiers(tree: ast.Module) -> set[str]:
+@cache
+def identifiers(tree: ast.Module) -> frozenset[str]:
     """Of variables, arguments and attributes."""
-    names = (getattr(node, kind, None) for node in ast.walk(tree) for kind in ("id", "arg", "attr"))
-    return {name for name in names if isinstance(name, str)}
+    names = (getattr(node, kind, None) for node in nodes(tree) for kind in ("id", "arg", "attr"))
+    return frozenset(name for name in names if isinstance(name, str))
 
 
 def words_of(tree: ast.Module) -> set[str]:
     """Identifiers, names of functions and classes, words of strings, and "piece*" or "*piece" for those of
     f-strings; docstrings apart."""
-    found, nodes = identifiers(tree), list(ast.walk(tree))
-    docstrings = {id(n.value) for n in nodes if isinstance(n, ast.Expr)}
-    for node in nodes:
+    found = set(identifiers(tree))
+    docstrings = {id(n.value) for n in nodes(tree) if isinstance(n, ast.Expr)}
+    for node in nodes(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
         elif isinstance(node, ast.JoinedStr):
@@ -208,7 +215,9 @@ def is_setting(parts: tuple[str, ...]) -> bool | None:
     return True
 
 
-def broken_pointers(text: str, home: str | None = None, code: set[str] = frozenset()) -> Iterator[tuple[int, str]]:
+def broken_pointers(
+    text: str, home: str | None = None, code: frozenset[str] = frozenset()
+) -> Iterator[tuple[int, str]]:
     """(line, name) of dotted names in backticks that look like names of ours and are none.
 
     They do if they begin with a package; or with a section of the configuration (`model.width`); or, in a
@@ -236,7 +245,7 @@ def test_every_dotted_name_in_backticks_exists():
     wrong = []
     for path in files(".py", ".md"):
         first = path.relative_to(ROOT).parts[0]
-        code = identifiers(parsed(path)) if path.suffix == ".py" else set()
+        code = identifiers(parsed(path)) if path.suffix == ".py" else frozenset()
         found = broken_pointers(path.read_text(), first if first in PACKAGES else None, code)
         wrong += [f"{path.relative_to(ROOT)}:{line}: `{name}` does not exist (moved?)" for line, name in found]
     assert not wrong, "\n".join(wrong)
