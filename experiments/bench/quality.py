@@ -129,11 +129,9 @@ def plot_quality(rows: Sequence[Judged], path: Path) -> None:
             panels, ("psnr", "delta_psnr"), ("PSNR (dB)", "ΔPSNR, last frame (dB)"), strict=True
         ):
             kinds = dict.fromkeys(row.decoding.split()[0] for row in rows)
-            looks = (
-                (COLOURS["perplexity"], COLOURS["delta_psnr"], DEFAULT),
-                (5, -12, 12),
-            )  # for as many kinds as SAMPLER_STEPS has
-            for kind, colour, lift in zip(kinds, *(look[: len(kinds)] for look in looks), strict=True):
+            colours = COLOURS["perplexity"], COLOURS["delta_psnr"], DEFAULT  # for as many kinds as SAMPLER_STEPS has
+            looks = colours[: len(kinds)], (5, -12, 12)[: len(kinds)]
+            for kind, colour, lift in zip(kinds, *looks, strict=True):
                 ours = [r for r in rows if r.decoding.split()[0] == kind]
                 time, value, sem = ([getattr(r, f) for r in ours] for f in (cost, metric, f"{metric}_sem"))
                 panel.errorbar(
