@@ -247,7 +247,7 @@ def join_actions(
 ) -> np.ndarray:
     """float32 [steps, A]: the fields `keys` (flat, perhaps sliced) of a record, side by side.
 
-    Raises what `unusable` makes of a reason, for fields of another length and values that are not finite.
+    Raises what `unusable` makes of a reason, for fields of another length and taken values that are not finite.
     """
     columns = [np.zeros((steps, 0), np.float32)]  # of a dataset without actions nothing else
     for key in keys:
@@ -261,7 +261,7 @@ def join_actions(
         if values.dtype.kind not in "biuf":
             what = f"{key!r} holds no numbers, but {values.dtype}"
             raise unusable(f"{what}. Repair the episode, or read with corrupt='skip'.")
-        values = values.reshape(steps, size).astype(np.float32)
+        values = values.reshape(steps, size)[:, part].astype(np.float32)
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():
             step = int(np.flatnonzero(~finite)[0])
@@ -269,5 +269,5 @@ def join_actions(
                 f"{key!r} is not finite at step {step}: {values[step].tolist()}. "
                 "Repair the episode, or read with corrupt='skip'."
             )
-        columns.append(values[:, part])
+        columns.append(values)
     return np.concatenate(columns, axis=1)

@@ -200,6 +200,17 @@ def test_actions_that_are_not_finite_name_the_step(tmp_path, value):
         dataset.episode(2, *KEYS)
 
 
+def test_values_that_an_entry_leaves_out_need_not_be_finite(tmp_path):
+    def spoil(episode, features):
+        features["steps/action"][:, 2] = np.nan
+
+    dataset = RldsDataset(write_rlds(tmp_path, SPEC, [6], change=spoil))
+    actions = dataset.episode(0, KEYS[0], ("action[:2]",)).actions
+    np.testing.assert_array_equal(actions, [[0, t] for t in range(6)])
+    with pytest.raises(EpisodeError, match=r"'steps/action\[1:\]' is not finite at step 0: \[0.0, nan\]"):
+        dataset.episode(0, KEYS[0], ("action[1:]",))
+
+
 def test_actions_and_frames_of_different_number(tmp_path):
     def spoil(episode, features):
         features["steps/action"] = features["steps/action"][:-1]
