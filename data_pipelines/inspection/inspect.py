@@ -24,7 +24,7 @@ from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
 from data_pipelines.sources.rlds.images import decode_image
-from data_pipelines.sources.rlds.schema import read_features, read_info, step_key
+from data_pipelines.sources.rlds.schema import field_slice, read_features, read_info, step_key
 from data_pipelines.sources.source import INSTRUCTION_KEY, SUCCESS_KEY, EpisodeSource, Fetched
 from hma_jax.config import require
 
@@ -45,7 +45,7 @@ class FieldFacts:
     """A field of the schema, by the key under which an entry would name it."""
 
     key: str
-    kind: str  # image, depth, number or text
+    kind: str  # image, depth, number, list (of numbers, however long) or text
     shape: tuple[int | None, ...]
     dtype: str
     per_step: bool  # False: once per episode
@@ -133,21 +133,22 @@ def inspect_dataset(
     shown: int = 4,
     frames: int = 8,
     max_bytes: int = 2_000_000_000,
+    action_keys: Sequence[str] = (),
 ) -> Sample:
     """Facts of one split, some of its episodes to look at, and what tells duplicates.
 
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
-    each camera are decoded in the first `shown`, two in the others. Damaged records are counted
-    and left out. Raises DataError for a directory that is no dataset or has no readable episode,
+    each camera are decoded in the first `shown`, two in the others. Fields of numbers count as actions if they are called
+    so, or if an entry takes them as its `action_keys`. Damaged records are counted and left out. Raises DataError for a directory that is no dataset or has no readable episode,
     ConfigError for an unknown split.
     """
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")
     source = open_source(directory, split, corrupt="skip", max_skipped=sys.maxsize)
     fields, splits = _describe(source)
     cameras = {f.key: _CameraLog() for f in fields if f.per_step and f.kind == "image"}
-    numbers = [f.key for f in fields if f.per_step and f.kind == "number" and "action" in f.key]
-    sizes = {key: source.features[step_key(key)].size for key in numbers}
-    numbers = [key for key in numbers if sizes[key] in range(1, WIDEST + 1) or key == "action" and sizes[key] > 0]
+    sizes = {f.key: source.features[step_key(f.key)].size for f in fields if f.per_step and f.kind == "number"}
+    taken = {"action", *(field_slice(key)[0] for key in action_keys)}
+    numbers = [k for k, n in sizes.items() if n and (k in taken or "action" in k and n <= WIDEST)]
     rows: dict[str, list[np.ndarray]] = {key: [] for key in numbers}
     steps, examples, prints, bytes_read = [], [], [], 0
     drawn = smallest_hashes(source.name, source.ids[source.numbers], episodes, "inspect")
@@ -227,7 +228,7 @@ def _field(key: str, feature: FlatFeature) -> FieldFacts:
     if feature.image:
         kind = "image" if feature.shape[-1] == 3 and feature.dtype == "uint8" else "depth"
     else:
-        kind = "number" if feature.dtype in NUMBERS and None not in feature.shape else "text"
+        kind = "text" if feature.dtype not in NUMBERS else "list" if None in feature.shape else "number"
     dtype = feature.dtype if feature.dtype in NUMBERS else "string"
     return FieldFacts(key.removeprefix("steps/"), kind, feature.shape, dtype, key.startswith("steps/"))
 

@@ -66,6 +66,16 @@ class Page(HTMLParser):
             assert self.open.pop() == tag
 
 
+def test_actions_of_an_entry_may_be_fields_of_any_name(toy, tmp_path, capsys):
+    directory, entries = toy
+    entries.write_text(to_toml(replace(SPEC, action_keys=("action", "is_last"), action_dims=(3, 1))))
+    arguments = ["data", "view", str(directory), "--registry", str(entries), "--out", str(tmp_path / "page.html")]
+    assert main(arguments) == 0
+    said = capsys.readouterr().out
+    assert "does not fit" not in said and "next: hma tokenize" in said
+    assert ">is_last<" in (tmp_path / "page.html").read_text()
+
+
 def test_page_is_one_file_with_clips_curves_and_statistics(toy, tmp_path, capsys):
     directory, entries = toy
     out = tmp_path / "pages/page.html"

@@ -66,7 +66,8 @@ def parse_features(schema: Any) -> dict[str, FlatFeature]:
     return found
 
 
-def _fields(node: Any, key: str, depth: int) -> Iterator[tuple[str, FlatFeature]]:
+def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[tuple[str, FlatFeature]]:
+    """Of `node`; `listed`: it lies in a list, as of the steps of an episode."""
     if depth > DEEPEST:
         raise ValueError(f"{_field(key)}: fields are nested more than {DEEPEST} deep")
     form, content = _content(node, key)
@@ -75,15 +76,17 @@ def _fields(node: Any, key: str, depth: int) -> Iterator[tuple[str, FlatFeature]
         for name, child in children.items():
             if not name or not name.isprintable() or len(key) + len(name) > LONGEST_KEY:
                 raise ValueError(f"{_field(key)}: a field cannot be called {shown(name)}")
-            yield from _fields(child, f"{key}/{name}" if key else name, depth + 1)
+            yield from _fields(child, f"{key}/{name}" if key else name, depth + 1, listed)
     elif form == "sequence":
-        yield from _fields(content.get("feature"), key, depth + 1)
+        inner = _fields(content.get("feature"), key, depth + 1, listed=True)
+        yield from ((k, _in_lists(feature)) for k, feature in inner) if listed else inner
     elif form == "translation":
         for language in _list(content.get("languages", []), key):
             yield f"{key}/{str(language)[:LONGEST_KEY]}", FlatFeature(image=False, size=0)
     elif form in ("image", "video"):
         shape = _shape(content, key) or (None, None, 3)
-        yield key, FlatFeature(True, 0, shape[-3:], _dtype(content) or "uint8")
+        image = FlatFeature(True, 0, shape[-3:], _dtype(content) or "uint8")
+        yield key, _in_lists(image) if listed and form == "video" else image
     elif form == "classLabel":
         yield key, FlatFeature(False, 1, (), "int64")
     elif form == "boundingBox":
@@ -92,6 +95,12 @@ def _fields(node: Any, key: str, depth: int) -> Iterator[tuple[str, FlatFeature]
         yield key, _numbers(_shape(content, key), _dtype(content), key)
     else:  # text, and what a class of somebody else's holds
         yield key, FlatFeature(image=False, size=0)
+
+
+def _in_lists(feature: FlatFeature) -> FlatFeature:
+    """What each step has a list of, however long. A record holds that under other keys than the field's own (tfds calls
+    it ragged), and not so many of it per step."""
+    return FlatFeature(False, 0, (None, *feature.shape), feature.dtype)
 
 
 def _field(key: str) -> str:

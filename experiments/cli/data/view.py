@@ -92,7 +92,8 @@ def _view_one(
 
     known = find_spec(source_name(directory))
     split = split or (known.split if known else "train")
-    sample = inspect_dataset(directory, split, episodes=episodes, shown=shown, frames=CLIP_FRAMES)
+    keys = known.action_keys if known else ()
+    sample = inspect_dataset(directory, split, episodes=episodes, shown=shown, frames=CLIP_FRAMES, action_keys=keys)
     facts = sample.facts
     rate = hz or (known.hz if known else facts.hz)
     entry = replace(known, hz=rate) if known else None
@@ -102,19 +103,20 @@ def _view_one(
     usual = entry.stride if entry else stride_of(rate) if rate else None
     stride = (stride or usual) if rate else None
     others = [s.name for s in facts.splits if s.name not in split.split("+") and s.episodes][:OTHER_SPLITS]
-    prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes))]
+    prints = [*sample.fingerprints, *(p for name in others for p in _fingerprints(directory, name, episodes, keys))]
     windows = window_facts(facts, stride, frames) if stride else None
     remarks = make_remarks(facts, entry, windows, find_duplicates(prints))
     return Viewed(sample, entry, known is not None, rate, stride, tuple(remarks))
 
 
-def _fingerprints(directory: str, split: str, episodes: int) -> Sequence[Fingerprint]:
+def _fingerprints(directory: str, split: str, episodes: int, keys: Sequence[str]) -> Sequence[Fingerprint]:
     """Of another split, which need not be readable: the page is about the one that was asked for."""
     from data_pipelines.errors import DataError
     from data_pipelines.inspection.inspect import inspect_dataset
 
     try:
-        return inspect_dataset(directory, split, episodes=episodes, shown=0, frames=2).fingerprints
+        sample = inspect_dataset(directory, split, episodes=episodes, shown=0, frames=2, action_keys=keys)
+        return sample.fingerprints
     except DataError as error:
         console.print(f"[yellow]note[/]: split {split!r} was not searched for the same episodes: {escape(str(error))}")
         return ()

@@ -122,6 +122,24 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
     assert any("differ in length" in reason for reason in facts.damaged)
 
 
+def test_steps_that_hold_lists_of_numbers_are_read(tmp_path):
+    """As plans of some actions each: tfds keeps them under other keys, and not so many values of them per step."""
+    from tensorflow_datasets import features as tf
+
+    def change(episode, features):
+        lengths = 1 + np.arange(6) % 3
+        features["steps/action_plan/ragged_flat_values"] = np.zeros(2 * lengths.sum(), np.float32)
+        features["steps/action_plan/ragged_row_lengths_0"] = lengths
+
+    directory = write_rlds(tmp_path, make_spec(), [6, 6], change=change)
+    plan = tf.Sequence(tf.Tensor(shape=(2,), dtype=np.float32))
+    step = {"observation": {"image": tf.Image(shape=(8, 8, 3))}, "action": tf.Tensor(shape=(3,), dtype=np.float32)}
+    tf.FeaturesDict({"steps": tf.Dataset(step | {"action_plan": plan})}).save_config(str(directory))
+    facts = inspect_dataset(directory).facts
+    assert [a.key for a in facts.actions] == ["action"] and facts.steps == (6, 6) and not facts.damaged
+    assert {f.key: (f.kind, f.shape) for f in facts.fields}["action_plan"] == ("list", (None, 2))
+
+
 def test_an_instruction_in_numbers_is_no_text(tmp_path):
     """As some datasets keep the ids of its tokens."""
     numbers = {"steps/language_instruction": np.arange(20)}

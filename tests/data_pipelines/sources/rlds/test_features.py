@@ -20,20 +20,20 @@ from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
 NOT_RECOGNISED = {"pythonClassName": "somebody.features.Own", "text": {}}
 
 
-def tfds_fields(feature, key: str = "") -> dict[str, tuple]:
-    """(image, size, shape, dtype) of each field, by tfds itself."""
+def tfds_fields(feature, key: str = "", lists: int = 0) -> dict[str, tuple]:
+    """(image, size, shape, dtype) of each field, by tfds itself; `lists`: sequences that it lies in, one in the other."""
     import tensorflow_datasets as tfds
 
     if isinstance(feature, tfds.features.FeaturesDict):
         found = {}
         for name, child in feature.items():
-            found |= tfds_fields(child, f"{key}/{name}" if key else name)
+            found |= tfds_fields(child, f"{key}/{name}" if key else name, lists)
         return found
-    if isinstance(feature, tfds.features.Image):
+    if isinstance(feature, tfds.features.Image) and lists < 2:
         return {key: (True, 0, tuple(feature.shape), np.dtype(feature.np_dtype).name)}
     if isinstance(feature, (tfds.features.Dataset, tfds.features.Sequence)):
-        return tfds_fields(feature.feature, key)
-    shape, dtype = tuple(feature.shape), np.dtype(feature.np_dtype)
+        return tfds_fields(feature.feature, key, lists + 1)
+    shape, dtype = (None,) * (lists - 1) + tuple(feature.shape), np.dtype(feature.np_dtype)
     numbers = dtype.kind in "fiub" and None not in shape
     size = int(np.prod(shape)) if numbers else 0
     return {key: (False, size, shape, dtype.name if dtype.kind in "fiub" else "string")}
