@@ -26,13 +26,14 @@ from experiments.applications.judging.ladder import OWN_HEAD, find_policy, names
 from experiments.applications.judging.outcomes import LEARNED, SHUFFLED, TRUE, Outcome, judge_rollout
 from experiments.applications.judging.outside import Outside, TrueOutside
 from experiments.applications.judging.own_policies import load_own, try_out
-from experiments.applications.judging.own_success import OwnSuccess
+from experiments.applications.judging.own_success import PAGE, OwnSuccess
 from experiments.applications.judging.recordings import Recordings
 from experiments.applications.judging.rollouts import Rollout, load_rollout, run, save_rollout
 from experiments.applications.made_with import claim, short_hash
 from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
+from experiments.own_file import naming_line
 from experiments.running.workspace import Workspace
 from experiments.words import few
 from hma_jax.config import require
@@ -129,7 +130,8 @@ def _judge(
     for encoder in encoders + [config.head.encoder] * (success is None):
         require_multiples(*simulator.tokenizer.image_shape, encoder.size)
     if own is not None:
-        try_out(users, success, config.batch, simulator.tokenizer.image_shape)
+        with naming_line(own, PAGE):
+            try_out(users, success, config.batch, simulator.tokenizer.image_shape)
         about["contents of --policies"] = short_hash(own.read_bytes())
     policies += users
     others = [name for name in counted if name not in policies]

@@ -17,7 +17,7 @@ from experiments.applications.judging.own_success import PAGE, OwnSuccess, succe
 from experiments.applications.policies.cloning import ClonedPolicy
 from experiments.applications.policies.diffusion import DiffusionPolicy
 from experiments.applications.policies.policy import Policy
-from experiments.own_file import function_of, run_file
+from experiments.own_file import function_of, naming_line, run_file
 from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 
@@ -69,13 +69,15 @@ def load_own(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], OwnSuc
     """What `policies(robot)` of the file gives, and what it says of success, if it does. Modules beside the file can be
     imported by it, as where it is a program.
 
-    Raises ConfigError for another thing than policies, and for names that rollouts cannot be kept under.
+    Raises ConfigError for another thing than policies, for names that rollouts cannot be kept under, and, with its line,
+    for what the file raises.
     """
     beside = str(path.resolve().parent)
     if beside not in sys.path:
         sys.path.append(beside)  # behind all others: it hides none
-    file = run_file(path, SIGNATURE, "policies of your own are", PAGE)
-    found = function_of(file, SIGNATURE, PAGE)(robot)
+    with naming_line(path, PAGE):
+        file = run_file(path, SIGNATURE, "policies of your own are", PAGE)
+        found = function_of(file, SIGNATURE, PAGE)(robot)
     where = f"{path}: {SIGNATURE}"
     require(isinstance(found, dict), f"{where} must return a dict of policies by name, got {type(found).__name__}")
     require(bool(found), f"{where} returned no policy")

@@ -165,6 +165,11 @@ def test_a_policy_without_right_actions_is_refused_before_anything_is_made(judge
     file.write_text(OWN.format(value="0"))
     with pytest.raises(ConfigError, match=r"mine.py: policy 'still': .*float32 \[2, 4\].* it gave int64 \[2, 4\]"):
         judge_run(root / "model", tmp_path / "out", ASKED, step, file)
+    file.write_text(OWN.format(value="images.widht"))
+    with pytest.raises(
+        ConfigError, match=r"mine.py, line 9: AttributeError: 'numpy.ndarray' object has no attribute 'widht'"
+    ):
+        judge_run(root / "model", tmp_path / "out", ASKED, step, file)
     assert not (tmp_path / "out").exists()
 
 

@@ -116,6 +116,27 @@ def test_what_is_no_file_of_policies_is_refused_by_file_function_and_name(tmp_pa
     assert str(error.value).startswith(str(path))
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("\ndef policies(robot) return {}", "line 2: SyntaxError: expected ':'"),
+        ("import no_such_module", "line 1: ModuleNotFoundError: No module named 'no_such_module'"),
+        (
+            "def policies(robot):\n    return {'a': robot.width}",
+            "line 2: AttributeError: 'Robot' object has no attribute",
+        ),
+        ("def policies(robot):\n    return {1 / 0: 1}\n\n", "line 2: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_the_file_raises_is_a_message_that_names_its_line(tmp_path, text, message):
+    """It was a traceback, most of it through what runs the file."""
+    path = tmp_path / "mine.py"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        load_own(path, ROBOT)
+    assert str(error.value).startswith(f"{path}, {message}") and "docs/judging.md" in str(error.value)
+
+
 class Gives:
     def __init__(self, actions):
         self.actions = actions
