@@ -89,6 +89,9 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
             if not other.says_seed:
                 unsaid = "does not say with which seed it was trained, and stands for"
                 table.caption += f" {escape(other.name)} {unsaid} {kept}."
+        mine, theirs = (next(iter(one.seeds.values())).datasets for one in (side, other))
+        if left_out := [name for name in mine if name not in theirs]:
+            table.caption += f" Only {escape(side.name)} was judged on {few(left_out)}: nothing here is of them."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         table.caption += f" No error of {few(alone)}: one held-out episode."
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:

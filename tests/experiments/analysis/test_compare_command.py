@@ -86,6 +86,18 @@ def test_seeds_of_a_study_that_the_other_has_not_are_left_out_and_it_is_said(tab
     assert "Of the seeds of study (0, 1) only 1 is compared." in said
 
 
+def test_robots_that_one_was_not_judged_on_are_left_out_and_it_is_said(table, tmp_path, capsys):
+    """The mean over those that remain was called overall, without a word."""
+    trial = reference_trial(STUDY, 0)
+    a = write_trial(tmp_path / "a", trial, better(table))
+    b = write_trial(tmp_path / "b", replace(trial, max_trajectories=4), table.among(("r0", "r2")))
+    for one, other in ((a, b), (b, a)):
+        assert main(["compare", str(one), str(other), "--to", str(tmp_path / "c.csv")]) == 0
+        assert {scope for scope, _ in rows_of(tmp_path / "c.csv")} == {OVERALL, "r0", "r2"}
+        said = " ".join(capsys.readouterr().out.split())
+        assert said.count("Only") == 1 and f"Only {a.name} was judged on r1: nothing here is of them." in said
+
+
 def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path, capsys):
     trial = reference_trial(STUDY, 0)
     a = write_trial(tmp_path / "a", trial, table)
