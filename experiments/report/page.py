@@ -145,7 +145,9 @@ def _headline(
     }
     for metric in (m for m in metrics if shown and m in said):
         name, of_untrained = said[metric]
-        cards.append(card(f"{name}, {shown.name}", _at_default(rows, shown.by, metric), "s.e. over episodes and seeds"))
+        found = _at_default(rows, shown.by, metric)
+        over = "s.e. over episodes and seeds" if found and len(found.seeds) > 1 else "s.e. over episodes of one seed"
+        cards.append(card(f"{name}, {shown.name}", found, over))
         untrained = _at_default(rows, shown.by, metric, UNTRAINED)
         if untrained or shown.name == REFERENCE:  # of others nobody asks it
             cards.append(card(f"{name}, untrained", untrained, of_untrained))

@@ -22,10 +22,12 @@ from experiments.rows import Row, curve
 from experiments.sweeps.sweep import CONTROL, Sweep
 
 CAPTION = (
-    "dots: seeds; bars: mean ± s.e. over seeds, {judged}\ndashed: the default trained on shuffled actions, one seed"
+    "dots: seeds; bars: mean ± s.e. over seeds, {judged}\n"
+    "dashed: the default trained on shuffled actions, one seed{whose}"
 )
 JUDGED = {False: "all judged on the same windows", True: "each judged on robots of its own"}
-"""By whether judged robots are drawn anew for every seed."""
+WHOSE = {False: "", True: " and its robots: not to be held against means"}
+"""Both by whether judged robots are drawn anew for every seed."""
 
 
 def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
@@ -40,7 +42,7 @@ def plot_names(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
     panels[0, 0].set_yticks(range(len(sweep.labels)), sweep.labels)
     panels[0, 0].set_ylim(len(sweep.labels) - 0.4, -0.6)  # the first on top
     panels[0, 0].get_yticklabels()[sweep.reference_x].set(color=DEFAULT, fontweight="bold")
-    figure.supxlabel(CAPTION.format(judged=JUDGED[sweep.drawn]), fontsize=8.5, color=MUTED)
+    figure.supxlabel(CAPTION.format(judged=JUDGED[sweep.drawn], whose=WHOSE[sweep.drawn]), fontsize=8.5, color=MUTED)
     return figure
 
 

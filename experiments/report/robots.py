@@ -158,10 +158,11 @@ def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames
             "than frames under the recorded ones. "
         )
     if not frames:
-        return said + "Errors are standard errors over episodes and seeds."
+        return said + "Errors are standard errors over episodes, and over seeds where there are several."
     return said + (
         "PSNR and SSIM are of the rollout against the recorded frames; <em>copying</em> is the PSNR of repeating the "
-        "last given frame. Errors are standard errors over episodes and seeds; those of <em>ahead</em> over episodes."
+        "last given frame. Errors are standard errors over episodes, and over seeds where there are several; those of "
+        "<em>ahead</em> over episodes."
     )
 
 

@@ -231,8 +231,8 @@ def _transfer(optima: Sequence[Optimum], kind: str) -> str:
         own = [o for o in optima if o.role == role and o.metric == "cross_entropy" and not math.isnan(o.moved)]
         if own:
             far = max(own, key=lambda o: abs(o.moved))
-            ends = far.edge or any(o.edge for o in own if o.moved == 0)
-            open_ended = ", at an end of the grid, so perhaps further" if ends else ""
+            # Whichever lies at an end: what is best beyond it may have moved further than `far`.
+            open_ended = ", some at an end of the grid, so perhaps further" if any(o.edge for o in own) else ""
             steps = f"{abs(far.moved):.0f} step{'s' * (abs(far.moved) != 1)}"
             parts.append(f"{words}: the best rate of {len(own)} {kind}s moves by at most {steps}{open_ended}")
     return f"{'; '.join(parts)} (held-out loss)." if parts else ""

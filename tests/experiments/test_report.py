@@ -248,6 +248,14 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
 
 
+def test_the_error_of_one_seed_is_not_said_to_be_over_seeds(drawn):
+    sweep = plan_width(STUDY)
+    rows = rows_of(drawn, [sweep])
+    for own, said in ((rows, "and seeds"), ([r for r in rows if r.seed == 0], "of one seed")):
+        cards = page._headline(drawn, record_of(), [sweep], own, {}, page._Shown(sweep, "reference"), None)
+        assert f"s.e. over episodes {said}<" in cards
+
+
 @pytest.mark.parametrize("base", ["", "width 16"])
 def test_a_control_beside_one_of_several_curves_is_no_curve(drawn, base, tmp_path):
     """Drawing such an axis of one's own ended with a KeyError, after all its trials had run."""
@@ -270,6 +278,7 @@ def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
         said = describe(sweep, [], [], Along())
         assert ("each judged on robots of its own" in caption) == ("robots of its own, all variants" in said) == own
         assert ("all judged on the same windows" in caption) != own
+        assert ("one seed and its robots: not to be held against means" in caption) == own
 
 
 def test_robots_that_are_others_for_every_seed_are_shown_of_the_seed_that_judges_them():

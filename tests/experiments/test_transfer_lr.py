@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.optima import as_good, chosen_by_others, find_optima
+from experiments.optima import Optimum, as_good, chosen_by_others, find_optima
 from experiments.override import override
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
 from experiments.report.plots import plot_sweep
+from experiments.report.sweeps import _transfer
 from experiments.rows import LOSS, TRAINING, CurvePoint, curve, read_csv
 from experiments.study import TransferConfig
 from experiments.sweeps import lr
@@ -114,6 +115,19 @@ def test_optima_line_up_with_mup_and_cost_nothing(tmp_path):
     assert optima[STANDARD, "width 16"].penalty == 0.0  # its own optimum
     training = optima_of(rows, LOSS)
     assert training[STANDARD, "width 8"].penalty == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("moved", [-2, -1, 1, 2])
+def test_an_optimum_at_an_end_of_the_grid_leaves_open_how_far_the_best_rate_moves(moved):
+    """It was looked for among those alone that moved furthest, or not at all."""
+    base, inside = (
+        Optimum("lr", "cross_entropy", POINT, f"width {x}", x, "", 1.0, 0.1, x, x, step, 1.0, 0.0, 0.0)
+        for x, step in ((1.0, 0), (4.0, 2))
+    )
+    other = replace(inside, series="width 64", moved=moved)
+    assert "3 widths moves by at most 2 steps (held-out loss)" in _transfer([base, inside, other], "width")
+    said = _transfer([base, inside, replace(other, edge="edge")], "width")
+    assert "moves by at most 2 steps, some at an end of the grid, so perhaps further" in said
 
 
 def point(x: float, *losses: float) -> CurvePoint:
