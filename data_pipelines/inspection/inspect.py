@@ -20,6 +20,7 @@ from data_pipelines.inspection.action_stats import DimensionFacts, dimension_fac
 from data_pipelines.inspection.duplicates import Fingerprint, take_fingerprint
 from data_pipelines.inspection.sample import Shown, shrink
 from data_pipelines.sampling.splits import smallest_hashes
+from data_pipelines.sources.identity import describe
 from data_pipelines.sources.open import open_source
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import NUMBERS, FlatFeature
@@ -163,8 +164,11 @@ def inspect_dataset(
             wanted = frames if len(examples) < shown else 2
             times = tuple(np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist())
             looked = {key: log.look(record[step_key(key)], times) for key, log in cameras.items()}
-        except (EpisodeError, ValueError) as error:
-            source.skip(int(i), error if isinstance(error, EpisodeError) else EpisodeError(f"episode {i}: {error}"))
+        except EpisodeError as error:
+            source.skip(int(i), error)
+            continue
+        except ValueError as error:
+            source.skip(int(i), EpisodeError(f"{describe(source.runs, int(source.numbers[i]))}: {error}"))
             continue
         bytes_read += sum(_size(values) for values in record.values())
         steps.append(count)
@@ -173,7 +177,7 @@ def inspect_dataset(
             rows[key].append(actions[key])
         prints.append(take_fingerprint(*_named(source, int(i)), count, looked, list(actions.values())))
         if len(examples) < shown:
-            examples.append(_shown(int(i), count, record, times, looked, actions))
+            examples.append(_shown(int(source.numbers[i]), count, record, times, looked, actions))
     if not steps:
         reasons = "; ".join(source.skipped) or "it is empty"
         raise DataError(f"{source.location}: no episode of split {split!r} can be read: {reasons}")
@@ -254,11 +258,11 @@ def _read(source: EpisodeSource, i: int, cameras: dict, numbers: Sequence[str]) 
 
 
 def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence[str]) -> int:
-    """Steps of an episode. Raises EpisodeError when its fields disagree."""
+    """Steps of an episode. Raises ValueError when its fields disagree."""
     for key in (*cameras, *numbers):
         values = record[step_key(key)]
         if len(values) and isinstance(values, np.ndarray) != (key in numbers):
-            raise EpisodeError(f"an episode whose {key} holds {'bytes' if key in numbers else 'numbers'}")
+            raise ValueError(f"its {key} holds {'bytes' if key in numbers else 'numbers'}")
     counts = {key: len(record[step_key(key)]) for key in cameras}
     for key in numbers:
         counts[key] = len(record[step_key(key)]) / source.features[step_key(key)].size
@@ -266,7 +270,7 @@ def _steps(record: dict, source: EpisodeSource, cameras: dict, numbers: Sequence
         counts["is_first"] = len(record.get("steps/is_first", ()))
     if len(set(counts.values())) != 1 or not max(counts.values()):
         found = ", ".join(f"{key} {n:g}" for key, n in counts.items())
-        raise EpisodeError(f"an episode whose fields differ in length, or without steps ({found})")
+        raise ValueError(f"its fields differ in length, or it has no step ({found})")
     return int(max(counts.values()))
 
 

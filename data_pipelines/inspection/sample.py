@@ -16,7 +16,7 @@ HEIGHT = 240
 class Shown:
     """An episode for people: a few frames of every camera, and its actions as recorded."""
 
-    index: int
+    index: int  # its number among all that its files should have
     steps: int
     success: bool | None
     instruction: str

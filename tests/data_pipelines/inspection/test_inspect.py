@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -119,7 +121,23 @@ def test_damaged_episode_is_counted_not_fatal(tmp_path):
 
     facts = inspect_dataset(write_rlds(tmp_path, make_spec(), [5, 5, 5, 5], change=change)).facts
     assert facts.sampled == 2 and sum(facts.damaged.values()) == 2
-    assert any("differ in length" in reason for reason in facts.damaged)
+    first, second = sorted(facts.damaged)
+    file = "toy-train.tfrecord-00000-of-00001"
+    assert first.startswith(f"{file}, episode 1: its fields differ in length") and "action 4" in first
+    assert second.startswith(f"{file}, episode 2: 8 bytes that are neither JPEG nor PNG")
+
+
+def test_episodes_keep_their_numbers_behind_a_shard_that_is_cut_off(tmp_path):
+    def change(episode, features):
+        if episode == 4:
+            features["steps/action"] = features["steps/action"][:-1]
+
+    directory = write_rlds(tmp_path, make_spec(), [5] * 6, shards=2, change=change)
+    first = directory / "toy-train.tfrecord-00000-of-00002"
+    os.truncate(first, first.stat().st_size - 1)
+    sample = inspect_dataset(directory, shown=4)
+    assert sorted(shown.index for shown in sample.shown) == [0, 1, 3, 5]
+    assert any(r.startswith("toy-train.tfrecord-00001-of-00002, episode 1: its fields") for r in sample.facts.damaged)
 
 
 def test_steps_that_hold_lists_of_numbers_are_read(tmp_path):
