@@ -81,7 +81,11 @@ def predict(
     require(not fit.refused, f"{curve.name}: nothing can be predicted: {fit.refused}")
     x = np.array([held_out[0].x])
     noise, freedom = noise_near(fitted.measured, x[0])
-    require(np.isfinite(noise), f"{curve.name}: one seed per point: the interval of a prediction needs their noise")
+    require(
+        np.isfinite(noise),
+        f"{curve.name}: one seed per point: the interval of a prediction needs their noise; run the trials that it is made "
+        "from under several (--set seeds=0,1,2)",
+    )
     luck = np.random.default_rng(1).standard_t(freedom, len(fit.thetas)) / np.sqrt(len(ids))
     spread = np.exp(noise * luck)
     low, high = interval(fit.all_at(x)[:, 0] * spread)

@@ -1,19 +1,26 @@
 """Predictions are made before their trials run, stay as they were written, and are held against what came."""
 
 import json
+import re
 import shutil
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from experiments.analysis.fits import LEAST
 from experiments.analysis.predictions import load_predictions, save_prediction
 from experiments.cli.main import main
+from experiments.override import override
+from experiments.presets import CPU
 from experiments.report.draw import draw
 from experiments.report.numbers import read_numbers
 from experiments.running.sealed import RESULT, write_result
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
-from experiments.sweeps.sweep import unique_trials
+from experiments.sweeps.sweep import POINT, unique_trials
+from experiments.sweeps.width import plan as plan_width
 from tests.experiments.fakes import PROVENANCE
 from tests.experiments.judged import WIDE, finish, judged_study
 
@@ -127,11 +134,26 @@ def test_a_prediction_after_the_fact_is_marked(root):
         (("--predict", "width=50"), "plans no trial there"),
         (("--predict", "lr=0.1"), "no axis over a number"),
         (("--out", "x.json"), "give --predict"),
+        (
+            ("--predict", f"width={HELD}", "--set", f"widths=8,16,24,32,48,{HELD}", "--set", "seeds=0"),
+            "width: one seed per point: the interval of a prediction needs their noise; run the trials",
+        ),
     ],
 )
 def test_what_cannot_be_predicted_says_why(before, words, says, capsys):
     assert command(before, *words) == 2
     assert says in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_sweeps_of_the_page_have_the_seeds_that_a_prediction_needs():
+    """After its first one, of 26 minutes, the prediction that it was for was refused."""
+    page = (Path(__file__).parents[3] / "docs" / "fits.md").read_text()
+    sweeps = re.findall(r"^    hma sweep width (.*) --out", page, re.MULTILINE)
+    for words in sweeps:
+        points = plan_width(override(CPU, words.replace("--set ", "").split())).points
+        seeds = Counter(point.x for point in points if point.role == POINT)
+        assert len(seeds) >= LEAST and min(seeds.values()) > 1, words
+    assert len(sweeps) == 2
 
 
 def with_own_axis(root, change):
