@@ -142,8 +142,14 @@ class RobomimicSource:
 
     def _read_layout(self, demo: Any, wanted: tuple[str, ...]) -> tuple[Layout, tuple[str, ...]]:
         where = f"{self.path}: {demo.name.lstrip('/')}"
-        obs = demo.get("obs", {})
+        obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # groups are none of robomimic's
         there = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
+        pictures = sorted(k for k in obs if obs[k].dtype == np.uint8 and obs[k].ndim == 4 and obs[k].shape[3] == 3)
+        if not there and pictures:  # as LIBERO's, agentview_rgb
+            raise DataError(
+                f"{where}/obs has no *_image, as robomimic calls pictures, but {', '.join(pictures)}: rename each to end "
+                "in _image in every demonstration, in a copy of the file (h5py: obs.move(OLD, NEW))."
+            )
         if not there:
             raise DataError(
                 f"{where}/obs has no *_image (it holds {', '.join(sorted(obs)) or 'nothing'}): a "

@@ -50,6 +50,24 @@ def test_low_dimensional_files_are_refused_with_the_remedy(tmp_path):
         RobomimicSource(path)
 
 
+def test_pictures_of_another_name_are_no_low_dimensional_file(tmp_path):
+    def rename(file):
+        for demo in file["data"].values():
+            for camera in ("agentview", "robot0_eye_in_hand"):
+                demo["obs"].move(f"{camera}_image", f"{camera}_rgb")
+
+    path = write_robomimic(tmp_path / "libero.hdf5", change=rename)
+    with pytest.raises(
+        DataError, match=r"demo_9/obs has no \*_image.* but agentview_rgb, robot0_eye_in_hand_rgb: rename"
+    ):
+        RobomimicSource(path)
+
+
+def test_groups_beside_the_arrays_of_a_demonstration_are_left_out(tmp_path):
+    path = write_robomimic(tmp_path / "a.hdf5", change=lambda file: file["data/demo_9/obs"].create_group("extra"))
+    assert "observation/extra" not in RobomimicSource(path).layout.vectors
+
+
 def test_success_without_rewards_is_by_done_and_otherwise_unknown():
     assert succeeded(np.array([0.0, 0.9]), np.array([0, 1])) is False  # shaped reward, done at the end
     assert succeeded(None, np.array([0, 1])) is True
