@@ -175,7 +175,8 @@ def eval_batches(
     With `others`, so many action sequences of other episodes of each window's robot (`others`): `other_actions` float32
     [B, others, T, U], and `other_valid` bool [B, others], False where there are fewer. With `truth`, made for these
     windows, what would have been seen under the first of them: `other_images` uint8 [B, T, H, W, 3], the recorded
-    ones up to the prompt, and `other_seen` bool [B], False for robots that nobody simulates.
+    ones up to the prompt, and `other_seen` bool [B], False for robots that nobody simulates and for windows that no
+    other episode's actions cover.
 
     Raises ConfigError if the store differs from the frozen one, lacks raw frames, or a
     dataset is not in the manifest or in `table`.
@@ -258,7 +259,7 @@ class _Rows:
             row["real"] = cut.valid(item, start)
         if self._count:
             row |= self._under_others(name, episode, start, width)
-        return row | self._seen(name, episode, start, row["images"]) if self._truth else row
+        return row | self._seen(name, episode, start, row) if self._truth else row
 
     def _under_others(self, name: str, episode: int, start: int, width: int) -> dict:
         chosen = self._others.choose(name, episode, start, self._count)
@@ -269,9 +270,9 @@ class _Rows:
             "other_valid": np.arange(self._count) < len(chosen),
         }
 
-    def _seen(self, name: str, episode: int, start: int, images: np.ndarray) -> dict:
-        frames = self._truth.frames.get(name)
-        if frames is None:
+    def _seen(self, name: str, episode: int, start: int, row: dict) -> dict:
+        images, frames = row["images"], self._truth.frames.get(name)
+        if frames is None or not row["other_valid"][0]:
             return {"other_images": images, "other_seen": np.False_}
         seen = np.concatenate([images[: self._truth.prompt], frames[self._at[name, episode, start]]])
         return {"other_images": seen, "other_seen": np.True_}

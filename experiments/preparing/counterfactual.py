@@ -62,7 +62,8 @@ def _of_robot(
     prompt: int,
     study: Study,
 ) -> np.ndarray:
-    """uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros."""
+    """uint8 [windows, T - prompt, H, W, 3]; after the last real frame, zeros. Of a window that no other episode's actions
+    cover, as one of the longest episode, they are the recorded frames, which nobody reads."""
     from data_pipelines.errors import DataError
     from data_pipelines.suite.counterfactual import frames_under
 
@@ -72,12 +73,12 @@ def _of_robot(
     for row, (episode, start) in enumerate(dataset.windows):
         item, first = store.episode(name, "val", episode), start * cut.frame_step
         frames = cut.real(item, start)
-        (other,) = others.choose(name, episode, start, 1)
-        instead = store.episode(name, other.split, other.episode).actions
-        there = other.start * cut.frame_step
         until, end = (prompt - 1) * cut.stride, (frames - 1) * cut.stride
         own.append(item.actions)
-        changed.append(np.concatenate([item.actions[: first + until], instead[there + until : there + end]]))
+        changed.append(item.actions)
+        for other in others.choose(name, episode, start, 1):
+            instead, there = store.episode(name, other.split, other.episode).actions, other.start * cut.frame_step
+            changed[-1] = np.concatenate([item.actions[: first + until], instead[there + until : there + end]])
         times[row] = first + np.minimum(np.arange(cut.frames), frames - 1) * cut.stride
         real.append(frames)
         seeds.append(_seed_of(store, spec, item.episode, study.suite.seed))

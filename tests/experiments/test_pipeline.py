@@ -9,6 +9,7 @@ from data_pipelines.errors import DataError
 from data_pipelines.loading.loader import make_loader
 from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.windows.evalset import eval_batches
+from data_pipelines.windows.others import OtherWindows
 from experiments.override import override
 from experiments.preparing import counterfactual
 from experiments.preparing.pipeline import prepare
@@ -52,3 +53,10 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     with pytest.raises(DataError, match="does not give back the recorded frames .* --replace suite makes it again"):
         counterfactual.make_counterfactual(study, workspace)
     assert not workspace.counterfactual.exists()
+
+    monkeypatch.undo()
+    monkeypatch.setattr(OtherWindows, "choose", lambda *args: [])  # as of episodes that are longer than all others
+    counterfactual.make_counterfactual(study, workspace)
+    alone = open_materials(workspace).truth
+    (batch,) = eval_batches(store, table, materials.manifest, 4, others=3, truth=alone)
+    assert not batch["other_seen"].any()

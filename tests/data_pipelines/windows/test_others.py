@@ -118,6 +118,15 @@ def test_frames_under_other_actions_follow_the_prompt(tmp_path):
     np.testing.assert_array_equal(batch["other_images"][toy, 2:], truth.frames["toy"])
 
 
+def test_nothing_is_seen_under_actions_that_there_are_not(tmp_path):
+    """The held-out episode is longer than all others: none covers its window."""
+    store = small_store(tmp_path, lengths=(3, 4), min_val=1)
+    frozen = freeze_manifest(store, store.names, 4, 5, 0, prompt=2)
+    _, batch = batches(store, 1, prompt=2, truth=truth_for(frozen))
+    assert not batch["other_valid"].any() and not batch["other_seen"].any()
+    np.testing.assert_array_equal(batch["other_images"], batch["images"])
+
+
 def test_frames_of_other_windows_or_damaged_ones_are_refused(tmp_path):
     store = small_store(tmp_path)
     frozen = freeze_manifest(store, store.names, 4, 5, 1)
