@@ -4,17 +4,20 @@ Each size's run gives its loss at several budgets, by its decay branches; betwee
 the logarithm (modified Akima, no further out than TOLERANCE). At one budget the loss over log N is fitted by a
 parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A budget at which the smallest or the largest size
 has the lowest loss, or whose parabola has no minimum between them, is refused: the best size may lie beyond. A parabola
-through losses that only flatten has a minimum, too.
+through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter it is said:
+its minimum is then where no bootstrap looks for an error.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 from scipy.interpolate import Akima1DInterpolator
 
-from experiments.analysis.fits import DRAWS, OFTEN, Coefficient, interval
+from experiments.analysis.fits import DRAWS, OFTEN, UNLIKELY, Coefficient, interval
 from experiments.analysis.measured import Measured
 
 TOLERANCE = 0.1
@@ -41,6 +44,12 @@ class Budget:
     best: Coefficient | None = None  # N_opt
     refused: str = ""
     doubt: str = ""
+    misfit: str = ""  # whether sizes lie off the parabola by more than seeds scatter
+
+    @property
+    def remarks(self) -> str:
+        """Why there is no best size, or what is doubtful of it."""
+        return self.refused or "; ".join(filter(None, (self.doubt, self.misfit)))
 
     def at(self, sizes: np.ndarray) -> np.ndarray:
         """The parabola's loss."""
@@ -85,11 +94,16 @@ class _Line:
         own = measured.x[:, 0] == size
         self.size, flops = size, measured.x[own, 1]
         self.flops, which = np.unique(flops, return_inverse=True)
+        self._seeds = np.bincount(which)
         means = np.stack([values[:, own][:, which == i].mean(1) for i in range(len(self.flops))])  # [c, 1 + R]
         self.logs = np.log(means)
 
     def covers(self, flops: float) -> bool:
         return self.flops[0] * (1 - TOLERANCE) <= flops <= self.flops[-1] * (1 + TOLERANCE)
+
+    def seeds_near(self, flops: float) -> int:
+        """At the budget that was measured nearest to it."""
+        return int(self._seeds[np.argmin(np.abs(np.log(self.flops / flops)))])
 
     def at(self, flops: float) -> np.ndarray:
         """[1 + R] log loss."""
@@ -140,4 +154,18 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
     part = float((at_end[1:] | np.isin(lowest[1:], (x[0], x[-1]))).mean())
     doubt = f"in {part:.0%} of the bootstraps the best size is at an end" if part > OFTEN else ""
     best = Coefficient("N_opt", *(float(np.exp(v)) for v in (lowest[0], *interval(lowest[1:]))))
-    return Budget(flops, sizes, loss, **common, best=best, doubt=doubt), lowest
+    misfit = _misfit(logs - np.vander(x - x.mean(), 3) @ parabolas, [line.seeds_near(flops) for line in covering[near]])
+    return Budget(flops, sizes, loss, **common, best=best, doubt=doubt, misfit=misfit), lowest
+
+
+def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:
+    """Of `residuals` [m, 1 + R] of log losses, those of the values before those of the draws, which scatter around them as
+    means over `seeds` [m] do: an F test of lack of fit, as `fits` makes it of a power law."""
+    scatter = float(((residuals[:, 1:] - residuals[:, :1]) ** 2).sum(0).mean())
+    if min(seeds) < 2 or scatter == 0:
+        return ""
+    ratio = float((residuals[:, 0] ** 2).sum()) / scatter
+    chance = float(scipy.stats.f.sf(ratio, len(seeds) - 3, sum(seeds) - len(seeds)))
+    if chance >= UNLIKELY:
+        return ""
+    return f"sizes lie off the parabola by more than seeds scatter (F = {ratio:.1f}, p = {chance:.2g})"

@@ -62,7 +62,8 @@ def _show(root: Path) -> None:
     if numbers.isoflop is not None:
         a = numbers.isoflop.exponent
         said = f"N_opt ~ C^{a.value:.3f}  [{a.low:.3f}, {a.high:.3f}]" if a else ""
-        table.add_row("isoflop", "training FLOPs", said, "", numbers.isoflop.refused)
+        doubts = [f"{b.flops:.3g} FLOPs: {b.remarks}" for b in numbers.isoflop.budgets if b.best and b.remarks]
+        table.add_row("isoflop", "training FLOPs", said, "", numbers.isoflop.refused or "; ".join(doubts))
     console.print(table)
 
 

@@ -115,7 +115,7 @@ def _isoflop(isoflop: IsoFlop | None) -> str:
     lines = []
     for b in isoflop.budgets:
         best = _with_interval(b.best) if b.best else "–"
-        lines.append([f"{b.flops:.3g}", str(len(b.sizes)), best, html.escape(b.refused or b.doubt)])
+        lines.append([f"{b.flops:.3g}", str(len(b.sizes)), best, html.escape(b.remarks)])
     a = isoflop.exponent
     said = (
         f"The best size grows as C<sup>{a.value:.2f}</sup> <span class=sem>[{a.low:.2f}, {a.high:.2f}]</span>."

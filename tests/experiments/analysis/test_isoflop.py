@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from experiments.analysis.isoflop import fit_isoflop
-from experiments.report.fits import fit_rows
+from experiments.report.fits import describe_fits, fit_rows
 from tests.experiments.analysis.curves import measured, power
 
 SIZES, BUDGETS = np.geomspace(1e4, 1e7, 7), np.geomspace(6e10, 6e12, 5)
@@ -53,6 +53,22 @@ def test_a_loss_that_only_flattens_has_no_best_size():
     fit = fit_isoflop(measured(x, loss, 1e-3, 3, np.random.default_rng(5)), BUDGETS, draws=20)
     assert fit.exponent is None and "0 of 5 budgets" in fit.refused
     assert all("the largest size is best" in budget.refused for budget in fit.budgets)
+
+
+@pytest.mark.parametrize(("steeper", "seeds"), [(0.0, 3), (0.06, 3), (0.06, 1)])
+def test_sizes_off_the_parabola_are_said(steeper, seeds):
+    """The best size then lies where the form puts it, within an interval that knows of seeds and episodes alone. Left of
+    its minimum the loss rises as right of it, or by `steeper` more; with one seed nothing tells that from luck."""
+    sizes = np.geomspace(1e4, 1e6, 5)
+    x = np.array([(n, c) for n in sizes for c in BUDGETS])
+    off = np.log(x[:, 0] / 1e5)
+    loss = 3 * np.exp((0.02 + steeper * (off < 0)) * off**2)
+    fit = fit_isoflop(measured(x, loss, 3e-3, seeds, np.random.default_rng(0)), BUDGETS, draws=100)
+    assert all(b.best and not b.doubt for b in fit.budgets)
+    said = ["off the parabola by more than seeds scatter (F = " in b.remarks for b in fit.budgets]
+    assert all(said) if steeper and seeds > 1 else not any(said)
+    page = describe_fits([], fit, [], "")
+    assert page.count("off the parabola by more than seeds scatter") == sum(said)
 
 
 def test_noise_that_leaves_no_minimum_is_said():
