@@ -43,6 +43,11 @@ class Prediction:
     inputs: dict[str, str]  # {trial id: hash of its result} of the fit
     finished: tuple[str, ...]  # every trial of the study that had a result when this was written
 
+    @property
+    def place(self) -> str:
+        """In words: '132,480 trunk parameters'."""
+        return ", ".join(f"{x:,.12g} {axis}" for x, axis in zip(self.x, self.axes, strict=True))
+
 
 @dataclass(frozen=True)
 class Outcome:

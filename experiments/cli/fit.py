@@ -113,7 +113,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     path = out or workspace.predictions / f"{curve.name}-{text}.json".replace("/", "_")
     save_prediction(path, prediction)
     console.print(
-        f"{curve.name} at {prediction.x[0]:,.0f} {curve.axes[0]}: {prediction.mean:.4f} nats per token, "
+        f"{curve.name} at {prediction.place}: {prediction.mean:.4f} nats per token, "
         f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}",
         soft_wrap=True, highlight=False, markup=False,
     )  # fmt: skip

@@ -98,11 +98,10 @@ def _outcomes(outcomes: Sequence[Outcome]) -> str:
     lines = []
     for o in outcomes:
         p = o.prediction
-        where = ", ".join(f"{x:,.0f} {axis}" for x, axis in zip(p.x, p.axes, strict=True))
         came = "not run yet" if o.observed is None else f"{o.observed:.4f}"
         said = f"{p.mean:.4f} <span class=sem>[{p.low:.4f}, {p.high:.4f}]</span>"
         lines.append([
-            html.escape(p.curve), where, said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
+            html.escape(p.curve), html.escape(p.place), said, came, VERDICTS[o.inside], f"{o.seeds} of {len(p.trials)}",
             html.escape("; ".join(o.marks)),
         ])  # fmt: skip
     head = ["curve", "at", "predicted", "came", "", "seeds", "remarks"]

@@ -10,12 +10,14 @@ from pathlib import Path
 import pytest
 
 from experiments.analysis.fits import LEAST
-from experiments.analysis.predictions import load_predictions, save_prediction
+from experiments.analysis.predictions import Outcome, Prediction, load_predictions, save_prediction
 from experiments.cli.main import main
 from experiments.override import override
 from experiments.presets import CPU
 from experiments.report.draw import draw
+from experiments.report.fits import describe_fits
 from experiments.report.numbers import read_numbers
+from experiments.report.validity import _prediction
 from experiments.running.sealed import RESULT, write_result
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
@@ -143,6 +145,15 @@ def test_a_prediction_after_the_fact_is_marked(root):
 def test_what_cannot_be_predicted_says_why(before, words, says, capsys):
     assert command(before, *words) == 2
     assert says in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_position_that_is_no_whole_number_is_said_as_it_is():
+    """A quarter of the data was 'at 0 part of the data'."""
+    made = Prediction("own", ("part of the data",), (0.25,), ("a",), 3.0, 2.9, 3.1, 0.9, "", {}, {}, ())
+    outcome = Outcome(made, None, 0, ())
+    assert "own at 0.25 part of the data: 3.000" in _prediction(outcome).text
+    assert "<td class=text>0.25 part of the data</td>" in describe_fits([], None, [outcome], "")
+    assert replace(made, x=(132480.0,), axes=("trunk parameters",)).place == "132,480 trunk parameters"
 
 
 def test_the_sweeps_of_the_page_have_the_seeds_that_a_prediction_needs():
