@@ -165,7 +165,7 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
     if many:
         console.print(
             f"note: held out, not trained on: {few(many)}. At least store.min_val={settings.min_val} are, but no more "
-            f"than store.max_val_fraction={settings.max_val_fraction:g} of a dataset",
+            f"than store.max_val_fraction={settings.max_val_fraction:g} of a dataset, or one episode",
             markup=False,
             soft_wrap=True,
         )

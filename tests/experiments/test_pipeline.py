@@ -11,7 +11,7 @@ from data_pipelines.loading.selection import LoaderConfig
 from data_pipelines.windows.evalset import eval_batches
 from data_pipelines.windows.others import OtherWindows
 from experiments.override import override
-from experiments.preparing import counterfactual
+from experiments.preparing import counterfactual, windows
 from experiments.preparing.pipeline import prepare
 from experiments.presets import get_preset
 from experiments.running.run_trial import open_materials
@@ -60,3 +60,10 @@ def test_prepared_batches_hold_the_tokens_that_the_model_takes(tmp_path, monkeyp
     alone = open_materials(workspace).truth
     (batch,) = eval_batches(store, table, materials.manifest, 4, others=3, truth=alone)
     assert not batch["other_seen"].any()
+
+
+def test_what_is_held_out_of_a_small_dataset_is_said_with_what_bounds_it(capsys):
+    facts = {"bridge_dataset": {"held_out": 1, "episodes": 1}}
+    windows._say_held_out(facts, get_preset("smoke").store)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 of 2 episodes of bridge_dataset" in said and "max_val_fraction=0.25 of a dataset, or one episode" in said
