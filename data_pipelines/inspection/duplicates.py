@@ -7,6 +7,7 @@ in every episode, so pictures alone say little: where there are actions that var
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -61,18 +62,23 @@ def find_duplicates(episodes: Sequence[Fingerprint]) -> list[tuple[Fingerprint, 
     """Groups of two or more that are probably one recording, each in the order given."""
     if not episodes:
         return []
-    rows = _finite(np.concatenate([e.actions for e in episodes]))
-    scale = rows.std(axis=0)
+    rows = _finite(np.stack([e.actions for e in episodes]))
+    scale = rows.std(axis=(0, 1))
     alive = scale > 1e-6
-    groups: list[list[Fingerprint]] = []
-    for episode in episodes:
-        for group in groups:
-            if _same(group[0], episode, scale, alive):
-                group.append(episode)
+    actions = (rows[:, :, alive] / scale[alive]).reshape(len(episodes), -1)
+    groups: dict[int, list[Fingerprint]] = {}  # by the number of the first of each
+    firsts: defaultdict[tuple[int, int], list[int]] = defaultdict(list)  # of those as long, and of as many cameras
+    for n, episode in enumerate(episodes):
+        alike = firsts[episode.steps, len(episode.pictures)]
+        near = (np.abs(actions[alike] - actions[n]) <= SAME_ACTIONS).all(axis=1)
+        for first in np.asarray(alike, int)[near].tolist():
+            if _same_pictures(episodes[first], episode, bool(alive.any())):
+                groups[first].append(episode)
                 break
         else:
-            groups.append([episode])
-    return [tuple(group) for group in groups if len(group) > 1]
+            alike.append(n)
+            groups[n] = [episode]
+    return [tuple(group) for group in groups.values() if len(group) > 1]
 
 
 def _finite(actions: np.ndarray) -> np.ndarray:
@@ -80,12 +86,7 @@ def _finite(actions: np.ndarray) -> np.ndarray:
     return np.nan_to_num(actions, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _same(a: Fingerprint, b: Fingerprint, scale: np.ndarray, alive: np.ndarray) -> bool:
-    if a.steps != b.steps or len(a.pictures) != len(b.pictures):
-        return False
-    moves = np.abs(_finite(a.actions) - _finite(b.actions))[:, alive]
-    if (moves > SAME_ACTIONS * scale[alive]).any():
-        return False
-    if not alive.any() and not (a.pictures.std(axis=(1, 2)) > SAME_PICTURE).any():
+def _same_pictures(a: Fingerprint, b: Fingerprint, actions_vary: bool) -> bool:
+    if not actions_vary and not (a.pictures.std(axis=(1, 2)) > SAME_PICTURE).any():
         return False  # blank pictures and still actions: nothing to tell episodes apart by
     return not (np.sqrt(((a.pictures - b.pictures) ** 2).mean(axis=(1, 2))) > SAME_PICTURE).any()
