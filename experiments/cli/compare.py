@@ -70,6 +70,9 @@ def compare(
 
 def _table(rows: list[Difference], a: Side, b: Side) -> Table:
     """A line per scope, overall first; differences of the shown metrics with their standard errors."""
+    from experiments.analysis.compare import NOT_OF_MODELS
+    from experiments.analysis.paired import OF_TOKENS
+
     metrics = [m for m in SHOWN if any(row.metric == m for row in rows)]
     found = {(row.scope, row.metric): row for row in rows}
     ratio = "cross_entropy" in metrics
@@ -94,10 +97,15 @@ def _table(rows: list[Difference], a: Side, b: Side) -> Table:
             table.caption += f" Only {escape(side.name)} was judged on {few(left_out)}: nothing here is of them."
     if alone := list(dict.fromkeys(row.scope for row in rows if row.episodes == 1)):
         table.caption += f" No error of {few(alone)}: one held-out episode."
+    told = {row.metric for row in rows} | set(NOT_OF_MODELS)
     if a.tokenizer and b.tokenizer and a.tokenizer != b.tokenizer:
         table.caption += f" Nats are not compared: the tokenizers differ ({a.tokenizer}, {b.tokenizer})."
+        told |= set(OF_TOKENS)
     elif not (a.tokenizer and b.tokenizer):
         table.caption += " Nats are comparable only if both saw the same tokens, which one of them does not say."
+    there = dict.fromkeys(metric for side in (a, b) for windows in side.seeds.values() for metric in windows.metrics)
+    if missing := [metric for metric in there if metric not in told]:
+        table.caption += f" Not compared, since not both have them, or among as many actions: {', '.join(missing)}."
     return table
 
 

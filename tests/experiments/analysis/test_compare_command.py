@@ -98,6 +98,21 @@ def test_robots_that_one_was_not_judged_on_are_left_out_and_it_is_said(table, tm
         assert said.count("Only") == 1 and f"Only {a.name} was judged on r1: nothing here is of them." in said
 
 
+def test_metrics_that_are_left_out_are_named(table, tmp_path, capsys):
+    """The table and the file lacked them without a word."""
+    trial, n = reference_trial(STUDY, 0), len(table)
+    chance = {k: replace(table, metrics={**table.metrics, "retrieval": np.ones(n), "retrieval_chance": np.full(n, 1 / k)})
+              for k in (4, 16)}  # fmt: skip
+    a = write_trial(tmp_path / "a", trial, chance[16])
+    b = write_trial(tmp_path / "b", replace(trial, max_trajectories=4), chance[4])
+    c = write_trial(tmp_path / "c", replace(trial, max_trajectories=2), table)
+    for other, kept in ((a, True), (b, False), (c, False)):
+        assert main(["compare", str(a), str(other), "--to", str(tmp_path / "c.csv")]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert ("Not compared, since not both have them, or among as many actions: retrieval." in said) != kept
+        assert any(metric == "retrieval" for _, metric in rows_of(tmp_path / "c.csv")) == kept
+
+
 def test_what_is_not_comparable_ends_with_a_message_and_no_file(table, tmp_path, capsys):
     trial = reference_trial(STUDY, 0)
     a = write_trial(tmp_path / "a", trial, table)
