@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import shlex
 from dataclasses import replace
@@ -230,6 +232,20 @@ def test_mixture_is_looked_for_in_the_given_directories(tmp_path):
     assert find_directories(["x", "y"], roots) == (f"{roots[0]}/x", f"{roots[1]}/y")
     with pytest.raises(ConfigError, match="no directory for z in"):
         find_directories(["x", "z"], roots)
+
+
+def test_a_full_disk_is_said_of_the_contact_sheet(robot, tmp_path, capsys, monkeypatch):
+    def fsync(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def draw(*arguments):
+        monkeypatch.setattr(os, "fsync", fsync)  # from here on
+        return draw_sheet(*arguments)
+
+    monkeypatch.setattr("experiments.contact_sheet.draw_sheet", draw)
+    assert main(["data", "inspect", str(robot), "--hz", "4", "--out", str(tmp_path / "sheets")]) != 0
+    assert f"error: {tmp_path / 'sheets' / 'contact_sheet.png'}: No space left" in capsys.readouterr().err
+    assert not list((tmp_path / "sheets").iterdir())
 
 
 def test_contact_sheet_shows_every_frame_where_it_says():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -157,10 +158,10 @@ def data_inspect(
     folder.mkdir(exist_ok=True)
     blank = [c.key for c in facts.cameras if c.is_blank]
     title = f"{facts.name} {facts.version}, split {facts.split}: {facts.episodes:,} episodes"
-    sheet, aside = folder / SHEET, folder / f".{SHEET}"
-    draw_sheet(title, sample.shown, blank).save(aside, format="png")
-    aside.replace(sheet)
-    wrote(sheet)
+    drawn = io.BytesIO()
+    draw_sheet(title, sample.shown, blank).save(drawn, format="png")
+    write_file(folder / SHEET, drawn.getvalue())
+    wrote(folder / SHEET)
     if json is not None:
         values = dataclasses.asdict(facts) | {"suggestion": suggestion and dataclasses.asdict(suggestion)}
         write_file(json, to_strict_json(values))
