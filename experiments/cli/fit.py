@@ -82,7 +82,7 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     from experiments.report.numbers import read_results, result_hashes
     from experiments.running.attempts import read_states
     from experiments.running.ledger import MISSING, Ledger
-    from experiments.sweeps.registry import plan_sweeps
+    from experiments.sweeps.registry import is_file, plan_sweeps
     from experiments.sweeps.sweep import unique_trials
 
     workspace = Workspace(root.absolute())
@@ -100,7 +100,9 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     sweep = next((s for s in sweeps if s.name == axis), None)
     if sweep is None or not sweep.measured:
         raise ConfigError(f"--predict {asked}: {axis} is no axis over a number")
-    curve, held = _held_out(sweep, record.provenance, asked, x)
+    own = next((a for a, s in zip(record.axes, sweeps, strict=False) if s is sweep and is_file(a)), None)
+    how = f"in {short(workspace.root / own)}" if own else "with --set"
+    curve, held = _held_out(sweep, record.provenance, asked, x, how)
     ids = [place.trial for place in held]
     states = read_states(sorted(ids), workspace.trials, Ledger(workspace.ledger))
     for id, state in states.items():
@@ -120,10 +122,10 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit, and only then run the trials")
 
 
-def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float) -> tuple[Curve, list[Place]]:
-    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`. Raises ConfigError where a
-    power law is not what the axis is to show, where it is not said which of several curves, and for a curve without a
-    trial there."""
+def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float, how: str) -> tuple[Curve, list[Place]]:
+    """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` one is added. Raises
+    ConfigError where a power law is not what the axis is to show, where it is not said which of several curves, and for a
+    curve without a trial there."""
     from experiments.analysis.scaling import curves_of
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import POINT
@@ -145,6 +147,6 @@ def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float) -> tup
     positions = ", ".join(f"{v:g}" for v in sorted({p.x for p in points}))
     require(
         bool(ids),
-        f"--predict {asked}: the study plans no trial there (its positions: {positions}); add it to the plan with --set",
+        f"--predict {asked}: the study plans no trial there (its positions: {positions}); add it to the plan {how}",
     )
     return curves[name], [place for place in curves[name].places if place.trial in ids]

@@ -189,6 +189,15 @@ def test_an_axis_of_a_file_is_predicted(root):
     assert prediction.curve == "own" and len(prediction.inputs) == 15 and len(prediction.trials) == 3
 
 
+def test_a_position_that_no_axis_of_a_file_has_is_added_to_that_file(root, capsys):
+    """No setting adds it, and one was asked for."""
+    with_own_axis(root, "sweep")
+    assert command(root, "--predict", "own=50") == command(root, "--predict", "width=50") == 2
+    own, width = capsys.readouterr().err.split("error: ")[1:]
+    assert own.strip().endswith(f"add it to the plan in {root / 'axes/mine.py'}"), own
+    assert width.strip().endswith("add it to the plan with --set")
+
+
 def test_of_several_curves_one_is_chosen(root, capsys):
     with_own_axis(
         root, "replace(sweep, points=tuple(replace(p, series=s) for s in ('a/b', 'as well') for p in sweep.points))"
