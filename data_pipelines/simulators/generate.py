@@ -21,12 +21,14 @@ from typing import BinaryIO
 
 from data_pipelines.errors import DataError
 from data_pipelines.publishing.claims import Claim, claim
-from data_pipelines.publishing.marks import FINGERPRINT, is_complete
+from data_pipelines.publishing.marks import FINGERPRINT, is_complete, read_metadata, shard_lengths
 from data_pipelines.simulators.embodiments import select
 from data_pipelines.simulators.packages import gl_backend, package_versions, require_packages
+from data_pipelines.simulators.record import IMAGE_KEY
 from data_pipelines.simulators.spec import SimSpec
 from data_pipelines.simulators.worker import Job, record_path
 from data_pipelines.simulators.write import write_dataset
+from data_pipelines.sources.rlds.schema import read_features
 from data_pipelines.sources.rlds.writer import VERSION
 from hma_jax.config import ConfigError, require
 from hma_jax.runtime.locks import Held
@@ -47,6 +49,26 @@ def fingerprint(spec: SimSpec, episodes: int, size: int, seed: int) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: int) -> list[str] | None:
+    """How the dataset that is there was made otherwise; [] if by other versions of the packages or the generator alone;
+    None if it is as it should be, is not there, or lacks shards and is to be made in any case."""
+    if not directory.exists():
+        return None
+    metadata = read_metadata(directory)
+    made_as = metadata.get(FINGERPRINT)
+    if made_as is None:
+        return ["it says nothing of what it was made from"]
+    if made_as == fingerprint(spec, episodes, size, seed) or not is_complete(directory, made_as):
+        return None
+    there = {
+        "episodes": sum(shard_lengths(directory)),
+        "size": read_features(directory)[f"steps/observation/{IMAGE_KEY}"].shape[0],
+        "seed": metadata.get("seed"),
+    }
+    wanted = {"episodes": episodes, "size": size, "seed": seed}
+    return [f"{name}: {there[name]} -> {value}" for name, value in wanted.items() if there[name] != value]
+
+
 def generate_sim(
     root: str | Path,
     *,
@@ -60,7 +82,7 @@ def generate_sim(
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
     `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
-    is left as it is. Raises ConfigError for bad arguments, missing packages and a dataset that another
+    is left as it is; what is there otherwise is replaced (see `differences`). Raises ConfigError for bad arguments, missing packages and a dataset that another
     process is making, DataError when a simulator fails; the other datasets are then made all the same.
     """
     require(episodes >= 1, f"episodes must be at least 1, got {episodes}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from data_pipelines.simulators import generate
 from experiments.cli.main import main
 from tests.data_pipelines.simulators.fakes import fake_workers
 
@@ -29,6 +30,31 @@ def test_datasets_and_contact_sheets_are_written_and_named(tmp_path, monkeypatch
 
     assert main(["data", "sim-table", str(tmp_path)]) == 0
     assert "| `pusht` | gym-pusht | 2 | 10 | push script | 2 | 160 |" in capsys.readouterr().out
+
+
+def test_what_is_there_is_not_replaced(tmp_path, monkeypatch, capsys):
+    """Neither hours of simulation, by a smaller preset, nor somebody's recordings of a robot of that name."""
+    workers = fake_workers(monkeypatch)
+
+    def sim(*more: str) -> int:
+        workers.made.clear()
+        names = ["--names", "pusht", "--out", str(tmp_path)]
+        return main(["data", "sim", *names, *(more or ("--episodes", "3", "--size", "16"))])
+
+    assert sim() == 0
+    shards = {p: p.read_bytes() for p in (tmp_path / "pusht" / "1.0.0").iterdir()}
+    capsys.readouterr()
+    assert sim("--preset", "smoke", "--seed", "1") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "pusht/1.0.0: episodes: 3 -> 4; size: 16 -> 64; seed: 0 -> 1. Nothing was changed" in said
+    monkeypatch.setattr(generate, "GENERATOR", generate.GENERATOR + 1)
+    assert sim() == 0
+    assert "pusht in" in (said := capsys.readouterr().out) and "made by other versions of simulators" in said
+    assert not workers.made and shards == {p: p.read_bytes() for p in shards}
+
+    (tmp_path / "pusht" / "1.0.0" / "metadata.json").unlink()
+    assert sim() == 2
+    assert "it says nothing of what it was made from" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.parametrize(

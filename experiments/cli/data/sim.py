@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
 from experiments.progress import console, step
 from experiments.setting import command, command_words
+from experiments.words import few
 from experiments.wrote import wrote
+from hma_jax.config import require
+
+if TYPE_CHECKING:
+    from data_pipelines.simulators import SimSpec
 
 SimPreset = Literal["smoke", "full"]
 
@@ -57,7 +63,7 @@ def data_sim(
     """Simulate real robots' models (MuJoCo and others) and write them as RLDS directories.
 
     Needs the extra `sim`. Run the same command again after an interruption: only what is missing
-    is made, and the bytes are the same.
+    is made, and the bytes are the same. What is there with another number of episodes, size or seed is refused.
 
     Args:
         out: Directory to write: one dataset per embodiment, and contact sheets.
@@ -71,25 +77,23 @@ def data_sim(
     """
     from data_pipelines.simulators import generate_sim, select
     from data_pipelines.simulators.sheet import draw_sheet
+    from data_pipelines.sources.rlds.writer import VERSION
 
     chosen = PRESETS[preset]
     specs = select(tuple(names) or chosen.names)
-    with step(f"simulate {len(specs)} robots") as update:
+    episodes, size = chosen.episodes if episodes is None else episodes, chosen.size if size is None else size
+    wanted = _not_of_other_versions(out, specs, episodes, size, seed)
+    with step(f"simulate {len(wanted)} robots") as update:
 
         def report(name: str, done: int, total: int) -> None:
             update(done, total, name)
             if done and not console.is_terminal and (done == total or done % REPORT == 0):
                 console.print(f"{done} of {total} episodes, the last of {name}")
 
-        paths = generate_sim(
-            out,
-            names=[spec.name for spec in specs],
-            episodes=chosen.episodes if episodes is None else episodes,
-            size=chosen.size if size is None else size,
-            seed=seed,
-            workers=workers,
-            progress=report,
-        )
+        if wanted:
+            how = {"episodes": episodes, "size": size, "seed": seed}
+            generate_sim(out, names=wanted, **how, workers=workers, progress=report)
+    paths = [out / spec.name / VERSION for spec in specs]
     with step("draw contact sheets"):
         for path in paths:
             draw_sheet([path], path.parent / "contact.png", SHEET_EPISODES)
@@ -98,6 +102,32 @@ def data_sim(
     data = f"{command_words(out)}/*/{paths[0].name}" if everything else command_words(*paths)
     study = command("study", "--preset", chosen.study, "--out", "runs/sim")
     wrote(*paths, out / SHEET, then=f"{study} --data {data}")
+
+
+def _not_of_other_versions(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
+    """The robots to simulate: all whose dataset is not there, made by other versions of the packages, which is said.
+
+    Raises ConfigError, before anything is made, where one is there that was made with other settings, or by others.
+    """
+    from data_pipelines.simulators.generate import differences
+    from data_pipelines.sources.rlds.writer import VERSION
+
+    found = {s.name: differences(s, out / s.name / VERSION, episodes, size, seed) for s in specs}
+    lines = [f"{out / name / VERSION}: {'; '.join(how)}" for name, how in found.items() if how]
+    require(
+        not lines,
+        f"datasets are there that were made otherwise (there -> asked for): {few(lines)}. Nothing was changed. Choose "
+        "another --out, or give the settings that they were made with, or remove them to have them made again.",
+    )
+    kept = [name for name, how in found.items() if how is not None]
+    if kept:
+        console.print(
+            f"note: {few(kept)} in {out}: made by other versions of simulators, and still used; remove them to have them "
+            "made again",
+            markup=False,
+            soft_wrap=True,
+        )
+    return [name for name in found if name not in kept]
 
 
 def data_sim_table(directory: Positional[Path]) -> None:
