@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -164,10 +165,14 @@ class LeRobotDataset(EpisodeSource):
 
 
 class _Frames(Sequence[Fetched]):
-    """The frames of one camera, each read when it is asked for."""
+    """The frames of one camera, each read when it is asked for. A video is open from the first one on, as long as this
+    lives, so that frames near each other are decoded in one go. One thread at a time."""
 
     def __init__(self, source: LeRobotDataset, entry: EpisodeEntry, *place: Any):
         self._source, self._entry, self._place, self._length = source, entry, place, entry.length
+        self._fetch: Callable[[int], Fetched] | None = None
+        self._open = ExitStack()
+        weakref.finalize(self, self._open.close)
         self.nbytes = 0
         """What was read for the frames that were asked for: of a table whole groups of rows, of a video its pixels."""
 
@@ -176,8 +181,9 @@ class _Frames(Sequence[Fetched]):
 
     def __getitem__(self, n: int) -> Fetched:
         before = self._source._read.loaded
-        with ExitStack() as stack:
-            frame = self._source._fetch(stack, self._entry, *self._place)(n)
+        if self._fetch is None:
+            self._fetch = self._source._fetch(self._open, self._entry, *self._place)
+        frame = self._fetch(n)
         size = frame.nbytes if isinstance(frame, np.ndarray) else len(frame)
         self.nbytes += max(self._source._read.loaded - before, size)
         return frame

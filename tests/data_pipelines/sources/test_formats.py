@@ -8,6 +8,7 @@ import json
 import pickle
 import re
 import shutil
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -17,10 +18,12 @@ from data_pipelines.inspection.inspect import inspect_dataset
 from data_pipelines.inspection.suggest import suggest_entry
 from data_pipelines.loading.frames import make_frame_loader
 from data_pipelines.registry import DatasetSpec
+from data_pipelines.sources import lerobot_dataset
 from data_pipelines.sources.open import find_format, open_source, source_name
 from data_pipelines.sources.rlds import location
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.robomimic import RobomimicSource
+from data_pipelines.sources.video import open_video
 from data_pipelines.tokens.store import TokenStore
 from data_pipelines.tokens.tokenize_job import tokenize_dataset
 from hma_jax.config import ConfigError
@@ -68,6 +71,24 @@ def test_lerobot_is_read_where_it_lies(tmp_path, version, camera):
             DataError, match="机器人: a LeRobot dataset is called as its folder, which has none of a to z"
         ):
             read(tmp_path / "机器人")
+
+
+def test_frames_of_a_record_are_decoded_from_a_video_that_is_opened_once(tmp_path, monkeypatch):
+    opened, closed = [], []
+
+    @contextmanager
+    def counted(path):
+        opened.append(path)
+        with open_video(path) as video:
+            yield video
+        closed.append(path)
+
+    monkeypatch.setattr(lerobot_dataset, "open_video", counted)
+    dataset = open_source(write_lerobot(tmp_path / "toy", "v3.0"))
+    frames = dataset.record(1, ["steps/observation/top"])["steps/observation/top"]
+    assert [number(frames[t]) for t in (0, 3, 8, 2)] == [24, 27, 32, 26] and len(opened) == 1
+    del frames
+    assert len(closed) == 1
 
 
 def test_lerobot_actions_alone_can_be_sliced_and_be_none(tmp_path):
