@@ -16,12 +16,13 @@ from dataclasses import replace
 from experiments.program import run_sweep
 from experiments.study import Study
 from experiments.sweeps.sweep import CONTROL, Point, Sweep, control_of, reference_trial
+from experiments.words import few
 from hma_jax.config import require
 
 
 def plan(study: Study) -> Sweep:
     """All robots at every point, judged on all; the last point has all trajectories. Raises ConfigError without a cap
-    that takes some away."""
+    that takes some away, and where it is not known how many there are."""
     # A cap that takes some away would leave more if it were one higher.
     cutting = [cap for cap in study.designs.caps if count_episodes(study, cap) < count_episodes(study, cap + 1)]
     require(
@@ -56,15 +57,22 @@ def plan(study: Study) -> Sweep:
 
 
 def count_episodes(study: Study, cap: int | None) -> int:
-    """Training trajectories of all robots under a cap, as far as they are known: of the suite exactly; of others what
-    the registry says, which counts those that are held out."""
+    """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly; of others what
+    the registry says, which counts those that are held out. Raises ConfigError where it says nothing."""
     from data_pipelines.registry import get_spec
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count
 
     simulated = {e.name: episode_count(e, study.suite.scale, study.suite.fewest) for e in EMBODIMENTS}
-    there = [simulated.get(name) or get_spec(name).episodes or cap or 0 for name in study.dataset_names()]
-    return sum(n if cap is None else min(n, cap) for n in there)
+    there = {name: simulated.get(name) or get_spec(name).episodes for name in study.dataset_names()}
+    unknown = [name for name, n in there.items() if not n]
+    require(
+        not unknown,
+        f"the axis episodes counts trajectories, and nobody says how many there are of {few(unknown)}: write `episodes` into "
+        "the entries of your registry (`hma data inspect DIR --entry FILE` counts them), or leave the axis out",
+    )
+    most = study.trajectory_counts[-1]
+    return sum(min(n, most, cap or most) for n in there.values())
 
 
 if __name__ == "__main__":

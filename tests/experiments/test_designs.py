@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -141,6 +142,19 @@ def test_trajectories_are_counted_as_they_are():
     for cap in (4, 64, 10_000):
         assert count_episodes(CPU_FULL, cap) == sum(min(n, cap) for n in there)
     assert {p.x for p in points("episodes")} >= {160, sum(there)}
+
+
+def test_trajectories_that_nobody_counted_are_not_counted_as_none(monkeypatch):
+    """All of them stood at 0, before 4 of each; the change along the axis then had the wrong sign."""
+    counts = {"mine": 300, "yours": 40}
+    monkeypatch.setattr("data_pipelines.registry.get_spec", lambda name: SimpleNamespace(episodes=counts[name]))
+    study = replace(CPU_FULL, datasets=tuple(counts), dataset_counts=(1, 2), unseen=(), trajectory_counts=(4, 200))
+    found = sorted({p.x: p.trial.max_trajectories for p in find_axis("episodes")(study).points}.items())
+    # 256 takes none of the 200 that the reference has.
+    assert found == [(8, 4), (32, 16), (104, 64), (240, 200)]
+    counts["yours"] = 0
+    with pytest.raises(ConfigError, match="nobody says how many there are of yours: write `episodes` into"):
+        find_axis("episodes")(study)
 
 
 def test_few_shots_start_from_trials_of_other_axes():
