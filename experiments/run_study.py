@@ -27,6 +27,7 @@ from experiments.sweeps.registry import is_file, join_axes, keep_axes, plan_swee
 from experiments.sweeps.sweep import Sweep, all_judged, titles, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import diff, to_dict
+from hma_jax.runtime.files import write_file
 
 
 class TrialsFailed(Exception):
@@ -74,6 +75,8 @@ def run_study(
         trials = unique_trials(sweeps, provenance)
         require_agreement(workspace, shown, trials, sources, accept_code)
         kept = keep_axes(every, workspace.root)
+        if setting.asked.registry:  # some axes are planned with it
+            write_file(workspace.registry, setting.asked.registry.read_bytes())
         record = Record(study, setting.data, kept, whole_command(setting, kept), provenance)
         save_record(workspace, record)
         common = {"provenance": to_dict(provenance), "execution": to_dict(study.execution), "code": sources}

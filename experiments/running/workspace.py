@@ -120,6 +120,11 @@ class Workspace:
         return self.root / "fits.csv"
 
     @property
+    def registry(self) -> Path:
+        """The registry entries of the user's own that its axes were planned with; there is none without any."""
+        return self.root / "registry.toml"
+
+    @property
     def predictions(self) -> Path:
         """What was said of trials before they ran."""
         return self.root / "predictions"
@@ -200,7 +205,8 @@ def find_record(workspace: Workspace) -> Record | None:
 
 
 def load_record(workspace: Workspace) -> Record:
-    """Raises ConfigError if no study lives there, or one that does not say what its axes are."""
+    """The study that lives there, whose own registry entries are added to the registry for the rest of this process: its
+    axes are planned with them. Raises ConfigError if there is none, or one that does not say what its axes are."""
     record = find_record(workspace)
     if record is None:
         raise ConfigError(
@@ -208,4 +214,9 @@ def load_record(workspace: Workspace) -> Record:
             f"`{PROGRAM} study --out {shlex.quote(str(workspace.root))}`"
         )
     require(bool(record.axes), f"{workspace.record}: axes is empty; name those that it had, or run `{record.command}`")
+    if workspace.registry.exists():
+        from data_pipelines.registry import register
+        from data_pipelines.registry.toml_file import load_entries
+
+        register(load_entries(workspace.registry))
     return record

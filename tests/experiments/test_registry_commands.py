@@ -17,11 +17,16 @@ from data_pipelines.inspection.inspect import Shown
 from data_pipelines.registry import get_spec
 from data_pipelines.registry import table as registry_table
 from data_pipelines.registry.toml_file import to_toml
+from experiments import run_study
 from experiments.cli.main import main
 from experiments.contact_sheet import TILE, draw_sheet
-from experiments.setting import StudyArguments, find_directories, make_setting
+from experiments.running.launchers.registry import Launching
+from experiments.running.workspace import Workspace, load_record
+from experiments.setting import Setting, StudyArguments, find_directories, make_setting, use_entries
+from experiments.sweeps.registry import plan_sweeps
 from hma_jax.config import ConfigError
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
+from tests.experiments.fakes import PROVENANCE, STUDY
 
 
 @pytest.fixture(autouse=True)
@@ -258,3 +263,32 @@ def test_contact_sheet_shows_every_frame_where_it_says():
         assert (pixels == colour).all(axis=2).sum() == pytest.approx(4 * 112 * 80, rel=0.05)
     columns = [np.flatnonzero((pixels == c).all(axis=2).any(axis=0)).mean() for c in colours]
     assert columns == sorted(columns)
+
+
+def test_a_study_keeps_the_entries_that_its_axes_are_planned_with(tmp_path, monkeypatch):
+    """`hma report` and `hma fit` of such a study ended with: unknown dataset."""
+    entries = tmp_path / "my.toml"
+    specs = [replace(make_spec(name, (4,)), episodes=count) for name, count in (("mine", 9), ("yours", 30))]
+    entries.write_text("\n".join(map(to_toml, specs)))
+    for name in ("prepare", "require_judged", "require_same_windows"):
+        module = "pipeline" if name == "prepare" else "windows"
+        monkeypatch.setattr(f"experiments.preparing.{module}.{name}", lambda *_, **__: PROVENANCE)
+    for name in ("run_jobs", "draw", "require_results"):
+        monkeypatch.setattr(run_study, name, lambda *_, **__: {})
+    study = replace(
+        STUDY, datasets=("mine", "yours"), dataset_counts=(1, 2), trajectory_counts=(40,),
+        designs=replace(STUDY.designs, caps=(4, 16)),
+    )  # fmt: skip
+    asked = StudyArguments("smoke", tmp_path / "study", registry=entries, data=(tmp_path,))
+    use_entries(entries)
+    workspace = Workspace(tmp_path / "study")
+    workspace.root.mkdir()
+    run_study.run_study(
+        Setting(asked, study, ("somewhere",), workspace), ("episodes",), again="", launcher=Launching(),
+        retry_failed=False, accept_code=False, replace=None,
+    )  # fmt: skip
+    entries.unlink()
+    registry_table._registered.clear()
+    record = load_record(workspace)
+    (sweep,) = plan_sweeps(record.study, record.axes, workspace.root)
+    assert {p.x for p in sweep.points} == {8, 25, 39}
