@@ -39,8 +39,8 @@ SUCCESS_REWARD = 1.0
 ADVICE = "Fetch the file again, or leave the demonstration out with --skip-damaged (when tokenising, corrupt='skip')."
 
 
-DAMAGED = (KeyError, OSError, RuntimeError, TypeError, ValueError)
-"""What h5py raises of a damaged file."""
+DAMAGED = (AttributeError, KeyError, OSError, RuntimeError, TypeError, ValueError)
+"""What h5py raises of a damaged file; the first of a group where an array should be, or an array for a group."""
 
 
 class RobomimicSource:
@@ -163,8 +163,9 @@ class RobomimicSource:
         for key in sorted(obs):
             if np.dtype(obs[key].dtype).kind == "f" and obs[key].ndim <= 2:
                 vectors[f"observation/{key}"] = int(np.prod(obs[key].shape[1:]))
-        if "states" in demo and demo["states"].ndim == 2 and demo["states"].shape[1]:
-            vectors["observation/sim_state"] = int(demo["states"].shape[1])
+        states = demo.get("states")  # of other programs' files a group
+        if getattr(states, "ndim", 0) == 2 and states.shape[1]:
+            vectors["observation/sim_state"] = int(states.shape[1])
         images = {f"observation/{c}": image_field(None, None) for c in cameras}
         return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras
 

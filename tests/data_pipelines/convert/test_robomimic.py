@@ -64,8 +64,25 @@ def test_pictures_of_another_name_are_no_low_dimensional_file(tmp_path):
 
 
 def test_groups_beside_the_arrays_of_a_demonstration_are_left_out(tmp_path):
-    path = write_robomimic(tmp_path / "a.hdf5", change=lambda file: file["data/demo_9/obs"].create_group("extra"))
-    assert "observation/extra" not in RobomimicSource(path).layout.vectors
+    """As Isaac Lab writes them."""
+
+    def change(file):
+        file["data/demo_9/obs"].create_group("extra")
+        del file["data/demo_9/states"]
+        file["data/demo_9"].create_group("states")
+
+    source = RobomimicSource(write_robomimic(tmp_path / "a.hdf5", change=change))
+    assert not {"observation/extra", "observation/sim_state"} & source.layout.vectors.keys()
+    assert len(list(source.read(0))) == 1
+
+
+def test_a_group_in_the_place_of_an_array_is_damage(tmp_path):
+    def change(file):
+        del file["data/demo_9/actions"]
+        file["data/demo_9"].create_group("actions")
+
+    with pytest.raises(DataError, match="a.hdf5 is damaged .*Group.*Fetch the file again"):
+        RobomimicSource(write_robomimic(tmp_path / "a.hdf5", change=change))
 
 
 def test_success_without_rewards_is_by_done_and_otherwise_unknown():
