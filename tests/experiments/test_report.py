@@ -14,6 +14,7 @@ from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.findings import read_findings
+from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, count, save
 from experiments.report.robots import read_data, robots_of
@@ -269,6 +270,16 @@ def test_a_control_beside_one_of_several_curves_is_no_curve(drawn, base, tmp_pat
     optima = find_optima(rows, [several])
     assert {o.role for o in optima} == ({POINT} if base else set())
     assert "width 16" in describe(several, rows, optima, Along())
+
+
+@pytest.mark.parametrize("status", ["finished", "diverged"])
+def test_a_cross_of_a_curve_is_explained_where_there_is_one(status, drawn):
+    width = plan_width(STUDY)
+    several = replace(width, points=tuple(replace(p, series="one") for p in width.points))
+    rows = [replace(r, series="one", status=status if r.x == 8 else r.status) for r in rows_of(drawn, [width])]
+    assert any(r.x == 8 for r in rows)
+    caption = plot_family(rows, several).get_supxlabel()
+    assert ("cross: a seed diverged, the point is left out" in caption) == (status == "diverged")
 
 
 def test_variants_that_each_seed_judges_on_robots_of_its_own_are_said_to_be():
