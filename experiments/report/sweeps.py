@@ -215,8 +215,9 @@ def _optima(sweep: Sweep, optima: Sequence[Optimum]) -> str:
         + (
             f"<p><em>Steps moved</em>: of the grid of rates, from the best of the base {kind}. The penalty is what the "
             f"loss is higher by when a {kind} takes the rate that is best at the base {kind} (bold); that of the "
-            "held-out loss is in nats per token; where there are several seeds, both rates are chosen by the others and "
-            "judged on the one left out. Errors are over seeds; the grid is not interpolated. <em>As good</em>: rates that "
+            "held-out loss is in nats per token; where all rates of both curves have several seeds in "
+            "common, both are chosen by the others and judged on the one left out, elsewhere on those that chose them, which "
+            "makes it too large. Errors are over seeds; the grid is not interpolated. <em>As good</em>: rates that "
             "seeds do not tell from the best (95 %, paired). "
             "<em>Edge</em>: the best rate is the lowest or highest tried, so that the true optimum may lie "
             "beyond.</p>"
