@@ -89,6 +89,7 @@ LATER: dict[str, Any] = {
     "train.optimizer.matrices": "adamw",
     "train.masking.change_weight": 1.0,
     "train.masking.own_past_rounds": 1,
+    "train.masking.displaced_past": 0.0,
     "eval.lpips": False,
 }
 """Fields that came after trials were published, by their path (`train.masking.own_past`), with the value that all had

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -54,6 +55,9 @@ class MaskingConfig:
     # Rounds in which own_past is drawn, each after what the one before drew; a step passes over every frame once more
     # for each.
     own_past_rounds: int = 1
+    # With teacher forcing: the probability of each of a few rectangles of the past that show what stands elsewhere, for some
+    # frames (`objective.displaced`). DIFFERS: the release has nothing like it.
+    displaced_past: float = 0.0
     # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
     # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
     change_weight: float = 1.0
@@ -66,7 +70,7 @@ class MaskingConfig:
 
     def __post_init__(self):
         check_choices(self)
-        shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain", "own_past")
+        shares = ("non_mlm_ratio", "mask_angle_min", "min_ratio", "horizon_gain", "own_past", "displaced_past")
         for name in (*shares, "max_corrupt_rate", "clean_rate_min", "label_smoothing"):
             value = getattr(self, name)
             require(0.0 <= value <= 1.0, f"masking.{name} must lie in [0, 1], got {value}")
@@ -90,6 +94,10 @@ class MaskingConfig:
         require(
             self.teacher_forcing or not self.own_past,
             "masking.own_past replaces frames of the past that masking.teacher_forcing shows: set that too",
+        )
+        require(
+            self.teacher_forcing or not self.displaced_past,
+            "masking.displaced_past changes frames of the past that masking.teacher_forcing shows: set that too",
         )
         require(
             self.own_past > 0 or self.own_past_rounds == 1,
@@ -187,6 +195,10 @@ def check_objective(model: ModelConfig, masking: MaskingConfig) -> None:
     require(
         model.diffusion is None or masking.change_weight == 1,
         "train.masking.change_weight tells ids that changed; of continuous tokens all change",
+    )
+    require(
+        not masking.displaced_past or math.isqrt(model.tokens) ** 2 == model.tokens,
+        f"train.masking.displaced_past displaces rectangles of square frames, and {model.tokens} tokens are no square",
     )
 
 

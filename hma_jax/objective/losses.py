@@ -17,6 +17,7 @@ from hma_jax.model.beside import look_beside
 from hma_jax.model.frames import factorise
 from hma_jax.model.hma import HMA
 from hma_jax.objective.diffusion import diffusion_loss
+from hma_jax.objective.displaced import displace_patches
 from hma_jax.objective.masking import Masked
 from hma_jax.objective.own_past import draw_own_past
 from hma_jax.objective.process import make_process
@@ -98,8 +99,8 @@ def masked_loss(
     slice_B: jax.Array | None = None,
     real_BT: jax.Array | None = None,
 ) -> LossSums:
-    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise, or the past that
-    `masking.own_past` asks for; `slice_B` as for the model.
+    """The loss sums of one batch under `masking.setting`. `key_B` draws diffusion noise, and the past that
+    `masking.own_past` and `displaced_past` ask for; `slice_B` as for the model.
 
     `real_BT` (bool; None: all) is False for frames that only fill up a window, at its end. They have no targets
     (`masking`), and where attention is causal no real frame sees them; where it is not, they are hidden here.
@@ -113,6 +114,9 @@ def masked_loss(
         if masking.own_past:
             drawn = masking.own_past, masking.own_past_rounds, key_B, slice_B, masking.action_leak
             past = draw_own_past(model, past, actions_BTU, embodiment_B, hidden, *drawn)
+        if masking.displaced_past:
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, 3))(key_B)
+            past = displace_patches(past, masking.displaced_past, keys)
         inputs = past, masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
         out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)
     else:

@@ -1,0 +1,55 @@
+"""A past in which things are missing or out of place, for training: what a rollout lost is to be brought back.
+
+In a rollout an object that once came out as ground is gone from the past of all later frames. Recorded pasts never lack
+one, so that a model learns to go on without it. Here a rectangle of the past shows, for some frames on end, what stands
+elsewhere in the same frame: ground in place of an object, or an object where none is. The true frames that follow are
+still the targets.
+"""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+PATCHES = 3
+"""Rectangles of an example."""
+
+LARGEST = 0.5
+"""Greatest side of a rectangle, as a share of the frame's."""
+
+
+def displace_patches(past: jax.Array, share: float, key_B: jax.Array) -> jax.Array:
+    """Tokens `past` [B, T - 1, S] or [B, T - 1, S, C] of square frames; each of `PATCHES` rectangles of an example is
+    displaced with probability `share`. Its sides, place and frames are uniform, and so is how far off it takes its
+    tokens from, around the frame's edges."""
+    frames, tokens = past.shape[1:3]
+    side = math.isqrt(tokens)
+    y_S, x_S = jnp.divmod(jnp.arange(tokens), side)
+
+    def sources(key: jax.Array) -> jax.Array:
+        """int [T - 1, S]: the place that each token is taken from."""
+        u_P = jax.random.uniform(key, (9, PATCHES, 1))  # PATCHES first, then what each of them covers
+        chosen, first, last, high, wide, top, left, down, right = u_P
+        begin = jnp.floor(first * frames)
+        end = begin + 1 + jnp.floor(last * (frames - begin))
+        frame_T = jnp.arange(frames)
+        within_PT = (chosen < share) & (frame_T >= begin) & (frame_T < end)
+        within_PS = _within(y_S, side, high, top) & _within(x_S, side, wide, left)
+        y_PS = (y_S + jnp.floor(down * side).astype(int)) % side
+        x_PS = (x_S + jnp.floor(right * side).astype(int)) % side
+        within_PTS = within_PT[:, :, None] & within_PS[:, None]
+        own = jnp.broadcast_to(jnp.arange(tokens), (frames, tokens))
+        # Where rectangles overlap, the first one is seen.
+        return jnp.select(list(within_PTS), list(jnp.expand_dims(y_PS * side + x_PS, 1)), own)
+
+    source_BTS = jax.vmap(sources)(key_B)
+    return jnp.take_along_axis(past, source_BTS.reshape(*source_BTS.shape, *(1,) * (past.ndim - 3)), axis=2)
+
+
+def _within(place_S: jax.Array, side: int, u_length: jax.Array, u_start: jax.Array) -> jax.Array:
+    """bool [..., S]: inside a stretch of up to `LARGEST` of the side, wherever it fits."""
+    length = 1 + jnp.floor(u_length * int(LARGEST * side))
+    start = jnp.floor(u_start * (side - length + 1))
+    return (place_S >= start) & (place_S < start + length)
