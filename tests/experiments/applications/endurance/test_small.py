@@ -91,6 +91,44 @@ def test_half_the_bits_keep_no_more_objects():
     assert said.format(*found) in page
 
 
+def test_a_displaced_past_keeps_objects_for_a_minute_where_tokens_are_drawn():
+    page = words_of(SMALL)
+    beside, before = partial(gains, "displaced", beside="resumed"), partial(gains, "displaced", beside="weighed")
+    (more, half), (less, off) = beside("object_found"), beside("psnr")
+    assert more > half and less < -off
+    assert f"found in {more:.2f} ± {half:.2f} more of the frames than with" in page
+    assert 'in {:.2f} ± {:.2f} more than with "weighed"'.format(*before("object_found")) in page
+    places = *beside("object_close"), *before("object_close")
+    assert "In place they are {:.2f} ± {:.2f} and {:.2f} ± {:.2f} more.".format(*places) in page
+    assert f'PSNR is {-less:.1f} ± {off:.1f} dB lower than with "resumed"' in page
+    assert '{:+.1f} ± {:.1f} dB beside "weighed"'.format(*before("psnr")) in page
+    tools = *beside("tool_found"), *beside("follows")
+    assert '(found {:.2f} ± {:.2f}, follows {:.2f} ± {:.2f} beside "resumed")'.format(*tools) in page
+    likeliest, resumed = (by_place(f"{name}_likeliest.csv") for name in ("displaced", "resumed"))
+    assert len(likeliest) == 8 * 4 * 3 and likeliest.keys() == resumed.keys()
+    later = [(row, resumed[place]) for place, row in likeliest.items() if row["part"] > 1]
+    assert "nothing is gained, {:.2f} ± {:.2f}:".format(*gain("object_found", later)) in page
+    back = [
+        over_robots([r for r in read_rows(RESULTS / f"{name}_hidden.csv") if r["kind"] == "hidden"], "found")[0]
+        for name in ("displaced", "resumed")
+    ]
+    assert f"hidden comes back in {100 * back[0]:.0f} % of the cases" in page
+    assert f'with "resumed" in {100 * back[1]:.0f} (' in page
+    weighed, ten = by_place("endurance.csv"), by_place("displaced_ten.csv")
+    assert len(weighed) == 8 * 10 and weighed.keys() == ten.keys()
+
+    def found(minute: int, of: dict) -> str:
+        rows = [row for row in of.values() if row["part"] == minute]
+        return f"{100 * over_robots(rows, 'object_found')[0]:.0f}"
+
+    said = 'found in {} % of the frames of the first minute ("weighed": {}), {} of the second ({}), {} of the last ({})'
+    assert said.format(*(found(minute, of) for minute in (1, 2, 10) for of in (ten, weighed))) in page
+    later = [(row, weighed[place]) for place, row in ten.items() if row["part"] > 1]
+    assert "the gain is {:.2f} ± {:.2f}, one".format(*gain("object_found", later)) in page
+    kept = [[of[robot, 0, 4]["object_found"] for of in (ten, weighed)] for robot in ("pusher_sand", "omni_chalk")]
+    assert kept[0][0] > 0.95 and kept[1][0] < 0.05 < 0.95 < kept[1][1]
+
+
 def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
     page = words_of(SMALL)
     served, ten = by_place("endurance.csv"), by_place("mended_ten.csv")
