@@ -139,8 +139,9 @@ def inspect_dataset(
     """Facts of one split, some of its episodes to look at, and what tells duplicates.
 
     `episodes` drawn by hash are read, fewer if they come to more than `max_bytes`; `frames` of
-    each camera are decoded in the first `shown`, two in the others. Fields of numbers count as actions if they are called
-    so, or if an entry takes them as its `action_keys`. Damaged records are counted and left out. Raises DataError for a directory that is no dataset or has no readable episode,
+    each camera are decoded in the first `shown`, two in the others. Fields of numbers count as actions
+    if they are called so, or if an entry takes them as its `action_keys`. Damaged records are counted
+    and left out. Raises DataError for a directory that is no dataset or has no readable episode,
     ConfigError for an unknown split.
     """
     require(episodes >= 1 and frames >= 2, f"episodes {episodes} or frames {frames} leave nothing to look at")

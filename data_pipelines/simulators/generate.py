@@ -82,8 +82,9 @@ def generate_sim(
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
     `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
-    is left as it is; what is there otherwise is replaced (see `differences`). Raises ConfigError for bad arguments, missing packages and a dataset that another
-    process is making, DataError when a simulator fails; the other datasets are then made all the same.
+    is left as it is; what is there otherwise is replaced (see `differences`). Raises ConfigError for
+    bad arguments, missing packages and a dataset that another process is making, DataError when a
+    simulator fails; the other datasets are then made all the same.
     """
     require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
     require(16 <= size <= 1024, f"the frame size must lie in 16..1024, got {size}")
