@@ -108,6 +108,38 @@ def test_robots_that_lose_their_heading_steer_to_the_end_as_the_page_says():
     assert f'"follows" wanders from {min(follows):.2f} to {max(follows):.2f}' in page
 
 
+def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
+    page = words_of(PAGE)
+    ten, grown = by_place("kept_ten.csv"), by_place("grown_ten.csv")
+    assert len(ten) == 8 * 10 and ten.keys() == grown.keys()
+
+    def found(minute: int, of: dict) -> str:
+        rows = [row for row in of.values() if row["part"] == minute]
+        return f"{100 * over_robots(rows, 'object_found')[0]:.0f}"
+
+    kept, before = ([found(minute, of) for minute in (1, 2, 10)] for of in (ten, grown))
+    said = "in {} % of the frames of the first minute, in {} % of those of the second and in {} % of the last, where"
+    assert said.format(*kept) in page and '"grown" has {}, {} and {}.'.format(*before) in page
+    assert f"in {kept[2]} % by a model that was trained on a displaced past" in page
+    assert f"{kept[2]} % in simulator_kept" in words_of(ROOT / "README.md")
+    last, later = ([(row, grown[k]) for k, row in ten.items() if k[2] >= first] for first in (10, 2))
+    more, half = gain("object_found", last)
+    assert more > half
+    said = "that is {:.2f} ± {:.2f} more, from the second on {:.2f} ± {:.2f}:"
+    assert said.format(more, half, *gain("object_found", later)) in page
+    lost = [robot for (robot, _, minute), row in ten.items() if minute == 10 and row["object_found"] < 0.1]
+    assert lost == ["arm_sand"]
+    objects, tools, psnr = (gain(measure, later) for measure in ("object_close", "tool_close", "psnr"))
+    said = "in place are {:.2f} ± {:.2f} fewer over the ten minutes, tools {:.2f} ± {:.2f} fewer, PSNR is {:.1f} ± {:.1f} dB"
+    assert said.format(-objects[0], objects[1], -tools[0], tools[1], -psnr[0], psnr[1]) in page
+
+    minute, drawn = gains("kept", "object_found", "grown"), gains("drawn", "object_found", "grown")
+    assert "objects are found in {:.2f} ± {:.2f} more of the frames than with".format(*minute) in page
+    assert '"drawn" finds {:.2f} ± {:.2f} more, and'.format(*drawn) in page
+    said = "training gains {:.2f} ± {:.2f}, which eight robots do not decide"
+    assert said.format(*gains("kept", "object_found", "drawn")) in page
+
+
 def test_size_and_data_keep_objects():
     page = words_of(PAGE)
     larger, grown = (
