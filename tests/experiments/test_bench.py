@@ -137,6 +137,7 @@ def test_the_command_times_frames_every_way_and_the_report_reads_its_record(tmp_
     assert figure.stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_a_tokenizer_is_timed_both_ways(tmp_path: Path, capsys):
     assert main(["tokenizer", "pixels", "--out", str(tmp_path / "tok"), "--image-size", "16", "--patch", "4"]) == 0
     options = ["--tokenizer", str(tmp_path / "tok"), "--repeats", "1", "--out", str(tmp_path)]
@@ -213,6 +214,7 @@ def test_a_trained_model_is_judged_under_every_decoding(tmp_path: Path):
     assert main(["bench", "quality", str(tmp_path / "model"), *where, "--frames", "3"]) == 2
 
 
+@pytest.mark.slow
 def test_loading_is_timed_with_its_memory(tmp_path: Path):
     options = ["--data", str(REAL_DATA), "--windows", "640", "--frames", "4", "--out", str(tmp_path)]
     assert main(["bench", "load", *options]) == 0

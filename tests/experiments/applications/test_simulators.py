@@ -99,6 +99,7 @@ def test_true_and_learned_are_exchanged_by_one_word(run):
     assert seen["learned"] == seen["true"]
 
 
+@pytest.mark.slow
 def test_a_simulator_is_timed_as_its_users_step_it(run, tmp_path, capsys):
     assert main(["bench", "simulate", str(run), "--batch", "2", "--repeats", "3", "--out", str(tmp_path)]) == 0
     (file,) = tmp_path.glob("simulate-*.json")
