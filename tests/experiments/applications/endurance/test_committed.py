@@ -133,6 +133,17 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
     said = "in place are {:.2f} ± {:.2f} fewer over the ten minutes, tools {:.2f} ± {:.2f} fewer, PSNR is {:.1f} ± {:.1f} dB"
     assert said.format(-objects[0], objects[1], -tools[0], tools[1], -psnr[0], psnr[1]) in page
 
+    five = by_place("drawn_five.csv")
+    assert len(five) == 8 * 5 and five.keys() <= ten.keys()
+    watched = [place for place in five if place[2] > 1]
+    shares = [100 * over_robots([of[k] for k in watched], "object_found")[0] for of in (five, ten, grown)]
+    said = 'in {:.0f} % of the frames from the second minute to the fifth, "kept" in {:.0f} and "grown" in {:.0f} %:'
+    assert said.format(*shares) in page
+    drawing = gain("object_found", [(five[k], grown[k]) for k in watched])
+    training = [gain(measure, [(ten[k], five[k]) for k in watched]) for measure in ("object_found", "psnr")]
+    said = "{:+.2f} ± {:.2f} for the temperature, {:+.2f} ± {:.2f} for training (PSNR {:+.1f} ± {:.1f} dB)"
+    assert said.format(*drawing, *training[0], *training[1]) in page
+
     minute, drawn = gains("kept", "object_found", "grown"), gains("drawn", "object_found", "grown")
     assert "objects are found in {:.2f} ± {:.2f} more of the frames than with".format(*minute) in page
     assert '"drawn" finds {:.2f} ± {:.2f} more, and'.format(*drawn) in page
