@@ -115,7 +115,8 @@ def masked_loss(
             drawn = masking.own_past, masking.own_past_rounds, key_B, slice_B, masking.action_leak
             past = draw_own_past(model, past, actions_BTU, embodiment_B, hidden, *drawn)
         if masking.displaced_past:
-            keys = jax.vmap(lambda key: jax.random.fold_in(key, 3))(key_B)
+            # Not the key of a round of `own_past`, nor of a repeat of the diffusion loss.
+            keys = jax.vmap(lambda key: jax.random.fold_in(key, 2**31 - 1))(key_B)
             past = displace_patches(past, masking.displaced_past, keys)
         inputs = past, masked.inputs[:, SAID_FROM:], masked.masked[:, SAID_FROM:]
         out = look_beside(model, *inputs, actions_BTU, embodiment_B, hidden, **options)

@@ -82,7 +82,7 @@ def data_sim(
     chosen = PRESETS[preset]
     specs = select(tuple(names) or chosen.names)
     episodes, size = chosen.episodes if episodes is None else episodes, chosen.size if size is None else size
-    wanted = _not_of_other_versions(out, specs, episodes, size, seed)
+    wanted = _to_simulate(out, specs, episodes, size, seed)
     with step(f"simulate {len(wanted)} robots") as update:
 
         def report(name: str, done: int, total: int) -> None:
@@ -104,7 +104,7 @@ def data_sim(
     wrote(*paths, out / SHEET, then=f"{study} --data {data}")
 
 
-def _not_of_other_versions(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
+def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
     """The robots to simulate: all whose dataset is not there, made by other versions of the packages, which is said.
 
     Raises ConfigError, before anything is made, where one is there that was made with other settings, or by others.
