@@ -458,6 +458,7 @@ def test_evaluation_of_a_converted_model_on_what_does_not_fit_it(changes, robot,
     assert why in message and f"; prepare a study with {advice}" in message and "trained in" not in message
 
 
+@pytest.mark.slow
 def test_evaluation_in_a_study_without_some_of_its_datasets_says_which(study, tmp_path, capsys):
     option, arm, base = study[1]
     other = prepared_otherwise(study, tmp_path, data=(option, arm))

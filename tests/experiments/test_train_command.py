@@ -241,7 +241,8 @@ def test_a_run_begins_with_the_weights_of_another(train, tmp_path, capsys, where
     assert main(new) != 0 and f"no checkpoints at {source}" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["train", pytest.param("adapt", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ["train", "adapt"])
 def test_a_run_goes_on_though_the_one_that_it_began_with_has_trained_on(command, tmp_path, capsys):
     source, run = tmp_path / "a" / "model", tmp_path / "b" / "model"
     damaged = run / "checkpoints" / "3"

@@ -166,6 +166,7 @@ def test_metrics_skip_padding(context, setting):
             assert (column[short] != whole[name][short]).all(), name
 
 
+@pytest.mark.slow
 def test_a_short_window_is_judged_as_the_host_would():
     """Of window 1, three frames long, one frame is predicted: mean, last and copy are of that one."""
     (batch,) = make_batches(MODEL, names=("arm",), each=4)

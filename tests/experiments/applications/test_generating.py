@@ -172,6 +172,7 @@ def test_what_cannot_be_replayed_is_refused(run, recorded, tmp_path):
         open_trajectories(str(recorded), "val", None, {gripper.name: gripper}, tokenizer, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_run_outside_a_study_begins_with_the_recordings_it_is_given(recorded, tmp_path, capsys):
     """As one that was converted: there are neither starts beside it nor held-out frames of its robot."""
     mine = EmbodimentTable((replace(TABLE.entries[0], name="my_robot"),))

@@ -121,6 +121,7 @@ def made_where_it_was_stopped(lessons, simulator, out: Path, monkeypatch) -> dic
     return data
 
 
+@pytest.mark.slow
 def test_without_a_simulator_policies_are_judged_on_held_out_recordings(recordings, tmp_path, monkeypatch):
     encoder = EncoderConfig(size=8, channels=(4, 4, 4), hidden=8)
     monkeypatch.setattr(synthetic, "BcConfig", partial(BcConfig, encoder=encoder))

@@ -192,6 +192,7 @@ def test_the_program_generates_the_same_frames_where_this_project_is_not_install
         np.testing.assert_array_equal(got, want)
 
 
+@pytest.mark.slow
 def test_a_program_shows_no_action_that_its_model_was_trained_without():
     """Stem and modulation of such a robot are as they were drawn: noise to every frame."""
     config, silent = shallow_config(frames=3), Embodiment("film", 0, 1, (), ())

@@ -178,6 +178,7 @@ def test_each_episode_of_a_vector_may_have_its_own_seed():
         env.step(low[:2])
 
 
+@pytest.mark.slow
 def test_a_part_of_a_vector_begins_anew_where_a_mask_says_so():
     env, mask = vector(max_episode_steps=3), np.array([False, True, False])
     env.reset(seed=0)

@@ -104,6 +104,7 @@ def test_a_waiting_episode_stays_and_another_s_actions_do_not_reach_it():
     assert sim.counts == (10, 3)
 
 
+@pytest.mark.slow
 def test_beginning_and_going_back_cost_what_they_are_of_and_come_to_the_same(monkeypatch):
     """Of four episodes one, then three: a power of two is computed, and the others stay where they are."""
     starts, asked, computed = [start(b % 3, b + 1) for b in range(4)], ([2], [1, 3, 0], []), []
