@@ -98,7 +98,7 @@ def plain_number(value: float) -> str:
 def count(n: float) -> str:
     """1234567 -> '1.2M'."""
     for unit, size in (("E", 1e18), ("P", 1e15), ("T", 1e12), ("G", 1e9), ("M", 1e6), ("k", 1e3)):
-        if n >= size:
+        if n >= 0.9995 * size and n >= 1000:  # what rounds to a thousand of a unit is one of the next
             return f"{n / size:.3g}{unit}" if n / size >= 100 or n % size == 0 else f"{n / size:.1f}{unit}"
     return f"{n:g}"
 

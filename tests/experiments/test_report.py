@@ -181,6 +181,14 @@ def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
         assert [t.get_text().split("\n")[1] for t in panel.get_xticklabels() if t.get_text()] == trunks
 
 
+@pytest.mark.parametrize(
+    ("n", "words"), [(999.6, "999.6"), (999_499, "999k"), (999_600, "1.0M"), (999_999_999, "1.0G"), (1_234_567, "1.2M")]
+)
+def test_a_count_that_rounds_to_a_thousand_of_a_unit_is_one_of_the_next(n, words):
+    """It was 1e+03k."""
+    assert count(n) == words
+
+
 @pytest.mark.parametrize("span", [1.5, 3, 5, 15, 50, 250, 400, 900, 2e3, 1e6])
 @pytest.mark.parametrize("low", [0.011, 1.04, 105, 7e4])
 def test_an_axis_has_at_least_three_ticks(low, span):
