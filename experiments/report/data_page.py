@@ -121,6 +121,10 @@ def _dataset(i: int, d: Viewed, frames: int) -> list[str]:
     remarks = [f"<p class={r.kind}><b>{html.escape(r.title)}</b>: {html.escape(r.text)}.</p>" for r in d.remarks] or [
         "<p class=fine>Nothing stands out.</p>"
     ]
+    if f.sampled < f.episodes:
+        remarks.append(
+            "<p class=fine>Recordings that occur twice are found among the episodes that were read alone.</p>"
+        )
     return [
         f'<section id="d{i}"><h2>{html.escape(f.name)}</h2><p class=meta>{html.escape(where)}</p>{"".join(remarks)}',
         _read_as(d),

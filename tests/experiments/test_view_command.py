@@ -180,6 +180,19 @@ def test_the_same_page_twice_is_the_same_bytes(toy, tmp_path):
     assert pages[0] == pages[1]
 
 
+def test_what_was_not_read_is_not_said_to_be_free_of_duplicates(toy, tmp_path, capsys):
+    directory, entries = toy
+    out, said = tmp_path / "page.html", {}
+    for episodes in ("3", "4"):
+        options = ("--registry", str(entries), "--out", str(out), "--episodes", episodes, "--shown", "3")
+        assert main(["data", "view", str(directory), *options]) == 0
+        said[episodes] = capsys.readouterr().out, out.read_text()
+    terminal, page = said["3"]
+    assert "toy: 3 of 4 episodes were read (--episodes); recordings that occur twice are found among these" in terminal
+    assert "Recordings that occur twice are found among the episodes that were read alone." in page
+    assert not any("occur twice" in text for text in said["4"])
+
+
 @pytest.mark.parametrize("same", [False, True])
 def test_splits_that_are_read_together_are_two_splits_none_of_which_is_another(same, toy, tmp_path, capsys):
     """An entry with split = "train+val": its episodes are not those of train again, but one may lie in both."""

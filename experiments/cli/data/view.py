@@ -49,7 +49,8 @@ def view(
         hz: Native rate of the frames, where neither a file nor the registry says it, or is wrong.
         stride: Native frames per frame of the model; what comes nearest to 2 Hz if not given.
         frames: Frames of the model's window, to count windows.
-        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB.
+        episodes: Read so many episodes, drawn at random; fewer if they come to more than 2 GB. Recordings that occur
+            twice are found among these alone.
         shown: Episodes to show.
         registry: TOML file with entries of your own.
     """
@@ -130,6 +131,13 @@ def _say_remarks(viewed: Viewed) -> None:
     for remark in viewed.remarks:
         title = f"[{colours[remark.kind]}]{remark.title}[/]"
         console.print(f"[bold]{name}[/]: {title}: {escape(remark.text)}", soft_wrap=True)
+    f = viewed.facts
+    if f.sampled < f.episodes:
+        console.print(
+            f"note: {name}: {f.sampled:,} of {f.episodes:,} episodes were read (--episodes); recordings that occur twice "
+            "are found among these alone",
+            soft_wrap=True,
+        )
 
 
 def _say_next(viewed: Sequence[Viewed], frames: int, registry: Path | None) -> None:
