@@ -10,7 +10,7 @@ The world model gets action heads and is post-trained, all of it, to say what an
 policy). The others are trained on the same episodes. All begin at the same starts, which no recording has.
 
 Writes to OUT: trials.csv, a row per policy and start; summary.csv and table.md, success with intervals over starts;
-run, the post-trained model, which `hma judge` takes.
+run, the post-trained model, and its tokenizer: a policy, and no simulator any more.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from experiments.applications.policies.network import require_multiples
 from experiments.applications.policies.own_head import OwnHeadPolicy
 from experiments.applications.policies.policy import Policy, RandomPolicy
 from experiments.applications.policies.tasks import Task, find_task
-from experiments.applications.simulators import load_simulator, save_beside
+from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
 from experiments.progress import step
@@ -53,8 +53,10 @@ from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, Optimize
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Params, path_name
 from hma_jax.runtime.files import write_file
+from hma_jax.simulator.folder import TOKENIZER
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
+from hma_jax.tokenizers.io import save_tokenizer
 from hma_jax.training.runs import Model, load_model
 from hma_jax.training.train import train_model
 
@@ -123,7 +125,7 @@ def with_heads(model: Model, seed: int) -> tuple[Params, ModelConfig]:
 def post_train(
     simulator: Simulator, robot: Robot, demos: Demonstrations, settings: Settings, run: Path, report: Report
 ) -> Model:
-    """The world model as a policy, trained or trained on in `run`, which is then a simulator as the first model is."""
+    """The world model as a policy, trained or trained on in `run`, with its tokenizer beside it."""
     model, tokenizer = simulator.model, simulator.tokenizer
     flat = demos.images.reshape(-1, *demos.images.shape[2:])
     tokens = np.concatenate([np.asarray(tokenizer.encode(flat[i : i + 256])) for i in range(0, len(flat), 256)])
@@ -141,7 +143,7 @@ def post_train(
         provenance={"data": f"demonstrations of {settings.robot}, {settings.task}", "tokenizer": tokenizer.identity},
         progress=lambda done, total, values: report(done, total, ""),
     )  # fmt: skip
-    save_beside(simulator, run, simulator.decode)
+    save_tokenizer(tokenizer, run / TOKENIZER)
     return load_model(run, execution)
 
 

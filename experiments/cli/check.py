@@ -37,13 +37,15 @@ def check(
     from experiments.applications.check import check_run, choose_robots, open_study, verdict, write_effects
     from experiments.cli.evaluate import check_fits, say_what_it_may_have_seen
     from hma_jax.simulator.folder import find_robots
-    from hma_jax.training.runs import load_model
+    from hma_jax.training.runs import load_model, require_frames
 
     require_local("--out", out)
     require(windows >= 2, f"--windows must be at least 2, got {windows}")
     workspace = Workspace(out) if out else Workspace.of_run(run)
     with step(f"check {run}"):
-        model, materials = load_model(run), open_study(workspace)
+        model = load_model(run)
+        require_frames(model.run, "judge")
+        materials = open_study(workspace)
         check_fits(model.run, materials)
         chosen, left_out = choose_robots(run, model, materials, robots, windows, workspace.root)
         for why in left_out.values():

@@ -12,6 +12,7 @@ from hma_jax.config.model import ModelConfig
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
 """What is hidden in training, and so predicted (paper section 3.1)."""
 
+PREDICT_FRAMES: tuple[Setting, ...] = ("forward", "passive", "full")
 PREDICT_ACTIONS: tuple[Setting, ...] = ("full", "policy", "inverse")
 
 ActionLeak = Literal["none", "conditioning", "all"]
@@ -106,7 +107,7 @@ class MaskingConfig:
 
     @property
     def predicts_frames(self) -> bool:
-        return self.setting in ("forward", "passive", "full")
+        return self.setting in PREDICT_FRAMES
 
     @property
     def predicts_actions(self) -> bool:

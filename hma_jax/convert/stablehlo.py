@@ -29,7 +29,7 @@ from hma_jax.generation import rollout
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.masking import never_shown
-from hma_jax.training.runs import Run
+from hma_jax.training.runs import Run, require_frames
 
 FORMAT, VERSION = "hma-jax-stablehlo", 1
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -95,12 +95,8 @@ def input_shapes(model: ModelConfig, table: EmbodimentTable, config: ProgramConf
 
 def write_stablehlo(run: Run, directory: Path, config: ProgramConfig) -> None:
     """Raises ConfigError if `directory` exists, the model predicts no frames or they do not fit its window."""
+    require_frames(run, "generate")
     model, table, masking = run.model, run.table, run.train.masking
-    require(
-        masking.predicts_frames,
-        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are none to "
-        "generate",
-    )
     require(
         config.frames <= model.frames,
         f"{config.frames} frames do not fit the model's window of {model.frames}",

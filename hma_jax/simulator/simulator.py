@@ -25,7 +25,7 @@ from hma_jax.simulator.programs import Beginning, Programs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 from hma_jax.tokenizers.shared import BaseTokenizer
-from hma_jax.training.runs import Model, load_model
+from hma_jax.training.runs import Model, load_model, require_frames
 
 Rate = Literal["model", "native"]
 """Whether a step is a frame of the model, or one native action: then a frame comes with every stride-th."""
@@ -63,6 +63,7 @@ class Simulator:
         """`robots` describe commands better than the model's table does. Actions `outside` their range are clipped
         (`clipped` says which, and the log once) or refused."""
         config = model.config
+        require_frames(model.run, "show")
         require(episodes >= 1, f"a simulator has at least 1 episode, got {episodes}")
         require_choice(outside, get_args(Outside), "outside")
         require_choice(rate, get_args(Rate), "rate")
@@ -94,7 +95,7 @@ class Simulator:
     ) -> Simulator:
         """Of a training run, with what lies beside it (`folder`); `options` are the constructor's.
 
-        Raises ConfigError where there is no run, or not the tokenizer that it was trained with.
+        Raises ConfigError where there is no run, one that predicts no frames, or not the tokenizer that it was trained with.
         """
         run = Path(run)
         model = load_model(run, execution, weights)

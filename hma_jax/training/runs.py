@@ -11,6 +11,7 @@ import jax
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, Weights, require
 from hma_jax.config.execution import FORMER_FIELDS
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.config.training import PREDICT_FRAMES
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params, inference_params
@@ -83,6 +84,17 @@ def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[
         values = {key: value for key, value in described[name].items() if key not in former}
         today[name] = to_dict(from_dict(kind, values, f"{where}: {name}"))
     return today
+
+
+def require_frames(run: Run, deed: str) -> None:
+    """Raises ConfigError for a policy and for inverse dynamics, whose frames nothing was learnt of: there are none to
+    `deed`."""
+    setting = run.train.masking.setting
+    require(
+        setting in PREDICT_FRAMES,
+        f"the model was trained with train.masking.setting {setting!r}, which predicts no frames: there are none to {deed}. "
+        f"`hma evaluate` judges its actions; for this take a model that was trained with one of {', '.join(PREDICT_FRAMES)}",
+    )
 
 
 def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:

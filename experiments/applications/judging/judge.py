@@ -38,6 +38,7 @@ from experiments.running.workspace import Workspace
 from experiments.words import few
 from hma_jax.config import require
 from hma_jax.config.json import to_dict
+from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.runtime.files import write_file
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.simulator import Simulator
@@ -101,8 +102,13 @@ def judge_recorded(
 
 def _require_some(simulator: Simulator, given: bool | int) -> None:
     """Raises ConfigError where neither are policies given nor is the model one."""
-    some = given or simulator.model.config.action_heads
+    some = given or _acts(simulator)
     require(bool(some), "there is no policy to judge but the random one: give --policies FILE")
+
+
+def _acts(simulator: Simulator) -> bool:
+    """Whether the model itself is a policy: heads alone do not make it one, which know nothing until actions are trained."""
+    return predicts_actions(simulator.model.config, simulator.model.run.train.masking.setting)
 
 
 def _of_episodes(simulator: Simulator, episodes: int) -> Simulator:
@@ -122,7 +128,7 @@ def _judge(
     counted: Sequence[str] = (),
 ) -> Judged:
     config = outside.config
-    policies = names(config.ladder) + [OWN_HEAD] * simulator.model.config.action_heads  # may refuse the ladder
+    policies = names(config.ladder) + [OWN_HEAD] * _acts(simulator)  # may refuse the ladder
     users, success, about = {}, None, outside.about()
     if own is not None:
         users, success = load_own(own, robot)

@@ -1,7 +1,7 @@
 """HMA itself as a policy: its action head reads the next chunk off the frames it sees, as long as one likes.
 
-Past the model's window the oldest frame and its action are forgotten. Needs a run with `model.action_heads`; the model
-of this repository was trained without (`experiments.applications.own_policy` adds them).
+Past the model's window the oldest frame and its action are forgotten. Needs a run that was trained to
+predict actions; the models of this repository were not (`experiments.applications.own_policy` trains one on).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 
 from experiments.applications.policies.policy import Counts
 from hma_jax.config import DecodeConfig, require
+from hma_jax.evaluation.protocol import predicts_actions
 from hma_jax.generation import predict_next_actions
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.shared import BaseTokenizer
@@ -24,9 +25,11 @@ class OwnHeadPolicy:
 
     def __init__(self, model: Model, tokenizer: BaseTokenizer, robot: Robot, decode: DecodeConfig | None = None):
         """Raises ConfigError for a model that predicts no actions."""
+        setting = model.run.train.masking.setting
         require(
-            model.config.action_heads,
-            "the model has no action heads, so it is no policy; train one with model.action_heads=true",
+            predicts_actions(model.config, setting) and setting != "inverse",
+            f"the model was trained with train.masking.setting {setting!r}, so it is no policy; train one with policy or full "
+            "and model.action_heads=true",
         )
         self.tokenizer, self.robot, self.frames = tokenizer, robot, model.config.frames
         self.width = model.table.action_width

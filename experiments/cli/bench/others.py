@@ -41,16 +41,11 @@ def quality(
     from experiments.cli.evaluate import check_fits, require_prepared
     from experiments.rows import write_csv
     from experiments.running.run_trial import open_materials
-    from hma_jax.training.runs import load_model
+    from hma_jax.training.runs import load_model, require_frames
 
     setting = make_setting(asked)
     trained = load_model(run).run
-    masking = trained.train.masking
-    require(
-        masking.predicts_frames,
-        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are "
-        "none to judge",
-    )
+    require_frames(trained, "judge")
     require_prepared(setting)
     materials = open_materials(setting.workspace)
     check_fits(trained, materials)
@@ -71,7 +66,7 @@ def quality(
 
     with step(f"judge {len(settings)} decodings on windows of {len(frozen.names)} datasets") as update:
         rows, stages = judge(
-            subject, materials.tokenizer, batches, settings, frames, repeats, masking.setting,
+            subject, materials.tokenizer, batches, settings, frames, repeats, trained.train.masking.setting,
             lambda name, done: update(done, len(settings), name),
         )  # fmt: skip
     table = tidy_table(

@@ -10,8 +10,9 @@ import pytest
 from data_pipelines.windows.evalset import freeze_manifest
 from experiments.applications.check import choose_robots, shortage
 from experiments.cli.check import check
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from tests.data_pipelines.windows.test_evalset import small_store
+from tests.experiments.applications.runs import make_run
 
 
 @pytest.mark.parametrize(
@@ -63,7 +64,9 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
     own, here = (small_store(tmp_path / f"{n}", lengths=(20,) * 20, min_val=n) for n in (4, 5))
     assert set(own.manifest("toy").train.episodes) & set(here.manifest("toy").val.episodes)
     provenance = {"loader": {"datasets": ["toy"]}, "store": own.hash(["toy"])}
-    model = SimpleNamespace(table=own.embodiment_table(("toy",)), run=SimpleNamespace(provenance=provenance))
+    model = SimpleNamespace(
+        table=own.embodiment_table(("toy",)), run=SimpleNamespace(provenance=provenance, train=TrainConfig())
+    )
     monkeypatch.setattr("hma_jax.training.runs.load_model", lambda run: model)
     monkeypatch.setattr("experiments.cli.evaluate.check_fits", lambda trained, materials: None)
     monkeypatch.setattr("experiments.applications.check.check_run", lambda *_: {})
@@ -73,3 +76,11 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
         check(tmp_path, tmp_path)
         said = " ".join(capsys.readouterr().out.split())
         assert ("toy: the model was trained on other tokens than lie here, so that it may have seen" in said) == told
+
+
+def test_a_policy_has_no_frames_to_be_judged(tmp_path):
+    policy = make_run(tmp_path, TrainConfig(masking=MaskingConfig(setting="policy")))
+    with pytest.raises(
+        ConfigError, match="'policy', which predicts no frames: there are none to judge. `hma evaluate`"
+    ):
+        check(policy)

@@ -355,6 +355,14 @@ def test_warming_up_ends_between_two_programs_when_it_is_asked_to():
     assert compiled == reached == [n for n in sizes(16) if n > 1][:2] and len(sizes(16)) > 3
 
 
+@pytest.mark.parametrize("setting", ["policy", "inverse"])
+def test_what_predicts_actions_alone_is_no_simulator(setting):
+    model, tokenizer = parts()
+    other = replace(model, run=replace(model.run, train=TrainConfig(masking=MaskingConfig(setting=setting))))
+    with pytest.raises(ConfigError, match=f"'{setting}', which predicts no frames: there are none to show"):
+        Simulator(other, tokenizer)
+
+
 @pytest.mark.slow
 def test_a_model_trained_without_actions_goes_on_alike_under_all_of_them():
     model, tokenizer = parts()

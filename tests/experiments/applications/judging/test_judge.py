@@ -23,7 +23,7 @@ from experiments.applications.policies.learning import FitConfig
 from experiments.applications.policies.network import EncoderConfig
 from experiments.cli.main import main
 from experiments.progress import step
-from hma_jax.config import ConfigError, TrainConfig
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.convert.run_directory import write_run
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.hma import declare_model
@@ -51,7 +51,8 @@ def judged(tmp_path_factory):
     root, tokenizer = tmp_path_factory.mktemp("study"), parts()[1]
     save_tokenizer(tokenizer, root / "tokenizer")
     table = EmbodimentTable((Embodiment("gripper_wood", 4, 1, (0.0,) * 4, (0.2,) * 4),))
-    run = Run(CONFIG, TrainConfig(), table, declare_model(CONFIG, table).init(0), 0, {"tokenizer": tokenizer.identity})
+    train = TrainConfig(masking=MaskingConfig(setting="full"))
+    run = Run(CONFIG, train, table, declare_model(CONFIG, table).init(0), 0, {"tokenizer": tokenizer.identity})
     write_run(run, root / "model")
     return root, judge_run(root / "model", root / "out", ASKED, step)
 
@@ -91,8 +92,9 @@ def test_seeds_that_no_episode_can_have_are_refused_before_policies_are_trained(
 
 
 def test_the_random_policy_alone_is_not_judged(tmp_path, monkeypatch):
-    """For a quarter of an hour, since --policies was forgotten."""
-    model = SimpleNamespace(config=SimpleNamespace(action_heads=False))
+    """For a quarter of an hour, since --policies was forgotten. Action heads that nothing was trained for are none."""
+    model = parts()[0]
+    assert model.config.action_heads and model.run.train.masking.setting == "forward"
     monkeypatch.setattr(judge, "load_simulator", lambda *_, **__: SimpleNamespace(model=model))
     alone = replace(ASKED, ladder=replace(ASKED.ladder, cloned=0))
     with pytest.raises(ConfigError, match="no policy to judge but the random one: give --policies FILE"):

@@ -21,7 +21,7 @@ from experiments.applications.judging.recordings import labelled
 from experiments.applications.judging.rollouts import load_rollout
 from experiments.applications.policies.network import EncoderConfig, moved
 from experiments.cli.main import main
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.robots import Robot
 from tests.data_pipelines.convert.sources import write_lerobot, write_robomimic
@@ -56,7 +56,7 @@ def policies(robot):
 def study(tmp_path_factory):
     """A run of one robot, 20 recordings of which every other one succeeded, and three policies."""
     root = tmp_path_factory.mktemp("own")
-    make_run(root, table=TABLE)
+    make_run(root, TrainConfig(masking=MaskingConfig(setting="full")), TABLE)
     write_rlds(root, SPEC, [9] * 19 + [4])
     (root / "mine.py").write_text(POLICIES)
     return root

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from experiments.applications.policies.own_head import OwnHeadPolicy
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from tests.hma_jax.simulator.small import ROBOTS, parts
 
 
 def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
     model, tokenizer = parts()
+    model = replace(model, run=replace(model.run, train=TrainConfig(masking=MaskingConfig(setting="full"))))
     frames = np.random.default_rng(0).integers(0, 256, (7, 2, 8, 8, 3), np.uint8)
     policy = OwnHeadPolicy(model, tokenizer, ROBOTS[1])
     acted = np.stack([policy.act(images) for images in frames])
@@ -32,8 +33,10 @@ def test_it_acts_longer_than_its_window_and_then_sees_only_the_last_frames():
     assert not np.array_equal(again[1], acted[0, 1])
 
 
-def test_a_model_without_action_heads_is_no_policy():
+@pytest.mark.parametrize(("heads", "setting"), [(False, "full"), (True, "forward"), (True, "inverse")])
+def test_a_model_that_was_not_trained_to_act_is_no_policy(heads, setting):
     model, tokenizer = parts()
-    without = replace(model, run=replace(model.run, model=replace(model.config, action_heads=False)))
-    with pytest.raises(ConfigError, match="model.action_heads=true"):
-        OwnHeadPolicy(without, tokenizer, ROBOTS[0])
+    train = TrainConfig(masking=MaskingConfig(setting=setting))
+    other = replace(model, run=replace(model.run, train=train, model=replace(model.config, action_heads=heads)))
+    with pytest.raises(ConfigError, match=f"'{setting}', so it is no policy; .* and model.action_heads=true"):
+        OwnHeadPolicy(other, tokenizer, ROBOTS[0])

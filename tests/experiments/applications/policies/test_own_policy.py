@@ -11,6 +11,7 @@ import pytest
 
 from data_pipelines.suite.world import World
 from experiments.applications import own_policy
+from experiments.applications.judging.own_policies import load_own, try_out
 from experiments.applications.own_policy import (
     OWN,
     RANDOM,
@@ -81,24 +82,26 @@ def test_heads_are_added_and_nothing_else_changes():
         np.testing.assert_array_equal(made[name], x)
 
 
-def test_what_is_post_trained_is_a_simulator_with_all_that_the_first_model_has(tmp_path, monkeypatch):
-    """`hma judge` and `hma play` take it."""
+def test_what_is_post_trained_is_no_simulator_and_acts_in_one_by_the_file_of_the_page(tmp_path, monkeypatch):
 
     def trained(config, table, training, make, *, run_dir, initial, provenance, **_):
         write_run(Run(config, training, table, initial, 0, provenance), run_dir)
 
     monkeypatch.setattr(own_policy, "train_model", trained)
-    first = load_simulator(make_run(tmp_path / "study"), decode=DecodeConfig(temperature=0.5))
+    first = load_simulator(make_run(tmp_path / "study"))
     robot, images = first.robot(FEW.robot), np.zeros((2, 6, 8, 8, 3), np.uint8)
-    first.describe([replace(robot, high=(9.0, 9.0))])
     none = np.zeros((2, 6), bool)
     demos = Demonstrations(images, np.zeros((2, 6, 2), np.float32), np.full(2, 6), none, none[:, 0], np.arange(2))
-    own_policy.post_train(first, robot, demos, FEW, tmp_path / "out" / "run", lambda *_: None)
-    made = load_simulator(tmp_path / "out" / "run")
-    assert made.model.config.action_heads and made.robots == first.robots and made.decode == first.decode
-    assert made.tokenizer.identity == first.tokenizer.identity
-    for mine, theirs in zip(made.starts, first.starts, strict=True):
-        np.testing.assert_array_equal(mine.images, theirs.images)
+    run = tmp_path / "runs/own_policy/run"
+    own_policy.post_train(first, robot, demos, FEW, run, lambda *_: None)
+    with pytest.raises(ConfigError, match="'policy', which predicts no frames: there are none to show"):
+        load_simulator(run)
+    page = (Path(__file__).parents[4] / "docs/policies.md").read_text()
+    (tmp_path / "mine.py").write_text(page.split("```python\n")[1].split("```")[0])
+    monkeypatch.chdir(tmp_path)
+    users, _ = load_own(tmp_path / "mine.py", robot)
+    try_out(users, None, 2, (8, 8))
+    assert list(users) == ["own_head"]
 
 
 def test_outcomes_that_are_kept_do_not_depend_on_how_a_model_fills_frames(tmp_path, monkeypatch):
