@@ -26,7 +26,7 @@ from experiments.study import Study
 from experiments.sweeps.sweep import Sweep, unique_trials
 from hma_jax.config import ConfigError
 from hma_jax.config.json import to_dict
-from hma_jax.training.claim import CHECKPOINTS
+from hma_jax.training.claim import CHECKPOINTS, list_steps
 
 UNKNOWN = Provenance("", "", "")
 """Stands in where nothing is known of it, and only the trials' own fields matter."""
@@ -77,8 +77,7 @@ def find_prepared(setting: Setting) -> Done:
 
 def newest_step(run: Path) -> int:
     """Of the checkpoints of a run; 0 without any."""
-    steps = [int(path.name) for path in (run / CHECKPOINTS).glob("*") if path.name.isdigit()]
-    return max(steps, default=0)
+    return max(list_steps(run / CHECKPOINTS), default=0)
 
 
 def _trials(

@@ -13,7 +13,14 @@ from hma_jax.runtime.locks import Held, Lock, exclusive
 NAME, EVALUATION = ".lock", ".evaluation.lock"
 
 CHECKPOINTS = "checkpoints"
-"""The folder of a run directory with a folder for each; named here, where nothing is imported that reads them."""
+"""The folder of a run directory with a folder for each; named, and listed, where nothing is imported that reads them."""
+
+
+def list_steps(directory: Path) -> list[int]:
+    """Steps with a finished checkpoint, in order; what Orbax has not finished has another name."""
+    if not directory.is_dir():
+        return []
+    return sorted(int(path.name) for path in directory.iterdir() if path.name.isdigit() and path.is_dir())
 
 
 class RunBusy(Held):

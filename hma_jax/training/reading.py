@@ -19,6 +19,7 @@ from orbax.checkpoint import v1 as ocp
 
 from hma_jax.config import ConfigError
 from hma_jax.runtime.processes import tell
+from hma_jax.training.claim import list_steps
 from hma_jax.training.hashes import Chosen, Damaged, verify
 
 WHOLE_STATE = "state"
@@ -29,13 +30,6 @@ log = logging.getLogger(__name__)
 
 class CheckpointError(ConfigError):
     """A checkpoint that is missing, unreadable or belongs to another configuration."""
-
-
-def list_steps(directory: Path) -> list[int]:
-    """Steps with a finished checkpoint, in order; what Orbax has not finished has another name."""
-    if not directory.is_dir():
-        return []
-    return sorted(int(path.name) for path in directory.iterdir() if path.name.isdigit() and path.is_dir())
 
 
 def find_damage(checkpoint: Path) -> Damaged | None:
