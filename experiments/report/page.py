@@ -25,7 +25,7 @@ from experiments.report.fits import describe_fits
 from experiments.report.numbers import Numbers
 from experiments.report.pieces import card, picture, section, table
 from experiments.report.plot_style import drawn_metrics
-from experiments.report.robots import Robot, describe_robots, robots_of
+from experiments.report.robots import Robot, are_sorted, describe_robots, robots_of
 from experiments.report.style import CSS
 from experiments.report.sweeps import Along, describe
 from experiments.report.validity import Check, check_study, draw_box
@@ -82,7 +82,7 @@ def write_report(
         _fits(workspace, numbers),
         findings.rest,
         _clips(workspace.trials / first / "samples.npz", record, robots, aside) if there else "",
-        section(f"Robots, the most controllable first{aside}", describe_robots(
+        section(f"Robots{', the most controllable first' * are_sorted(robots)}{aside}", describe_robots(
             rows, shown.by, robots, workspace.data_summary
         )) if there else "",
         section("Trials", _trial_table(workspace, sweeps, states, provenance, numbers.results)),

@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from experiments.analysis.controllability import Controlled, beyond, by_chance, controllability
@@ -121,21 +122,26 @@ def describe_robots(rows: Sequence[Row], sweep: Sweep, robots: Sequence[Robot], 
         line = robot.follows.get(metric)
         return pm(line.mean, line.sem) if line else "–"
 
-    lines = []
-    for robot in robots:
-        facts = data.get(robot.name, {})
-        share = [f"{shares[robot.name]:.0%}" if robot.name in shares else "–"] if shares else []
-        lines.append([
-            html.escape(robot.name), *share, _errors(robot.errors), *(followed(robot, m) for m in follows),
-            _ahead_words(robot), *(cell(robot.name, m) for m in metrics),
-            *(str(facts.get(k, "–")) for k in ("episodes", "windows")),
-        ])  # fmt: skip
-    blank = [""] * (1 + bool(shares))
-    means = [cell(OVERALL, m) for m in follows]
-    lines.append(["<b>all</b>", *blank, *means, "", *(cell(OVERALL, m) for m in metrics), "", ""])
-    head = ["robot", *["decided by actions"] * bool(shares), "s.e. above zero", *(FOLLOWS[m] for m in follows)]
-    head += ["ahead of copying (dB)", *(COLUMNS[m] for m in metrics), "episodes", "windows"]
-    return f"<p>{_words(robots, follows, bool(shares), 'psnr' in metrics)}</p>" + table(head, lines)
+    columns: dict[str, tuple[Callable[[Robot], str], str]] = {}  # heading -> (cell of a robot, of all)
+    if shares:
+        columns["decided by actions"] = (lambda r: f"{shares[r.name]:.0%}" if r.name in shares else "–", "")
+    if are_sorted(robots):
+        columns["s.e. above zero"] = (lambda r: _errors(r.errors), "")
+    columns |= {FOLLOWS[m]: (partial(followed, metric=m), cell(OVERALL, m)) for m in follows}
+    if not all(math.isnan(robot.ahead) for robot in robots):
+        columns["ahead of copying (dB)"] = (_ahead_words, "")
+    columns |= {COLUMNS[m]: (lambda r, m=m: cell(r.name, m), cell(OVERALL, m)) for m in metrics}
+    columns |= {
+        key: (lambda r, key=key: str(data.get(r.name, {}).get(key, "–")), "") for key in ("episodes", "windows")
+    }
+    lines = [[html.escape(robot.name), *(of_robot(robot) for of_robot, _ in columns.values())] for robot in robots]
+    lines.append(["<b>all</b>", *(of_all for _, of_all in columns.values())])
+    return f"<p>{_words(robots, follows, bool(shares), 'psnr' in metrics)}</p>" + table(["robot", *columns], lines)
+
+
+def are_sorted(robots: Sequence[Robot]) -> bool:
+    """Whether there is an order: what predicts no frames has none, since nothing says how well actions are followed."""
+    return not all(math.isnan(robot.errors) for robot in robots)
 
 
 def _words(robots: Sequence[Robot], follows: Sequence[str], shares: bool, frames: bool) -> str:

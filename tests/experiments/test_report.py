@@ -17,7 +17,7 @@ from experiments.report.findings import read_findings
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, count, save
-from experiments.report.robots import read_data, robots_of
+from experiments.report.robots import describe_robots, read_data, robots_of
 from experiments.report.sweeps import Along, describe
 from experiments.report.validity import Check, check_study
 from experiments.rows import OVERALL, curve, read_csv, read_rows, tally, write_rows
@@ -255,6 +255,8 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     assert any("copying" in check.name for check in checked) == ("delta_psnr" in measured)
     cards = page._headline(drawn, record_of(), [sweep], rows, {}, page._Shown(sweep, "reference"), None)
     assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
+    listed = describe_robots(rows, sweep, robots_of(rows, sweep, PROVENANCE, {}), tmp_path / "data.json")
+    assert ("s.e. above zero" in listed) == ("delta_psnr" in measured) and "ahead of copying" not in listed
 
 
 def test_the_error_of_one_seed_is_not_said_to_be_over_seeds(drawn):
