@@ -46,7 +46,7 @@ class FieldFacts:
     """A field of the schema, by the key under which an entry would name it."""
 
     key: str
-    kind: str  # image, depth, number, list (of numbers, however long) or text
+    kind: str  # image, depth, number, list (of numbers, however long), bytes (that numbers are kept as) or text
     shape: tuple[int | None, ...]
     dtype: str
     per_step: bool  # False: once per episode
@@ -231,7 +231,9 @@ def _read_schema(directory: Location) -> tuple[tuple[FieldFacts, ...], tuple[Spl
 
 def _field(key: str, feature: FlatFeature) -> FieldFacts:
     if feature.image:
-        kind = "image" if feature.shape[-1] == 3 and feature.dtype == "uint8" else "depth"
+        kind = "image" if feature.dtype == "uint8" else "depth"  # a grey one is shown as one of three colours
+    elif feature.encoding:
+        kind = "bytes"
     else:
         kind = "text" if feature.dtype not in NUMBERS else "list" if None in feature.shape else "number"
     dtype = feature.dtype if feature.dtype in NUMBERS else "string"

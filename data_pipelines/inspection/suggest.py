@@ -17,6 +17,7 @@ from data_pipelines.windows.cut import Cut
 from data_pipelines.windows.windows import TO_TRAIN
 
 ON_THE_ARM = re.compile(r"wrist|hand|grip|eye_in", re.IGNORECASE)
+DEPTHS = re.compile(r"depth|dispar", re.IGNORECASE)
 OUTSIDE = re.compile(r"ext|front|main|static|agent|third|high|top|head", re.IGNORECASE)
 NO_ACTION = re.compile(r"terminat|is_first|is_last", re.IGNORECASE)
 
@@ -24,7 +25,7 @@ NO_RATE = 0.0
 """Stands in an entry for a rate that nobody gave; a `DatasetSpec` refuses it."""
 
 NO_CAMERA = (
-    "none of its fields is an image of three colours; pictures that are kept as plain numbers are to be written as "
+    "none of its fields is an image of 8 bits; pictures that are kept as plain numbers are to be written as "
     "images (docs/own_data.md, Writing RLDS)"
 )
 """Why a dataset without one is given no entry."""
@@ -134,7 +135,7 @@ def choose_camera(cameras: Sequence[CameraFacts]) -> tuple[CameraFacts | None, s
     def rank(camera: CameraFacts) -> tuple:
         name = camera.key.rsplit("/", 1)[-1]
         plain = name in ("image", "rgb", "image_0", "image_1")
-        return bool(ON_THE_ARM.search(name)), not plain, not OUTSIDE.search(name), camera.key
+        return bool(DEPTHS.search(name)), bool(ON_THE_ARM.search(name)), not plain, not OUTSIDE.search(name), camera.key
 
     best = min(seeing, key=rank)
     blank = [c.key for c in cameras if c.is_blank]
@@ -150,7 +151,12 @@ def _choose_actions(facts: Facts) -> tuple[tuple[str, ...], tuple[int, ...], str
     else:
         keys = [k for k in by_key if k.startswith("action/") and not NO_ACTION.search(k)]
     if not keys:
-        return (), (), "no numeric field `action`: video alone"
+        kept = ", ".join(f.key for f in facts.fields if f.kind == "bytes" and f.key.partition("/")[0] == "action")
+        if kept:
+            why = f"{kept} is kept as bytes, which are not read; write the dataset again with encoding 'none' for it"
+        else:
+            why = "no numeric field `action`"
+        return (), (), f"{why}: video alone"
     names, dims, dropped = [], [], []
     for key in keys:
         hints = [d.hint for d in by_key[key].dimensions]

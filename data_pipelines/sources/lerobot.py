@@ -27,6 +27,7 @@ from data_pipelines.sources.settings import LeRobotSettings
 from data_pipelines.sources.units import Episode, Layout, UnitError, choose
 from data_pipelines.sources.video import ADVICE, open_video, shrink, stored_jpeg
 
+PICTURES = ("video", "image")
 EPISODE, TIME, TASK, SUCCESS, REWARD = "episode_index", "timestamp", "task_index", "next.success", "next.reward"
 
 
@@ -44,7 +45,19 @@ class LeRobotSource:
         _check_names(features, self.root / "meta" / "info.json")
         there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
         if not there:
-            raise DataError(f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels.")
+            others = [
+                f"{shown(k)}: {'x'.join(map(str, f['shape']))}"
+                for k, f in features.items()
+                if f.get("dtype") in PICTURES
+            ]
+            found = (
+                f" (there are {', '.join(others)}; grey ones are to be written as red, green and blue)"
+                if others
+                else ""
+            )
+            raise DataError(
+                f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels{found}."
+            )
         wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(there), "camera", str(self.root))
         self.cameras = {f"observation/{name}": there[name] for name in names}
@@ -209,7 +222,7 @@ def _as_units() -> Iterator[None]:
 
 def _is_camera(feature: dict[str, Any]) -> bool:
     depth = (feature.get("info") or feature.get("video_info") or {}).get("video.is_depth_map", False)
-    return feature.get("dtype") in ("video", "image") and 3 in feature.get("shape", (3,)) and not depth
+    return feature.get("dtype") in PICTURES and 3 in feature.get("shape", (3,)) and not depth
 
 
 def _is_vector(key: str, feature: dict[str, Any]) -> bool:

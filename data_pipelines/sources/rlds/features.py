@@ -45,12 +45,14 @@ _FORM_OF = {name: form for form, names in _FORMS.items() for name in names}
 
 @dataclass(frozen=True)
 class FlatFeature:
-    """A field of the schema: an image, or `size` numbers per step (0: text and the like)."""
+    """A field of the schema: an image, or `size` numbers per step (0: text and the like). `encoding`: numbers that a
+    record holds as bytes, which are not read, in the form that tfds calls so."""
 
     image: bool
     size: int
     shape: tuple[int | None, ...] = ()
     dtype: str = "string"
+    encoding: str = ""
 
 
 def parse_features(schema: Any) -> dict[str, FlatFeature]:
@@ -92,7 +94,7 @@ def _fields(node: Any, key: str, depth: int, listed: bool = False) -> Iterator[t
     elif form == "boundingBox":
         yield key, FlatFeature(False, 4, (4,), "float32")
     elif form in ("tensor", "audio"):
-        yield key, _numbers(_shape(content, key), _dtype(content), key)
+        yield key, _numbers(_shape(content, key), _dtype(content), _encoding(content), key)
     else:  # text, and what a class of somebody else's holds
         yield key, FlatFeature(image=False, size=0)
 
@@ -172,11 +174,17 @@ def _dtype(content: Mapping[str, Any]) -> str:
     return dtype[:32] if isinstance(dtype, str) and dtype.isprintable() else ""
 
 
-def _numbers(shape: tuple[int | None, ...], dtype: str, key: str) -> FlatFeature:
+def _encoding(content: Mapping[str, Any]) -> str:
+    """Of a tensor; "" for numbers that stand in the record as they are."""
+    encoding = content.get("encoding")
+    return encoding[:32] if isinstance(encoding, str) and encoding.isprintable() and encoding.lower() != "none" else ""
+
+
+def _numbers(shape: tuple[int | None, ...], dtype: str, encoding: str, key: str) -> FlatFeature:
     dtype = {"float": "float32", "double": "float64", "int": "int64"}.get(dtype, dtype)
     if dtype not in NUMBERS or None in shape:
         return FlatFeature(False, 0, shape, dtype if dtype in NUMBERS else "string")
     size = math.prod(shape)
     if size > MOST_NUMBERS:
         raise ValueError(f"{_field(key)}: {list(shape)} makes {size:,} numbers in one step")
-    return FlatFeature(False, size, shape, dtype)
+    return FlatFeature(False, 0 if encoding else size, shape, dtype, encoding)

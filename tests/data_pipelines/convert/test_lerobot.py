@@ -149,7 +149,14 @@ def test_length_and_rows_must_agree(tmp_path):
         ({"codebase_version": "v1.6"}, "codebase_version is 'v1.6'; v2.0, v2.1, v3.0 can be read"),
         ({"fps": None}, "no 'fps'"),
         ({"video_path": None}, "no 'video_path'"),
-        ({"features": {"action": {"dtype": "float32", "shape": [2]}}}, "no feature is a video or an image"),
+        (
+            {"features": {"action": {"dtype": "float32", "shape": [2]}}},
+            "no feature is a video or an image of 3 channels.$",
+        ),
+        (
+            {"features": {"top": {"dtype": "video", "shape": [8, 8, 1]}}},
+            "3 channels .there are 'top': 8x8x1; grey ones",
+        ),
     ],
 )
 def test_info_of_another_kind_is_named(tmp_path, change, message):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from data_pipelines.inspection.inspect import CameraFacts, inspect_dataset
 from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.registry.own import OWN
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, picture, write_lerobot, write_robomimic
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, png, write_rlds
@@ -158,6 +160,42 @@ def test_steps_that_hold_lists_of_numbers_are_read(tmp_path):
     assert {f.key: (f.kind, f.shape) for f in facts.fields}["action_plan"] == ("list", (None, 2))
 
 
+def test_a_grey_camera_is_one(tmp_path):
+    """It was called a depth, and the dataset one without a camera; with an entry by hand it could be trained on."""
+
+    def change(episode, features):
+        features["steps/observation/image"] = [png(np.eye(8, dtype=np.uint8) * 40 * t) for t in range(1, 6)]
+
+    directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
+    path = directory / "features.json"
+    path.write_text(re.sub(r'("dimensions": \[\s*"8",\s*"8",\s*)"3"', r'\1"1"', path.read_text()))
+    facts = inspect_dataset(directory).facts
+    assert {f.key: (f.kind, f.shape) for f in facts.fields}["observation/image"] == ("image", (8, 8, 1))
+    assert suggest_entry(facts, 4).image_key == "observation/image" and not facts.damaged
+    image = RldsDataset(directory).episode(0, "observation/image", ("action",)).images[1]
+    np.testing.assert_array_equal(image, np.repeat(np.eye(8, dtype=np.uint8)[..., None] * 80, 3, -1))
+
+
+def test_actions_that_are_kept_as_bytes_are_told_and_not_called_damage(tmp_path):
+    """All episodes could not be read: their action held bytes."""
+    from tensorflow_datasets import features as tf
+
+    def change(episode, features):
+        features["steps/action"] = [row.tobytes() for row in features["steps/action"]]
+
+    directory = write_rlds(tmp_path, make_spec(), [5, 5], change=change)
+    step = {"image": tf.Image(shape=(8, 8, 3)), "depth": tf.Tensor(shape=(4, 4), dtype=np.float32, encoding="zlib")}
+    action = tf.Tensor(shape=(3,), dtype=np.float32, encoding="bytes")
+    tf.FeaturesDict({"steps": tf.Dataset({"observation": step, "action": action})}).save_config(str(directory))
+    facts = inspect_dataset(directory).facts
+    kinds = {f.key: f.kind for f in facts.fields}
+    assert (kinds["action"], kinds["observation/depth"], facts.damaged) == ("bytes", "bytes", {})
+    suggestion = suggest_entry(facts, 4)
+    assert not suggestion.action_keys and "action is kept as bytes, which are not read" in " ".join(suggestion.reasons)
+    with pytest.raises(ConfigError, match="'action' in .*features.json is kept as bytes .encoding 'bytes'."):
+        RldsDataset(directory).check_keys("observation/image", ("action",))
+
+
 def test_an_instruction_in_numbers_is_no_text(tmp_path):
     """As some datasets keep the ids of its tokens."""
     numbers = {"steps/language_instruction": np.arange(20)}
@@ -222,6 +260,7 @@ def test_values_that_are_not_finite_are_counted_and_left_out():
         ([camera("image_0", blank=True), camera("image_1")], "image_1"),
         ([camera("wrist_left"), camera("zed"), camera("exterior_1_left")], "exterior_1_left"),
         ([camera("hand_image")], "hand_image"),
+        ([camera("front_depth"), camera("hand_image")], "hand_image"),
     ],
 )
 def test_camera_that_sees_from_outside_is_chosen(cameras, chosen):
