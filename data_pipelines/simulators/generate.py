@@ -19,7 +19,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import BinaryIO
 
-from data_pipelines.errors import DataError
+from data_pipelines.errors import NAMED, DataError
 from data_pipelines.publishing.claims import Claim, claim
 from data_pipelines.publishing.marks import FINGERPRINT, is_complete, read_metadata, shard_lengths
 from data_pipelines.simulators.embodiments import select
@@ -34,7 +34,7 @@ from hma_jax.config import ConfigError, require
 from hma_jax.runtime.locks import Held
 
 GENERATOR = 1
-"""Raise it when simulation, behaviour, drawing or encoding change: older datasets are then remade."""
+"""Raise it when simulation, behaviour, drawing or encoding change: older datasets are then told apart (`made_before`)."""
 
 JOB_EPISODES = 10
 """At most so many episodes in one process: starting one costs a few seconds."""
@@ -69,6 +69,23 @@ def differences(spec: SimSpec, directory: Path, episodes: int, size: int, seed: 
     return [f"{name}: {there[name]} -> {value}" for name, value in wanted.items() if there[name] != value]
 
 
+def made_before(root: Path, specs: Sequence[SimSpec], episodes: int, size: int, seed: int) -> list[str]:
+    """Which datasets are there as they are asked for, but made by other versions of the packages or the generator.
+
+    Raises ConfigError where one is there that was made with other settings, or by others: it is not replaced.
+    """
+    found = {s.name: differences(s, root / s.name / VERSION, episodes, size, seed) for s in specs}
+    lines = [f"{root / name / VERSION}: {'; '.join(how)}" for name, how in found.items() if how]
+    more = f" and {len(lines) - NAMED} more" if len(lines) > NAMED else ""
+    require(
+        not lines,
+        f"datasets are there that were made otherwise (there -> asked for): {', '.join(lines[:NAMED])}{more}. Nothing "
+        "was changed. Choose another directory, or give the settings that they were made with, or remove them to have them "
+        "made again.",
+    )
+    return [name for name, how in found.items() if how is not None]
+
+
 def generate_sim(
     root: str | Path,
     *,
@@ -82,15 +99,16 @@ def generate_sim(
     """Writes `<root>/<name>/<version>/` for each embodiment; returns these directories.
 
     `episodes` per dataset, frames of `size` x `size`. What is complete with the same fingerprint
-    is left as it is; what is there otherwise is replaced (see `differences`). Raises ConfigError for
-    bad arguments, missing packages and a dataset that another process is making, DataError when a
-    simulator fails; the other datasets are then made all the same.
+    is left as it is; what other versions of the packages or the generator made is replaced. Raises
+    ConfigError for bad arguments, missing packages, what `made_before` refuses and a dataset that another
+    process is making, DataError when a simulator fails; the other datasets are then made all the same.
     """
     require(episodes >= 1, f"episodes must be at least 1, got {episodes}")
     require(16 <= size <= 1024, f"the frame size must lie in 16..1024, got {size}")
     require(workers >= 1, f"workers must be at least 1, got {workers}")
     specs, root = select(names), Path(root)
     require_packages(specs)
+    made_before(root, specs, episodes, size, seed)
     try:
         root.mkdir(parents=True, exist_ok=True)
     except OSError as error:

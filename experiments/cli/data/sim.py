@@ -13,7 +13,6 @@ from experiments.progress import console, step
 from experiments.setting import command, command_words
 from experiments.words import few
 from experiments.wrote import wrote
-from hma_jax.config import require
 
 if TYPE_CHECKING:
     from data_pipelines.simulators import SimSpec
@@ -109,17 +108,9 @@ def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
 
     Raises ConfigError, before anything is made, where one is there that was made with other settings, or by others.
     """
-    from data_pipelines.simulators.generate import differences
-    from data_pipelines.sources.rlds.writer import VERSION
+    from data_pipelines.simulators.generate import made_before
 
-    found = {s.name: differences(s, out / s.name / VERSION, episodes, size, seed) for s in specs}
-    lines = [f"{out / name / VERSION}: {'; '.join(how)}" for name, how in found.items() if how]
-    require(
-        not lines,
-        f"datasets are there that were made otherwise (there -> asked for): {few(lines)}. Nothing was changed. Choose "
-        "another --out, or give the settings that they were made with, or remove them to have them made again.",
-    )
-    kept = [name for name, how in found.items() if how is not None]
+    kept = made_before(out, specs, episodes, size, seed)
     if kept:
         console.print(
             f"note: {few(kept)} in {out}: made by other versions of simulators, and still used; remove them to have them "
@@ -127,7 +118,7 @@ def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
             markup=False,
             soft_wrap=True,
         )
-    return [name for name in found if name not in kept]
+    return [spec.name for spec in specs if spec.name not in kept]
 
 
 def data_sim_table(directory: Positional[Path]) -> None:

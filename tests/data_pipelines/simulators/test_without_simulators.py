@@ -169,16 +169,25 @@ def test_a_run_cut_short_goes_on_and_ends_with_the_same_bytes(tmp_path, fake):
     assert fake.made == []
 
 
-def test_other_settings_remake_a_dataset(tmp_path, fake, monkeypatch):
+def test_a_dataset_of_other_settings_or_of_others_is_not_replaced(tmp_path, fake):
     run(tmp_path)
-    for change in ({"seed": 1}, {"episodes": 13}):
-        fake.made.clear()
-        run(tmp_path, **change)
-        assert len(fake.made) == change.get("episodes", 12)
+    kept = contents(tmp_path)
+    fake.made.clear()
+    for change, how in (({"seed": 1}, "seed: 0 -> 1"), ({"episodes": 13}, "episodes: 12 -> 13")):
+        with pytest.raises(ConfigError, match=f"pusht/1.0.0: {how}. Nothing was changed. Choose another directory"):
+            run(tmp_path, **change)
+    (tmp_path / "pusht/1.0.0/metadata.json").write_text("{}")
+    with pytest.raises(ConfigError, match="it says nothing of what it was made from"):
+        run(tmp_path)
+    assert not fake.made and contents(tmp_path) == kept | {"pusht/1.0.0/metadata.json": b"{}"}
+
+
+def test_a_dataset_of_another_generator_is_made_again(tmp_path, fake, monkeypatch):
+    run(tmp_path)
     fake.made.clear()
     monkeypatch.setattr(generate, "GENERATOR", generate.GENERATOR + 1)
-    run(tmp_path, episodes=13)
-    assert len(fake.made) == 13
+    run(tmp_path)
+    assert len(fake.made) == 12
 
 
 @pytest.mark.parametrize("package", ["numpy", "dm-control", "gymnasium", "mujoco", "simplejpeg"])
