@@ -206,8 +206,8 @@ class EpisodeSource(ABC):
             feature = self.features.get(step_key(field))
             require(
                 feature is None or not feature.encoding,
-                f"{self.name}: {field!r} in {self.schema} is kept as bytes (encoding {feature and feature.encoding!r}), which are "
-                "not read; write the dataset again with encoding 'none' for it, or take another field.",
+                f"{self.name}: {field!r} in {self.schema} is kept as bytes (encoding {feature and feature.encoding!r}), "
+                "which are not read; write the dataset again with encoding 'none' for it, or take another field.",
             )
             if feature is None or not feature.size:
                 raise ConfigError(

@@ -92,8 +92,9 @@ def require_frames(run: Run, deed: str) -> None:
     setting = run.train.masking.setting
     require(
         setting in PREDICT_FRAMES,
-        f"the model was trained with train.masking.setting {setting!r}, which predicts no frames: there are none to {deed}. "
-        f"`hma evaluate` judges its actions; for this take a model that was trained with one of {', '.join(PREDICT_FRAMES)}",
+        f"the model was trained with train.masking.setting {setting!r}, which predicts no frames: there are none to "
+        f"{deed}. `hma evaluate` judges its actions; for this take a model that was trained with one of "
+        f"{', '.join(PREDICT_FRAMES)}",
     )
 
 
