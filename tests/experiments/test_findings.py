@@ -16,8 +16,9 @@ from experiments.analysis.compare import Side, compare
 from experiments.analysis.preregistered import FILE, Expected, read_expected, what_came
 from experiments.applications.detector import CLOSE
 from experiments.applications.in_place import in_place
+from experiments.report.findings import read_findings
 from experiments.report.robots import Robot, robots_of
-from experiments.rows import OVERALL, Row, curve, difference, read_rows
+from experiments.rows import OVERALL, CurvePoint, Row, all_series, curve, difference, read_rows
 from experiments.running.trial import trial_id
 from experiments.running.workspace import Workspace, load_record
 from experiments.sweeps.registry import plan_sweeps
@@ -495,6 +496,51 @@ def grid_rows(sweep: str, digits: int) -> list[str]:
             cells.append(came)
         lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def test_what_stands_between_the_tables_is_as_findings_say():
+    """Single numbers that no line of a table holds."""
+    page, rows = " ".join(findings().split()), rows_of()
+
+    def point(sweep: str, metric: str, x: float | str, role: str = POINT, series: str = "") -> CurvePoint:
+        return next(p for p in curve(rows, sweep, metric, role, series=series) if x in (p.x, p.label))
+
+    *others, narrowest = (point("compute", "action_nats", x, series="1.3e+13 FLOP").mean for x in (24, 32, 48, 64, 16))
+    said = "{:.2f} at width 24, {:.2f} at 32, {:.2f} at 48 and {:.2f} at 64".format(*others)
+    assert said in page and f"a model is too narrow: {narrowest:.2f} at 16." in page
+    early = point("horizon", "delta_psnr", 2000)
+    assert f"told from zero after 2,000 steps, {early.mean:.2f} ± {early.sem:.2f} dB" in page
+    whole = point("fewshot", "delta_psnr", 4, series="after 40 robots, everything trained")
+    few = [
+        p for series in all_series(rows, "fewshot")[POINT] for p in curve(rows, "fewshot", "delta_psnr", series=series)
+    ]
+    few = [p for p in few if p.x == 4]
+    assert max(few, key=lambda p: p.mean) == whole and all(abs(p.mean) < 2 * p.sem for p in few) and len(few) == 5
+    assert f"the highest, where everything is trained, is {whole.mean:.2f} ± {whole.sem:.2f} dB" in page
+
+    def seed_0(sweep: str, metric: str, x: float | str, series: str = "") -> tuple[float, float]:
+        """Of the control and of the same seed on true actions."""
+        return tuple(point(sweep, metric, x, role, series).seeds[0] for role in (CONTROL, POINT))
+
+    shuffled, true = seed_0("newcomers", "cross_entropy", "all robots")
+    said = f"come to {shuffled:.2f} nats on its five, {true - shuffled:.2f} *better* than the same seed with true ones"
+    assert f"{said} ({true:.2f}), at the same PSNR" in page
+    shuffled, true = (
+        point("episodes", "cross_entropy", 160, *of).seeds[0] for of in ((CONTROL,), (POINT, "4,000 steps"))
+    )
+    frames = [point("episodes", "psnr", 160, *of).seeds[0] for of in ((CONTROL,), (POINT, "4,000 steps"))]
+    said = f"4 trajectories come to {shuffled:.2f} nats where true ones come to {true:.2f}, at {frames[0]:.2f} and"
+    shuffled, true = seed_0("horizon", "cross_entropy", 4000)
+    assert f"{said} {frames[1]:.2f} dB. With all trajectories true ones are {shuffled - true:.2f} ahead." in page
+
+
+@pytest.mark.parametrize("study", ["cpu-full", "cpu-full-continuous", "ladder"])
+def test_the_page_of_a_study_shows_its_findings(study):
+    """As they are, and not as they were when it was drawn."""
+    workspace = Workspace(RESULTS / study)
+    said = read_findings(workspace.root / "findings.md", load_record(workspace).axes)
+    page = workspace.report.read_text()
+    assert said.of_axes and all(text in page for text in (*said.of_axes.values(), said.rest))
 
 
 FAMILIES = [("lr_horizon", 3, 2), ("compute", 2, 4), ("episodes", 2, 3), ("fewshot", 2, 5)]
