@@ -65,7 +65,7 @@ LONGER = RUNGS | {
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories on every rung; `LONGER` for longer, which the label says."""
+    """All datasets and trajectories on every rung; `LONGER` for longer, which the label says, unless rungs take as long."""
     seeds, first = study.ablation_seeds, study.ablation_seeds[0]
     sweep = make_ablation(
         study,
@@ -82,6 +82,8 @@ def plan(study: Study) -> Sweep:
     labels = list(sweep.labels)
     longer = [(name, study.train.steps, seeds) for name in (BEST, REFERENCE, CHAINED, WEIGHED)]
     longer += [(name, study.train.steps, (first,)) for name in (RECALL, MUON, TENFOLD)]
+    if study.designs.ablation_steps in (None, study.train.steps):
+        longer = [one for one in longer if one[0] not in RUNGS]
     longer += [(BEST, steps, (first,)) for steps in study.designs.long]
     longer += [(WEIGHED, steps, (first,)) for steps in study.designs.long[:1]]
     for name, steps, chosen in longer:

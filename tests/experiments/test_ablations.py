@@ -1,6 +1,7 @@
 """The ablations: one thing changes at a time, the default is the reference, errors are over seeds."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 from typing import get_args
 
@@ -9,13 +10,14 @@ import pytest
 from experiments.presets import CPU, PRESETS, SMOKE
 from experiments.report.draw import draw
 from experiments.rows import curve, difference, read_csv
-from experiments.running.trial import trial_id
+from experiments.running.trial import training_of, trial_id
 from experiments.sweeps import conditioning as conditioning_axis
+from experiments.sweeps import ladder as ladder_axis
 from experiments.sweeps import settings as settings_axis
 from experiments.sweeps import width as width_axis
 from experiments.sweeps.sweep import CONTROL, POINT, reference_trial, titles, unique_trials
 from hma_jax.config import Conditioning, ConfigError
-from hma_jax.config.json import diff
+from hma_jax.config.json import diff, stable_hash
 from tests.experiments.fakes import PROVENANCE, STUDY, finished_study, record_of
 
 PLAIN = {name: study for name, study in PRESETS.items() if not study.designs.end_controls}
@@ -82,6 +84,15 @@ def test_ablations_share_the_reference_and_the_control_with_the_scaling_axes(stu
         shared = [p for p in sweep.points if p.x == sweep.reference_x and p.trial.train.seed in study.seeds]
         assert {p.role for p in shared} == {POINT, CONTROL}
         assert all(trial_id(p.trial, PROVENANCE) in width for p in shared)
+
+
+@pytest.mark.parametrize("steps", [None, CPU.train.steps, 1000])
+def test_no_rung_of_the_ladder_is_trained_twice(steps):
+    """Where rungs take as many steps as the study, none stands again among those that are trained for longer."""
+    study = replace(CPU, designs=replace(CPU.designs, ablation_steps=steps))
+    points = [p for p in ladder_axis.plan(study).points if p.role == POINT]
+    trained = Counter((stable_hash(training_of(p.trial)), p.trial.train.steps) for p in points)
+    assert set(trained.values()) == {1} and len(points) == 3 + 3 + 1 + 1 + 3 + 3 + 1 + (3 + 3 + 1 + 1) * (steps == 1000)
 
 
 def test_published_presets_have_error_bars():
