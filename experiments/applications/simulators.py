@@ -75,9 +75,14 @@ def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | No
 def make_simulator(run: Path | str, world: World = "learned", *, episodes: int = 1, **options: Any) -> AnySimulator:
     """Either simulator of a run's robots: the same robots, ranges, starts and images' size.
 
-    Raises ConfigError for another word; for "true" if a robot has no true simulator, or robots are of different ones.
+    Raises ConfigError for another word; for "true" if a robot has no true simulator, robots are of different ones, or
+    native actions are to be given one by one: a step of the truth is a frame of the model.
     """
     require_choice(world, get_args(World), "world")
+    require(
+        world == "learned" or options.get("rate", "model") == "model",
+        "a step of the true simulator is a frame of the model: rate='native' is of the learned one alone",
+    )
     learned = load_simulator(run, episodes=episodes, **options)
     return learned if world == "learned" else true_simulator(learned, tuple(learned.robots.values()), episodes)
 

@@ -65,6 +65,7 @@ class Simulator:
         config = model.config
         require_frames(model.run, "show")
         require(episodes >= 1, f"a simulator has at least 1 episode, got {episodes}")
+        require(history >= 0, f"episodes keep 0 frames or more to be taken back by, got history={history}")
         require_choice(outside, get_args(Outside), "outside")
         require_choice(rate, get_args(Rate), "rate")
         require(config.frames >= 3, f"a simulator needs a model of at least 3 frames, this one sees {config.frames}")
@@ -95,7 +96,8 @@ class Simulator:
     ) -> Simulator:
         """Of a training run, with what lies beside it (`folder`); `options` are the constructor's.
 
-        Raises ConfigError where there is no run, one that predicts no frames, or not the tokenizer that it was trained with.
+        Raises ConfigError where there is no run, one that predicts no frames, or not the tokenizer that it was trained
+        with.
         """
         run = Path(run)
         model = load_model(run, execution, weights)

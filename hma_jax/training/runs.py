@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig, Weights, require
+from hma_jax.config.base import require_choice
 from hma_jax.config.execution import FORMER_FIELDS
 from hma_jax.config.json import from_dict, to_dict
 from hma_jax.config.training import PREDICT_FRAMES
@@ -103,8 +104,9 @@ def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
 
     The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint while
     it is read, a newer one is taken. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign, and
-    ConfigError for an average that the run does not keep.
+    ConfigError for an average that the run does not keep, and for weights called otherwise.
     """
+    require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)
     directory = run_dir.absolute() / CHECKPOINTS
     steps = list_steps(directory)

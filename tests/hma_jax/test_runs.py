@@ -130,6 +130,8 @@ def test_which_weights_are_read_is_said_and_can_be_chosen(averaged, old_run: Pat
     assert load_run(old_run, "auto").weights == "last"
     with pytest.raises(ConfigError, match="keeps no average of its weights"):
         load_run(old_run, "ema")
+    with pytest.raises(ConfigError, match="weights: 'newest' is not a choice; choose one of auto, last, ema"):
+        load_run(run_dir, "newest")  # gave the average
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

@@ -99,6 +99,12 @@ def test_true_and_learned_are_exchanged_by_one_word(run):
     assert seen["learned"] == seen["true"]
 
 
+def test_the_truth_does_not_take_native_actions_one_by_one_and_says_so(run):
+    """Each was held for a whole frame, where the learned one made a frame of as many as its stride."""
+    with pytest.raises(ConfigError, match="rate='native' is of the learned one alone"):
+        make_simulator(run, "true", rate="native")
+
+
 @pytest.mark.slow
 def test_a_simulator_is_timed_as_its_users_step_it(run, tmp_path, capsys):
     assert main(["bench", "simulate", str(run), "--batch", "2", "--repeats", "3", "--out", str(tmp_path)]) == 0

@@ -265,6 +265,12 @@ def test_what_cannot_be_done_is_said(deed, message: str):
         deed(simulator(episodes=2))
 
 
+def test_a_history_of_fewer_frames_than_none_is_refused():
+    """An episode could then not be taken back by 0 frames."""
+    with pytest.raises(ConfigError, match="0 frames or more to be taken back by, got history=-1"):
+        simulator(history=-1)
+
+
 @pytest.mark.parametrize(("name", "word"), [("outside", "raise"), ("rate", "Native")])
 def test_another_word_is_not_taken_for_the_one_it_resembles(name: str, word: str):
     with pytest.raises(ConfigError, match=f"{name}: '{word}' is not a choice; choose one of "):
