@@ -54,6 +54,12 @@ def _show(root: Path) -> None:
     from experiments.report.numbers import read_numbers
 
     numbers = read_numbers(Workspace(root.absolute()))
+    if not numbers.fits and numbers.isoflop is None:
+        console.print(
+            f"{short(root)} has no axis along which a loss may fall as a power, such as width: there is nothing to fit",
+            soft_wrap=True, highlight=False, markup=False,
+        )  # fmt: skip
+        return
     table = Table(box=None, header_style="bold")
     for name in ("curve", "over", "L, nats per token", "exponents", "remarks"):
         table.add_column(name, overflow="fold")

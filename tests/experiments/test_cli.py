@@ -175,6 +175,15 @@ def test_a_study_whose_axes_were_taken_out_of_its_record_is_told_so(command, tmp
     assert said in capsys.readouterr().err and not workspace.report.exists()
 
 
+def test_a_study_of_named_axes_alone_has_nothing_to_fit(tmp_path, capsys):
+    """It was a table without a line."""
+    workspace = finished_study(tmp_path, axes=("settings",))
+    save_record(workspace, record_of(axes=("settings",)))
+    assert main(["fit", str(tmp_path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "has no axis along which a loss may fall as a power" in said and "exponents" not in said
+
+
 @pytest.fixture
 def instant_trials(monkeypatch):
     """Nothing is prepared; trials have fake results, but those of width 8 fail."""
