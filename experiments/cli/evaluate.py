@@ -160,15 +160,17 @@ def say_what_it_may_have_seen(trained: Run, names: Sequence[str], store: TokenSt
     """Where what is held out in `store` may be no test of a model."""
     if elsewhere := trained_on_other_tokens(trained, names, store):
         console.print(
-            f"note: {few(elsewhere)}: the model was trained on other tokens than lie here, so that it may have seen "
-            "episodes that are held out here; the --out that it was trained in holds out those that it has not",
+            f"note: {few(elsewhere)}: of the tokens that the model was trained on not all lie here as they were, so that it "
+            "may have seen episodes that are held out here; the --out that it was trained in holds out those that it has "
+            "not",
             soft_wrap=True,
         )
 
 
 def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStore) -> list[str]:
     """Those of `names` that a model, or the one it goes on from, was trained on and not, as far as can be told, with the
-    tokens of `store`: another choice of held-out episodes is another store."""
+    tokens of `store`: another choice of held-out episodes is another store. A run holds one hash of all its datasets, so
+    that one of them that is another, or not here, makes all of them doubtful."""
     found: list[str] = []
     provenance = trained.provenance
     while "loader" in provenance:

@@ -75,7 +75,9 @@ def test_what_the_model_may_have_been_trained_on_is_told(tmp_path, monkeypatch, 
         monkeypatch.setattr("experiments.applications.check.open_study", lambda _, found=materials: found)
         check(tmp_path, tmp_path)
         said = " ".join(capsys.readouterr().out.split())
-        assert ("toy: the model was trained on other tokens than lie here, so that it may have seen" in said) == told
+        assert (
+            "toy: of the tokens that the model was trained on not all lie here as they were, so that it" in said
+        ) == told
 
 
 def test_a_policy_has_no_frames_to_be_judged(tmp_path):
