@@ -518,6 +518,11 @@ def test_what_stands_between_the_tables_is_as_findings_say():
     assert max(few, key=lambda p: p.mean) == whole and all(abs(p.mean) < 2 * p.sem for p in few) and len(few) == 5
     assert f"the highest, where everything is trained, is {whole.mean:.2f} ± {whole.sem:.2f} dB" in page
 
+    there = json.loads((RESULTS / "cpu-full" / "data.json").read_text())
+    judged = {r.scope for r in rows if r.sweep == "newcomers" and r.of_robot}
+    eight = [8 * there[name]["windows"] / there[name]["episodes"] for name in judged]
+    assert f"have 8 trajectories each, on average {min(eight):.0f} to {max(eight):.0f} windows;" in page
+
     def seed_0(sweep: str, metric: str, x: float | str, series: str = "") -> tuple[float, float]:
         """Of the control and of the same seed on true actions."""
         return tuple(point(sweep, metric, x, role, series).seeds[0] for role in (CONTROL, POINT))
