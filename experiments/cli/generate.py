@@ -68,6 +68,7 @@ def generate(
     require(batch >= 1, f"--batch must be at least 1, got {batch}")
     require(episodes is None or episodes >= 1, f"--episodes must be at least 1, got {episodes}")
     require(0 <= seed < 2**32, f"--seed must lie in [0, 2^32), got {seed}")
+    require(clips >= 0, f"--clips must not be negative, got {clips}")
     if clips:
         require_module("av", f"--clips {clips}")
     use_entries(registry)

@@ -78,6 +78,11 @@ def test_help_needs_no_jax():
         (["tokenize", "--preset", "smoke", "--tokenizer", "{empty}"], 2, "hma tokenizer import"),
         (["tokenize", "--preset", "smoke", "--out", "{empty}", "--batch", "0"], 2, "--batch must be at least 1, got 0"),
         (["tokenize", "--preset", "smoke", "--out", "{empty}", "--threads", "-3"], 2, "--threads must be at least 1"),
+        (
+            ["generate", "{empty}", "--actions", "x", "--out", "{empty}", "--clips", "-1"],
+            2,
+            "--clips must not be negative",
+        ),
         (["convert", "from-official", "{empty}", "--out", "{empty}/run"], 2, "{empty}/config.json"),
         (["convert", "to-official", "{empty}", "--out", "{empty}/x"], 2, "{empty}/checkpoints"),
         (["convert", "from-safetensors", "{empty}", "--out", "{empty}/x"], 2, "{empty}/model.json"),
