@@ -59,7 +59,7 @@ def plot_family(rows: Sequence[Row], sweep: Sweep) -> plt.Figure:
         if metric in ON_LOG and any(panel.containers for panel in column):
             plain_log(column[-1], column[-1].yaxis)
     show_tally(panels[0, -1], rows, sweep.name)
-    show_legend(figure, panels[0, 0])
+    show_legend(figure, panels.flat)
     lost = any(diverged(rows, sweep.name, role, name) for role, names in series.items() for name in names)
     plain = "bars: s.e. over seeds" + "; cross: a seed diverged, the point is left out" * lost
     figure.supxlabel(CAPTION if sweep.base else plain, fontsize=8.5, color=MUTED)

@@ -125,6 +125,6 @@ def plot_isoflop(isoflop: IsoFlop | None, path: Path) -> None:
         plain_log(right, right.yaxis, count)
         left.set_ylabel("loss, nats per token")
         right.set_ylabel(f"best {TRUNK}")
-        show_legend(figure, left)
+        show_legend(figure, [left])
         left.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
         save(figure, path)

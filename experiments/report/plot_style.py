@@ -11,6 +11,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.ticker import FuncFormatter, Locator, LogLocator, MaxNLocator, NullLocator
@@ -137,13 +138,17 @@ def show_tally(panel: Axes, rows: Iterable[Row], sweep: str) -> None:
     panel.set_title(f"{finished} of {total} trials", loc="right", fontsize=8.5, color=MUTED)
 
 
-def show_legend(figure: plt.Figure, panel: Axes) -> None:
-    """What the lines of `panel` are, above all panels: within one, words would lie on what they are about."""
-    handles, labels = panel.get_legend_handles_labels()
-    if handles:
-        room = max(0.6 + 0.075 * len(label) for label in labels)  # inches of the longest one
-        columns = max(1, min(len(labels), int(figure.get_figwidth() / room)))
-        figure.legend(handles, labels, loc="outside upper center", ncols=columns)
+def show_legend(figure: plt.Figure, panels: Iterable[Axes]) -> None:
+    """What the lines of `panels` are, above all of them: within one, words would lie on what they are about. The first may
+    be empty, or lack what others have, while trials run."""
+    shown: dict[str, Artist] = {}
+    for panel in panels:
+        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
+            shown.setdefault(label, handle)
+    if shown:
+        room = max(0.6 + 0.075 * len(label) for label in shown)  # inches of the longest one
+        columns = max(1, min(len(shown), int(figure.get_figwidth() / room)))
+        figure.legend(shown.values(), shown.keys(), loc="outside upper center", ncols=columns)
 
 
 def name_axis(panel: Axes, name: str) -> None:

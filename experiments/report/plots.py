@@ -52,7 +52,7 @@ def plot_sweep(rows: Sequence[Row], sweep: Sweep, path: Path) -> None:
             )
             for panel, metric in zip(panels[0], metrics, strict=True):
                 _draw(panel, rows, sweep, metric)
-            show_legend(figure, panels[0, 0])
+            show_legend(figure, panels.flat)
         save(figure, path)
 
 
@@ -76,7 +76,7 @@ def plot_overview(rows: Sequence[Row], sweeps: Sequence[Sweep], path: Path) -> N
                 _draw(panel, own, sweep, metric)
                 if column:
                     panel.set_ylabel("")
-        show_legend(figure, panels[0, 0])
+        show_legend(figure, panels.flat)
         save(figure, path)
 
 

@@ -204,6 +204,7 @@ def test_what_lines_are_is_said_outside_of_panels(drawn, tmp_path, monkeypatch):
     rows, width, steps = rows_of(drawn, [plan_width(STUDY)]), plan_width(STUDY), plan_horizon(CPU_FULL)
     plots.plot_sweep(rows, width, tmp_path / "width.png")
     plots.plot_overview(rows, [width, steps], tmp_path / "scaling.png")
+    plots.plot_overview(rows, [steps, width], tmp_path / "scaling.png")  # nothing of the first has finished
     several = replace(width, points=tuple(replace(p, series=f"width {p.x}") for p in width.points))
     plots.plot_sweep([replace(r, series=f"width {r.x}") for r in rows], several, tmp_path / "several.png")
     for figure in kept:
