@@ -155,6 +155,7 @@ def _require_kinds(given: Any, where: str) -> Any:
 def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str) -> None:
     for one in trial.with_source():
         _require_fits(study, one, where)
+    require(bool(scope), f"{where} is averaged over no robot; name those that it judges in `scope`")
     known = {name for one in trial.with_source() for name in one.datasets}
     for names, of, what in (
         (known, study.all_names(), "is trained on {}, which the study does not have"),

@@ -154,6 +154,10 @@ def plan(study):
         (OWN.format("trial"), "has the same trial at 1 and 3: nothing of it changes there"),
         (OWN.format("None"), "axis own: change has to return a trial, and returned None"),
         (OWN.replace("(1, 3)", "()"), "line 5: axis own: values is empty, so that its control alone would run"),
+        (
+            OWN.replace("study.dataset_names()", "()").format("trial"),
+            "trial at 1 is averaged over no robot; name those",
+        ),
         (OWN.format("replace(trial, tau=2.0 + x)"), r"does not stand at reference_x 3, .* \(tau: 3.0 -> 5.0\)"),
         (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "trial at 1 has a setting of a wrong kind .*tau"),
         (OWN.format("replace(trial, datasets=list(trial.datasets)) if x == 1 else trial"), "a list where a tuple"),
