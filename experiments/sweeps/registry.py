@@ -161,9 +161,17 @@ def _require_trial(study: Study, trial: Trial, scope: Sequence[str], where: str)
         (known, study.all_names(), "is trained on {}, which the study does not have"),
         (trial.evaluated, known, "judges {} and is not trained on it; leave it out of `evaluated`"),
         (scope, trial.evaluated, "does not judge {}, over which the axis averages; leave it out of `scope`"),
+        (trial.capped, trial.datasets, "caps trajectories of {} and is not trained on it; leave it out of `capped`"),
     ):
         without = [name for name in names if name not in of]
         require(not without, f"{where} {what.format(few(without))}")
+    twice = [name for name, count in Counter(scope).items() if count > 1]
+    require(
+        not twice,
+        f"{where} is averaged over {few(twice)} more than once; robots count equally: name each once in `scope`",
+    )
+    most = trial.max_trajectories
+    require(most is None or most >= 1, f"{where}: max_trajectories must be at least 1, or None for all, got {most}")
 
 
 def _require_fits(study: Study, trial: Trial, where: str) -> None:

@@ -158,6 +158,18 @@ def plan(study):
             OWN.replace("study.dataset_names()", "()").format("trial"),
             "trial at 1 is averaged over no robot; name those",
         ),
+        (
+            OWN.replace("names(), (", "names() + study.dataset_names()[:1], (").format("replace(trial, tau=float(x))"),
+            "trial at 1 is averaged over arm more than once; robots count equally",
+        ),
+        (
+            OWN.format("replace(trial, capped=('rovre',)) if x == 1 else trial"),
+            "trial at 1 caps trajectories of rovre and",
+        ),
+        (
+            OWN.format("replace(trial, max_trajectories=0) if x == 1 else trial"),
+            "trial at 1: max_trajectories must be at",
+        ),
         (OWN.format("replace(trial, tau=2.0 + x)"), r"does not stand at reference_x 3, .* \(tau: 3.0 -> 5.0\)"),
         (OWN.format("replace(trial, tau='3' if x == 1 else 3.0)"), "trial at 1 has a setting of a wrong kind .*tau"),
         (OWN.format("replace(trial, datasets=list(trial.datasets)) if x == 1 else trial"), "a list where a tuple"),
