@@ -121,6 +121,8 @@ def _require_trials(study: Study, sweep: Sweep, where: str) -> None:
         known = (POINT, CONTROL, STANDARD)
         require(p.role in known, f"{where}: the role of point {number} has to be one of {known}, and is {p.role!r}")
         at = f"{where}: the trial at {p.x:g}"
+        shuffled = p.role != CONTROL or p.trial.shuffle_actions
+        require(shuffled, f"{at} is a control and is not trained on shuffled actions; make it by control_of(trial)")
         same = _require_kinds(p, at) == p
         require(same, f"{at} has a setting of a wrong kind: a list where a tuple belongs, or a number that is none")
         _require_trial(study, p.trial, p.scope or sweep.scope, at)

@@ -198,6 +198,7 @@ def plan(study):
         (POINTS.format("reference_trial(study, 0)"), "point 1 has to be a Point with a Trial, and has a Trial"),
         (POINTS.format("Point('wide', reference_trial(study, 0))"), "position 'wide' of point 1 is no number"),
         (EDITED.format("role='extra'"), "role of point 1 has to be one of .*'control'.*, and is 'extra'"),
+        (EDITED.format("role='control'"), "trial at 8 is a control and is not trained on shuffled actions; make it by"),
         (EDITED.format("series='long'"), "some points have a series and others none"),
         (EDITED.format("x=0, series='long'") + LABELLED, "has labels and several series"),
         ("from experiments.sweeps.width import plan", "'width' is taken"),
