@@ -223,7 +223,7 @@ class CurvePoint:
     sem: float
     seed_sem: float
     seeds: dict[int, float]  # the mean of each
-    parameters: int
+    parameters: tuple[int, ...]  # the numbers that its seeds have, in order: several where robots are drawn
     label: str = ""
 
 
@@ -258,7 +258,7 @@ def curve(
             CurvePoint(
                 x, mean, sem=math.sqrt(spread + episodes),
                 seed_sem=math.sqrt(spread) if len(group) > 1 else math.nan,
-                seeds={r.seed: r.mean for r in group}, parameters=group[0].parameters, label=group[0].label,
+                seeds={r.seed: r.mean for r in group}, parameters=tuple(sorted({r.parameters for r in group})), label=group[0].label,
             )
         )  # fmt: skip
     return points

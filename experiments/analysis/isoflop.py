@@ -47,9 +47,14 @@ class Budget:
     misfit: str = ""  # whether sizes lie off the parabola by more than seeds scatter
 
     @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is doubtful of the best size."""
+        return tuple(filter(None, (self.doubt, self.misfit)))
+
+    @property
     def remarks(self) -> str:
         """Why there is no best size, or what is doubtful of it."""
-        return self.refused or "; ".join(filter(None, (self.doubt, self.misfit)))
+        return self.refused or "; ".join(self.doubts)
 
     def at(self, sizes: np.ndarray) -> np.ndarray:
         """The parabola's loss."""

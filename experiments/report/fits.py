@@ -42,11 +42,11 @@ def fit_rows(fits: Sequence[Fitted], isoflop: IsoFlop | None) -> list[FitRow]:
     if isoflop is not None:
         coefficients = (isoflop.exponent,) if isoflop.exponent else ()
         best = [b for b in isoflop.budgets if b.best]
-        doubts = tuple(f"{b.flops:.4g} FLOPs: {b.doubt}" for b in best if b.doubt)
+        doubts = tuple(f"{b.flops:.4g} FLOPs: {b.remarks}" for b in best if b.doubts)
         rows += _rows(("isoflop", "training FLOPs", len(best)), coefficients, isoflop.refused, doubts)
         for b in isoflop.budgets:
             said = (f"isoflop {b.flops:.4g}", "trunk parameters", len(b.sizes))
-            rows += _rows(said, (b.best,) if b.best else (), b.refused, (b.doubt,) if b.doubt else ())
+            rows += _rows(said, (b.best,) if b.best else (), b.refused, b.doubts)
     return rows
 
 

@@ -214,7 +214,7 @@ def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
     path = workspace.tokenizer / "quality.json"
     try:
         quality = json.loads(path.read_text())
-        return CurvePoint(0, float(quality["mean"]), float(quality["sem"]), math.nan, {}, 0)
+        return CurvePoint(0, float(quality["mean"]), float(quality["sem"]), math.nan, {}, ())
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError) as error:

@@ -124,12 +124,14 @@ def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room:
 
 
 def show_control(panel: Axes, points: list[CurvePoint]) -> None:
-    """The trials on shuffled actions, where on the axis they stand, with their standard errors."""
+    """The trials on shuffled actions, where on the axis they stand, with their standard errors. One seed of them, as there
+    mostly is, stands beside means over several: it is said."""
     if points:
+        alone = all(len(p.seeds) == 1 for p in points)
         panel.errorbar(
             [p.x for p in points], [p.mean for p in points], [p.sem if p.sem > 0 else 0.0 for p in points],
             fmt="s", color=MUTED, markersize=5, markerfacecolor="white", capsize=3, elinewidth=1.2, zorder=2,
-            label="trained on shuffled actions",
+            label="trained on shuffled actions" + ", one seed" * alone,
         )  # fmt: skip
 
 

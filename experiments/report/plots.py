@@ -108,7 +108,8 @@ def _draw(panel: Axes, rows: Sequence[Row], sweep: Sweep, metric: str) -> None:
     else:
         panel.axhline(0, color=MUTED, linewidth=0.9, zorder=1)
     show_tally(panel, rows, sweep.name)
-    name_axis(panel, sweep.axis + (" · trunk parameters" if sweep.name == "width" else ""))
+    whose = " · controls: on their seed's robots alone" if sweep.drawn else ""
+    name_axis(panel, sweep.axis + (" · trunk parameters" if sweep.name == "width" else "") + whose)
     panel.set_ylabel(LABELS[metric])
 
 

@@ -126,9 +126,14 @@ def _curve(sweep: Sweep, rows: Sequence[Row], changes: Sequence[Change], series:
         here = [column.get(x) for column in columns.values()]
         known = next(p for p in here if p)
         values = [pm(p.mean, p.sem) if p else "–" for p in here]
-        lines.append([f"{x:,}", f"{known.parameters:,}", *values, str(len(known.seeds))])
+        lines.append([f"{x:,}", _parameters(known), *values, str(len(known.seeds))])
     numbers = table([sweep.axis, "parameters, all robots", *(HEADINGS[m] for m in columns), "seeds"], lines)
     return numbers + _change([c for c in changes if (c.sweep, c.series) == (sweep.name, series)])
+
+
+def _parameters(point: CurvePoint) -> str:
+    """From the fewest to the most of its seeds, which train on robots of their own in the designs over robots."""
+    return " to ".join(f"{n:,}" for n in dict.fromkeys((point.parameters[0], point.parameters[-1])))
 
 
 def _change(changes: Sequence[Change]) -> str:
@@ -160,7 +165,7 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
         known = next((p for p in here.values() if p), None)
         if known is None:
             continue
-        cells = [_bold(label, x == sweep.reference_x), f"{known.parameters:,}"]
+        cells = [_bold(label, x == sweep.reference_x), _parameters(known)]
         for metric, p in here.items():
             default = columns[metric].get(sweep.reference_x)
             cells += [pm(p.mean, p.seed_sem) if p else "–", _difference(p, default)]
@@ -171,12 +176,13 @@ def _names(sweep: Sweep, rows: Sequence[Row]) -> str:
     head = [sweep.axis, "parameters, all robots"]
     for metric in columns:
         head += [HEADINGS[metric], "to the default"]
-    judged = "all variants are judged on the same windows"
+    judged, whose = "all variants are judged on the same windows", ""
     if sweep.drawn:
         judged = "each seed judges robots of its own, all variants on the same windows of these"
+        whose = " The default trained on shuffled actions is of one seed and its robots: not to be held against means."
     return table([*head, "seeds"], lines) + (
         f"<p>Bold: the default. Errors are standard errors over seeds, as in the figure: {judged}, so that windows do "
-        "not add to a difference. Differences are taken seed by seed.</p>"
+        f"not add to a difference. Differences are taken seed by seed.{whose * any(controls.values())}</p>"
     )
 
 

@@ -173,7 +173,7 @@ def test_figures_show_what_the_table_says(drawn, tmp_path, monkeypatch):
         points = curve(rows, "width", metric)
         shown = bars["mean ± s.e."].lines[0].get_xydata()
         np.testing.assert_allclose(shown, [(p.x, p.mean) for p in points])
-        assert bars["trained on shuffled actions"].lines[0].get_xdata().tolist() == [sweep.reference_x]
+        assert bars["trained on shuffled actions, one seed"].lines[0].get_xdata().tolist() == [sweep.reference_x]
         low, high = sorted(panel.get_ylim())
         labelled = [t for t in panel.yaxis.get_ticklabels() if t.get_text() and low <= t.get_position()[1] <= high]
         assert len(labelled) >= 3

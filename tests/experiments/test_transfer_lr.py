@@ -131,7 +131,7 @@ def test_an_optimum_at_an_end_of_the_grid_leaves_open_how_far_the_best_rate_move
 
 
 def point(x: float, *losses: float) -> CurvePoint:
-    return CurvePoint(x, sum(losses) / len(losses), 0.0, 0.0, dict(enumerate(losses)), 100)
+    return CurvePoint(x, sum(losses) / len(losses), 0.0, 0.0, dict(enumerate(losses)), (100,))
 
 
 def test_rates_that_seeds_do_not_tell_apart_are_as_good():

@@ -48,6 +48,15 @@ def test_a_deaf_model_has_as_many_robots_beyond_as_is_said():
     assert found == pytest.approx(said, abs=3 * said**0.5)
 
 
+def test_a_robot_without_actions_is_never_there_by_chance():
+    """It has the value of a deaf model in every window; it was counted as one that might be far from it."""
+    table = judged(np.random.default_rng(3), robots=6, episodes=4)
+    values = np.where(table.dataset == "r0", 1e-7, table.metrics["cross_entropy"])  # up to rounding
+    rows = controllability({0: replace(table, metrics={"delta_psnr": values})})
+    assert beyond(rows, "delta_psnr")[1] == 6
+    assert by_chance(rows, "delta_psnr") == pytest.approx(5 * 0.0697, rel=1e-3)
+
+
 def test_rounding_is_no_control():
     """Always the same 1e-6 dB: many standard errors, and nothing."""
     rows = controllability({0: model(0.0, shift=1e-6)})

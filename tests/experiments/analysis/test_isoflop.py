@@ -69,6 +69,9 @@ def test_sizes_off_the_parabola_are_said(steeper, seeds):
     assert all(said) if steeper and seeds > 1 else not any(said)
     page = describe_fits([], fit, [], "")
     assert page.count("off the parabola by more than seeds scatter") == sum(said)
+    exponent, *best = fit_rows([], fit)
+    assert ["off the parabola" in row.doubts for row in best] == said
+    assert exponent.doubts.count("off the parabola") == sum(said)
 
 
 def test_noise_that_leaves_no_minimum_is_said():
