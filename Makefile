@@ -29,8 +29,9 @@ help:
 study: $(VENV)/installed$(addprefix -,$(EXTRA))
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
+# Of the committed model tokens are drawn: objects stay longer (docs/endurance.md).
 play: $(VENV)/installed-play
-	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play $(RUN) --port $(PORT)
+	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play $(if $(RUN),$(RUN),--temperature 0.7) --port $(PORT)
 
 # One process per core, each with its own JAX; compiled programs are shared through .jax_cache.
 PYTEST = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/python -m pytest -q
