@@ -139,7 +139,10 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
     drawn = by_place("drawn_ten.csv")
     training = [gain("object_found", [(row, drawn[k]) for k, row in ten.items() if k[2] >= first]) for first in (10, 2)]
     psnr = gain("psnr", [(row, drawn[k]) for k, row in ten.items() if k[2] >= 2])
-    said = "found in {:.2f} ± {:.2f} more of the frames of the last minute, from the second on in {:.2f} ± {:.2f} more (PSNR {:+.1f} ± {:.1f} dB)"
+    said = (
+        "found in {:.2f} ± {:.2f} more of the frames of the last minute, from the second on in {:.2f} ± {:.2f} more "
+        "(PSNR {:+.1f} ± {:.1f} dB)"
+    )
     assert said.format(*training[0], *training[1], *psnr) in page
 
     minute, drawn = gains("kept", "object_found", "grown"), gains("drawn", "object_found", "grown")
