@@ -145,24 +145,6 @@ def test_policies_and_plans_are_as_readme_says():
     assert cells == [f"{100 * planned_by_mppi().mean():.0f} %", f"cloned policies {100 * cloned().mean():.0f} %"]
 
 
-def test_policies_are_judged_with_drawn_tokens_as_their_page_says():
-    rows = table(ROOT / "docs/judging.md", "| 50 starts of each policy, drawn |")
-    assert {label.split()[0] for label in rows} == {"pusher_sand", "arm_chalk"}
-    for label, cells in rows.items():
-        place = ROOT / f"experiments/results/judge-{label.split()[0]}-reach-drawn"
-        found = json.loads((place / "agreement.json").read_text())["agreement"]
-        learned, control = (
-            found[world]["policies and starts"] for world in ("learned model", "control: actions of other episodes")
-        )
-        shown = [
-            f"{x['mean']:.2f} ({x['low']:.2f} to {x['high']:{sign}.2f})"
-            for x, sign in (
-                (learned["pearson"], ""), (learned["spearman"], ""), (learned["bias"], "+"), (control["pearson"], ""),
-            )
-        ]  # fmt: skip
-        assert cells == shown, label
-
-
 def planned_by_mppi() -> np.ndarray:
     """Success [starts] in the served model, from the further starts."""
     trials = read_trials(ROOT / "experiments/results/planning_more/trials.csv")
