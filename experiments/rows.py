@@ -258,7 +258,8 @@ def curve(
             CurvePoint(
                 x, mean, sem=math.sqrt(spread + episodes),
                 seed_sem=math.sqrt(spread) if len(group) > 1 else math.nan,
-                seeds={r.seed: r.mean for r in group}, parameters=tuple(sorted({r.parameters for r in group})), label=group[0].label,
+                seeds={r.seed: r.mean for r in group}, label=group[0].label,
+                parameters=tuple(sorted({r.parameters for r in group})),
             )
         )  # fmt: skip
     return points

@@ -204,11 +204,11 @@ class EpisodeSource(ABC):
         for n, key in enumerate(action_keys):
             field, part = field_slice(key)
             feature = self.features.get(step_key(field))
-            require(
-                feature is None or not feature.encoding,
-                f"{self.name}: {field!r} in {self.schema} is kept as bytes (encoding {feature and feature.encoding!r}), "
-                "which are not read; write the dataset again with encoding 'none' for it, or take another field.",
-            )
+            if feature is not None and feature.encoding:
+                raise ConfigError(
+                    f"{self.name}: {field!r} in {self.schema} is kept as bytes (encoding {feature.encoding!r}), which are "
+                    "not read; write the dataset again with encoding 'none' for it, or take another field."
+                )
             if feature is None or not feature.size:
                 raise ConfigError(
                     f"{self.name}: no numeric field {field!r} in {self.schema}; "

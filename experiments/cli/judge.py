@@ -41,11 +41,11 @@ def judge(
     """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
 
     Policies act on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and a random
-    one; the model itself, where it was trained to predict actions as well; your own. Success in the model is told by a head, in the truth by
-    the state; the head looks at true frames too, and a control executes what a policy does in another episode. A robot
-    without a true simulator is judged in the model alone, by a head that learns from recordings. Writes table, agreement
-    with intervals, a page with clips, and a page on which a person can label successes blindly. Goes on where it was
-    stopped. docs/judging.md says how to read it.
+    one; the model itself, where it was trained to predict actions as well; your own. Success in the model is told by a
+    head, in the truth by the state; the head looks at true frames too, and a control executes what a policy does in
+    another episode. A robot without a true simulator is judged in the model alone, by a head that learns from
+    recordings. Writes table, agreement with intervals, a page with clips, and a page on which a person can label
+    successes blindly. Goes on where it was stopped. docs/judging.md says how to read it.
 
     Args:
         run: Directory of a training run, or experiments/results/simulator.

@@ -90,10 +90,10 @@ def modernise(described: dict[str, Any], where: str = "the checkpoint") -> dict[
 def require_frames(run: Run, deed: str) -> None:
     """Raises ConfigError for a policy and for inverse dynamics, whose frames nothing was learnt of: there are none to
     `deed`."""
-    setting = run.train.masking.setting
+    masking = run.train.masking
     require(
-        setting in PREDICT_FRAMES,
-        f"the model was trained with train.masking.setting {setting!r}, which predicts no frames: there are none to "
+        masking.predicts_frames,
+        f"the model was trained with train.masking.setting {masking.setting!r}, which predicts no frames: there are none to "
         f"{deed}. `hma evaluate` judges its actions; for this take a model that was trained with one of "
         f"{', '.join(PREDICT_FRAMES)}",
     )

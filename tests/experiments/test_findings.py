@@ -1,54 +1,32 @@
-"""What findings.md and README say of cpu-full's axes follows from what is kept of its trials."""
+"""What is said of the axes of cpu-full and of its model on latents, and of where things stand in models of eight robots,
+follows from what is kept of them."""
 
 import csv
-import functools
 import json
 import re
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from data_pipelines.suite.embodiments import TRAINED
-from experiments.analysis.compare import Side, compare
-from experiments.analysis.preregistered import FILE, Expected, read_expected, what_came
+from experiments.analysis.preregistered import FILE, Expected, read_expected
 from experiments.applications.detector import CLOSE
 from experiments.applications.in_place import in_place
 from experiments.report.findings import read_findings
-from experiments.report.robots import Robot, robots_of
-from experiments.rows import OVERALL, CurvePoint, Row, all_series, curve, difference, read_rows
-from experiments.running.trial import trial_id
+from experiments.rows import OVERALL, CurvePoint, all_series, curve, difference
 from experiments.running.workspace import Workspace, load_record
-from experiments.sweeps.registry import plan_sweeps
 from experiments.sweeps.sweep import CONTROL, POINT
-from hma_jax.evaluation.windows import FILE as WINDOWS
-from hma_jax.evaluation.windows import WindowTable
-
-ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "experiments" / "results"
-
-
-def findings(study: str = "cpu-full") -> str:
-    return (RESULTS / study / "findings.md").read_text()
-
-
-@functools.cache
-def rows_of(study: str = "cpu-full") -> tuple[Row, ...]:
-    """The rows of its tables, which most tests need and which take seconds to read."""
-    return tuple(read_rows(Workspace(RESULTS / study)))
-
-
-def in_place_rows(name: str) -> list[dict[str, str]]:
-    """Where things stand at the end of windows of one model."""
-    with open(RESULTS / "in_place" / f"{name}.csv", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def readme() -> str:
-    """On one line."""
-    return " ".join((ROOT / "README.md").read_text().split())
+from tests.experiments.committed_findings import (
+    ACTING,
+    RESULTS,
+    ROOT,
+    counts,
+    findings,
+    in_place_rows,
+    readme,
+    robots_at,
+    rows_of,
+)
 
 
 def test_the_first_axis_by_how_much_data_a_robot_has_is_as_its_findings_say():
@@ -61,33 +39,6 @@ def test_the_first_axis_by_how_much_data_a_robot_has_is_as_its_findings_say():
         means = [np.mean([r.mean for r in mine if r.x == n]) for n in (500, 1000, 2000, 4000, 8000, 16_000)]
         line = " | ".join([str(len({r.scope for r in mine})), *(f"{mean:.2f}" for mean in means)])
         assert f"| {line} |" in page, line
-
-
-ACTING = {e.name for e in TRAINED if not e.video_only}
-"""Robots that are trained with actions."""
-
-
-@functools.cache
-def robots_at(study: str, axis: str, role: str = POINT) -> dict[float, tuple[list[Robot], int]]:
-    """{x: (every robot, from every window's numbers, trials)} of the points of `role` of an axis of a study."""
-    workspace = Workspace(RESULTS / study)
-    record = load_record(workspace)
-    (sweep,) = plan_sweeps(record.study, (axis,))
-    points = tuple(replace(p, role=POINT) for p in sweep.points if p.role == role)
-    found = {}
-    for x in sorted({p.x for p in points}):
-        ids = [trial_id(p.trial, record.provenance) for p in points if p.x == x]
-        windows = {id: WindowTable.load(workspace.trials / id / WINDOWS) for id in ids}
-        at_x = replace(sweep, points=points, reference_x=x)
-        found[x] = robots_of([], at_x, record.provenance, windows), len(ids)
-    return found
-
-
-def counts(robots: list[Robot]) -> list[int]:
-    """How many are ahead of copying; of those that act, action-nats beyond 3 standard errors, delta PSNR beyond 2."""
-    follow = [r.follows for r in robots if r.name in ACTING]
-    beyond = [sum(f[metric].errors > n for f in follow) for metric, n in (("action_nats", 3), ("delta_psnr", 2))]
-    return [sum(r.ahead > 0 for r in robots), *beyond]
 
 
 def horizon_rows() -> list[str]:
@@ -344,56 +295,6 @@ def test_what_was_predicted_of_newcomers_and_settings_is_as_findings_say():
             assert re.search(rf"{e.mean:.2f}( nats| behind it)? {re.escape(interval)}", section), (x, interval)
 
 
-def test_what_was_predicted_of_the_ladder_is_as_its_findings_say():
-    """Bold where it did not hold."""
-    page, expected = findings("ladder"), list(read_expected(RESULTS / "ladder" / "predictions" / FILE))
-    assert len(expected) == 20
-    for c in what_came(expected, rows_of("ladder")):
-        e, came = c.expected, "not run"
-        if c.observed is not None:
-            came = f"{c.observed:+.2f}" if e.against else f"{c.observed:.2f}"
-            came = came if c.inside else f"**{came}**"
-        about = f" beside {e.against}" * bool(e.against) + "".join(f", seed {seed}" for seed in e.seeds)
-        assert f"| {e.x}{about} | {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.x, came)
-
-
-def test_what_counting_changes_thrice_gives_is_as_findings_of_the_ladder_say():
-    page, early, late, tenfold = " ".join(findings("ladder").split()), {}, {}, {}
-    for metric in ("cross_entropy", "psnr", "action_nats", "delta_psnr"):
-        points = {p.label.removeprefix("recall, Muon, "): p for p in curve(rows_of("ladder"), "ladder", metric)}
-        mean, error = difference(points["changes thrice, 4,000 steps"], points["4,000 steps"])
-        assert len(points["changes thrice, 4,000 steps"].seeds) == 3
-        early[metric] = f"{mean:.3f} ± {error:.3f}"
-        late[metric], _ = difference(points["changes thrice, 32,000 steps"], points["32,000 steps"])
-        tenfold[metric] = [
-            difference(points[f"changes {n}, 4,000 steps"], points["4,000 steps"])[0] for n in ("thrice", "tenfold")
-        ]
-    said = "{cross_entropy} nats are lost; {psnr} dB of PSNR, {action_nats} action-nats and {delta_psnr} dB of ΔPSNR are gained"
-    assert said.format(**early) in page
-    said = "{psnr:+.2f} dB of PSNR, {action_nats:+.2f} action-nats, {delta_psnr:+.2f} dB of ΔPSNR, and of what moved"
-    assert said.format(**late) in page and f"{late['cross_entropy']:.2f} nats are still lost" in page
-    assert 4.5 < tenfold["cross_entropy"][1] / tenfold["cross_entropy"][0] < 5.5
-    shares = [in_place(in_place_rows(name), "model") for name in ("ladder-thrice", "ladder")]
-    said = "{:.1f} ± {:.1f} % in place, {:.1f} ± {:.1f} % without"
-    assert said.format(*(100 * x for mean, half, _ in shares for x in (mean, half))) in page
-
-
-def test_how_many_robots_of_the_ladder_follow_is_as_its_findings_say():
-    page = findings("ladder").splitlines()
-    labels = [p.label for p in curve(rows_of("ladder"), "ladder", "psnr")]
-    found = {labels[int(x)]: counts(robots) for x, (robots, _) in robots_at("ladder", "ladder").items()}
-    ((controls, _),) = robots_at("ladder", "ladder", CONTROL).values()
-    for label, said in (found | {"reference, control": counts(controls)}).items():
-        [line] = [line for line in page if re.match(rf"\| {label} \| \d", line)]
-        assert line.endswith(f" | {' | '.join(map(str, said))} |"), (label, said)
-    x = labels.index("recall, Muon, 64,000 steps")
-    gain = np.mean([r.ahead for r in robots_at("ladder", "ladder")[x][0]])
-    psnr = curve(rows_of("ladder"), "ladder", "psnr")[x].mean
-    share, _, _ = in_place(in_place_rows("ladder-64000"), "model")
-    assert f"a better recipe and 64,000 come to {psnr:.2f} dB and {100 * share:.0f} %" in readme()
-    assert f"64,000 steps, is {gain:.2f} dB ahead of copying**, on {found[labels[x]][0]} of 40 robots" in " ".join(page)
-
-
 def test_the_reference_on_latents_is_as_its_findings_say():
     study = "cpu-full-continuous"
     page = " ".join(findings(study).split())
@@ -411,53 +312,6 @@ def test_the_reference_on_latents_is_as_its_findings_say():
         (point,) = curve(rows_of(study), "horizon", e.metric)
         came = f"{point.mean:.2f}" if e.low <= point.mean <= e.high else f"**{point.mean:.2f}**"
         assert f"| {e.metric} | {e.mean:g} ({e.low:g} to {e.high:g}) | {came} |" in page, (e.metric, came)
-
-
-SIXTEEN_BITS = {0: "87031510e024dba4", 1: "e0ed9450a3926807", 2: "5be8301a53ed7f53"}
-"""Seed -> the trial of the ladder with recall and Muon, 4,000 steps."""
-
-
-@pytest.mark.parametrize("bits", [8, 24])
-def test_what_tokens_of_other_bits_give_is_as_findings_of_the_ladder_say(bits):
-    folder = RESULTS / "tokenizers" / f"bits{bits}"
-    other = Side(
-        folder.name, {s: WindowTable.load(folder / f"seed{s}" / WINDOWS) for s in SIXTEEN_BITS}, f"{bits} bits"
-    )
-    trials = RESULTS / "ladder" / "trials"
-    usual = Side("bits16", {s: WindowTable.load(trials / id / WINDOWS) for s, id in SIXTEEN_BITS.items()}, "16 bits")
-    found = {(d.scope, d.metric): d for d in compare(other, usual)}
-    quality = json.loads((folder / "quality.json").read_text())["mean"]
-    cells = [str(bits), f"{quality:.1f}"]
-    for metric in ("psnr", "delta_psnr"):
-        d = found[OVERALL, metric]
-        cells += [f"{d.a:.2f}", f"{d.mean:+.2f} ({d.low:+.2f} to {d.high:+.2f})"]
-    assert f"| {' | '.join(cells)} |" in findings("ladder")
-
-
-def test_where_robots_of_the_ladder_stand_is_as_its_findings_say():
-    """Beside the same robots of cpu-full's long reference."""
-    page = " ".join(findings("ladder").split())
-    longest, before = in_place_rows("ladder-64000"), in_place_rows("ladder")
-    robots = {row["robot"] for row in before}
-    of_others = [row for row in in_place_rows("32000") if row["robot"] in robots]
-
-    def share(mine: list[dict[str, str]], view: str = "model") -> str:
-        mean, half, count = in_place(mine, view)
-        assert count == len(robots) == 12
-        return f"{100 * mean:.1f} ± {100 * half:.1f} %"
-
-    tools, objects = ([r for r in longest if r["what"].startswith(kind)] for kind in ("tool", "colour"))
-    said = (
-        f"of what moved, {share(longest)} stands within 2 pixels of 32 of its place in the last frame of a window after"
-    )
-    assert f"{said} 64,000 steps, {share(before)} after 32,000" in page
-    assert f"{share(of_others)} on the same twelve robots" in page
-    assert share(longest, "true") == share(before, "true") and f"true frames {share(longest, 'true')}" in page
-    as_tokens = f"in true frames as the tokenizer shows them it is {share(longest, 'tokens')}"
-    assert (
-        f"Of tools it is {share(tools)}, of objects {share(objects)}. The tokens are not what limits it: {as_tokens}."
-        in page
-    )
 
 
 def test_where_things_stand_in_models_of_eight_robots_is_as_the_page_on_designs_says():

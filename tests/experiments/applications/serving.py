@@ -58,6 +58,15 @@ async def ask(socket: ClientWebSocketResponse, **message: Any) -> dict[str, Any]
     return await hear(socket)
 
 
+async def until(true) -> None:
+    """Waits for it, not forever."""
+    for _ in range(int(SECONDS * 100)):
+        if true():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("it never was")
+
+
 class Player:
     """A visitor who begins an episode and drives."""
 

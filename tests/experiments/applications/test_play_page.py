@@ -23,8 +23,8 @@ from PIL import Image  # noqa: E402
 
 from experiments.applications.play import crowd, server  # noqa: E402
 from experiments.applications.play.server import CROWD  # noqa: E402
-from tests.experiments.applications.serving import serving  # noqa: E402
-from tests.experiments.applications.test_play_server import FakeTruth, until  # noqa: E402
+from tests.experiments.applications.serving import serving, until  # noqa: E402
+from tests.experiments.applications.test_play_server import FakeTruth  # noqa: E402
 
 CHROMIUM = os.environ.get("PLAYWRIGHT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 PATIENCE = 60_000

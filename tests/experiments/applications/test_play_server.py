@@ -2,14 +2,10 @@
 
 import asyncio
 import contextlib
-import io
 import json
-import os
 import resource
-import signal
 import threading
 import time
-import zipfile
 from copy import copy
 from dataclasses import replace
 
@@ -19,21 +15,13 @@ import pytest
 
 pytest.importorskip("aiohttp", reason="needs the extra `play`")
 
-from aiohttp.test_utils import TestServer
 
-from data_pipelines.sources.rlds.dataset import RldsDataset
 from experiments.applications.play import crowd as crowd_module
 from experiments.applications.play import server
 from experiments.applications.play.crowd import REPLIES, Visitor
-from experiments.applications.play.recording import Recording
 from experiments.applications.play.turn import Seat
-from experiments.cli.main import main
-from hma_jax.config import ConfigError, require
-from hma_jax.runtime.exits import Exit
-from hma_jax.simulator.folder import DECODE, USUAL, save_decode
-from hma_jax.simulator.robots import Robot
-from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving
-from tests.hma_jax.simulator.small import simulator, start
+from hma_jax.config import require
+from tests.experiments.applications.serving import SECONDS, Player, ask, hear, serving, until
 
 
 def test_the_page_and_what_it_must_know_are_served():
@@ -95,15 +83,6 @@ def test_a_second_window_takes_over_and_the_first_is_told():
     serving(test)
 
 
-async def until(true) -> None:
-    """Waits for it, not forever."""
-    for _ in range(int(SECONDS * 100)):
-        if true():
-            return
-        await asyncio.sleep(0.01)
-    raise AssertionError("it never was")
-
-
 def test_what_the_first_window_asked_for_is_not_answered_to_the_second():
     async def test(client):
         first, second = Player(client), Player(client)
@@ -146,84 +125,6 @@ def test_as_many_act_at_once_as_programs_are_compiled_for_and_all_take_turns():
         assert max(at_once) == 2
 
     serving(test, together=1)
-
-
-def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
-    from experiments.applications import simulators
-
-    asked = []
-
-    def load(*_, decode, **__):
-        asked.append(decode.slide)
-        raise ConfigError("enough is known")
-
-    monkeypatch.setattr(simulators, "load_simulator", load)
-    save_decode(replace(USUAL, slide="streaming"), tmp_path / DECODE)
-    for more in ([], ["--window", "exact"]):
-        assert main(["play", str(tmp_path), *more]) == 2
-    assert asked == ["streaming", "exact"]
-
-
-def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp_path):
-    from experiments.applications import simulators
-    from experiments.cli.play import play
-
-    first = []
-
-    async def serve(app, host, port, ready):
-        async with TestServer(app):
-            first.append(app[server.CROWD].together)
-            ready(port)
-            await until(lambda: app[server.CROWD].together == 2)
-
-    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
-    monkeypatch.setattr(server, "serve", serve)
-    play(tmp_path, visitors=2)
-    assert first == [1]
-
-
-def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, capsys):
-    """Those of a model that robots were added to: there are frames of these alone."""
-    from experiments.applications import simulators
-    from hma_jax.simulator import warm_up
-
-    model = simulator(episodes=1)
-    model.starts = (start(0, 2),)
-    first, *others = model.robots
-    monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: model)
-    monkeypatch.setattr(warm_up, "warm_up", lambda *_, **__: require(False, "enough is said"))
-    assert main(["play", str(tmp_path)]) == 2
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"not on the page: {', '.join(others)}; there are no held-out frames" in said
-    assert said.endswith(f"{tmp_path}: {first}; compiling")
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
-def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, monkeypatch, tmp_path, capsys):
-    from experiments.applications import simulators
-
-    async def serve(app, host, port, ready):
-        ready(port)
-        os.kill(os.getpid(), number)
-
-    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
-    monkeypatch.setattr(server, "serve", serve)
-    assert main(["play", str(tmp_path), "--visitors", "1"]) == code
-    assert capsys.readouterr().err.endswith("; the same command begins anew\n")
-
-
-def test_a_request_to_stop_that_was_lost_while_it_compiled_is_obeyed_before_it_serves(monkeypatch, tmp_path):
-    from experiments.applications import simulators
-    from hma_jax.simulator import warm_up
-
-    def lost(*_, **__):
-        with contextlib.suppress(KeyboardInterrupt):  # as in a library's callback
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
-    monkeypatch.setattr(warm_up, "warm_up", lost)
-    monkeypatch.setattr(server, "serve", lambda *_: pytest.fail("it serves"))
-    assert main(["play", str(tmp_path)]) == Exit.STOPPED
 
 
 def test_after_a_fault_of_the_device_all_begin_again_and_drive_on(monkeypatch):
@@ -493,56 +394,3 @@ def test_a_page_from_elsewhere_cannot_connect():
         assert answer.status == 403
 
     serving(test)
-
-
-def test_a_recording_is_a_video_and_a_dataset(tmp_path):
-    async def test(client):
-        player = Player(client)
-        await player.enter()
-        assert (await client.get(f"/recording/{player.token}/mp4")).status == 404
-        assert (await ask(player.socket, type="record", on=True))["recording"]
-        await player.drive(0.5, 3)
-        assert (await ask(player.socket, type="rewind", frames=1))["recorded"] == 3
-        await player.drive(0.45, 1)
-        assert (await ask(player.socket, type="record", on=False))["recorded"] == 4
-        await player.drive(0.5, 1)
-        assert (await ask(player.socket, type="rewind", frames=2))["recorded"] == 4, (
-            "a finished recording stays as it is"
-        )
-
-        video = await (await client.get(f"/recording/{player.token}/mp4")).read()
-        import av
-
-        with av.open(io.BytesIO(video)) as container:
-            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-        assert len(frames) == 4 and frames[0].shape == (32, 32, 3)
-
-        frame = await ask(player.socket, type="start", robot="pusher", start=0)
-        assert (frame["recorded"], frame["recording"]) == (4, False), "it can still be had when another episode begins"
-        packed = await (await client.get(f"/recording/{player.token}/rlds")).read()
-        zipfile.ZipFile(io.BytesIO(packed)).extractall(tmp_path)
-        ((images, actions),) = _episodes(tmp_path / "arm_played" / "1.0.0")
-        assert images.shape == (4, 8, 8, 3)
-        np.testing.assert_array_equal(actions[:, 0], np.float32([0.5, 0.5, 0.45, 0.0]))
-
-    serving(test)
-
-
-@pytest.mark.parametrize(("hz", "said"), [(10.0, 5.0), (5.0, 2.5), (0.0, None)])
-def test_a_recording_says_its_rate_where_it_is_known(hz, said):
-    recording = Recording(Robot("arm", 2, (0.0,), (1.0,), (0.0,), hz=hz))
-    recording.add(np.zeros((8, 8, 3), np.uint8), np.zeros((2, 1)), np.zeros((8, 8, 3), np.uint8))
-    metadata = json.loads(zipfile.ZipFile(io.BytesIO(recording.dataset())).read("arm_played/1.0.0/metadata.json"))
-    assert metadata.get("hz") == said
-    import av
-
-    with av.open(io.BytesIO(recording.video())) as container:
-        assert container.streams.video[0].average_rate == (said or 2), "the film is not in the robot's own time"
-
-
-def _episodes(directory):
-    source = RldsDataset(directory, "train")
-    for i in range(len(source)):
-        images = np.stack(source.frames(i, "observation/image", lambda steps: list(range(steps))))
-        with source.open_episode(i, "observation/image", ["action"]) as episode:
-            yield images, np.array(episode.actions)

@@ -43,18 +43,8 @@ def words_of(page: Path) -> str:
 def rows_of_trained() -> list[dict]:
     """Of all models that were watched for a minute from the same four starts of each robot."""
     names = (
-        "chained",
-        "weighed",
-        "long",
-        "mended",
-        "coarse",
-        "resumed",
-        "displaced",
-        "larger",
-        "grown",
-        "drawn",
-        "kept",
-    )
+        "chained", "weighed", "long", "mended", "coarse", "resumed", "displaced", "larger", "grown", "drawn", "kept",
+    )  # fmt: skip
     return [row for name in names for row in read_rows(RESULTS / f"{name}.csv")]
 
 

@@ -145,9 +145,9 @@ def test_what_a_displaced_past_adds_to_the_served_model_is_as_the_page_says():
     )
     assert said.format(*training[0], *training[1], *psnr) in page
 
-    minute, drawn = gains("kept", "object_found", "grown"), gains("drawn", "object_found", "grown")
+    minute, drawing = gains("kept", "object_found", "grown"), gains("drawn", "object_found", "grown")
     assert "objects are found in {:.2f} ± {:.2f} more of the frames than with".format(*minute) in page
-    assert '"drawn" finds {:.2f} ± {:.2f} more, and'.format(*drawn) in page
+    assert '"drawn" finds {:.2f} ± {:.2f} more, and'.format(*drawing) in page
     said = "training gains {:.2f} ± {:.2f}, which eight robots do not decide"
     assert said.format(*gains("kept", "object_found", "drawn")) in page
 
@@ -164,6 +164,8 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     last = [percent([row for k, row in of.items() if k[2] == 10]) for of in (drawn, grown)]
     tools = percent([row for k, row in drawn.items() if k[2] == 10], "tool_found")
     assert f"| {last[0]} % of objects, {tools} % of tools |" in words_of(ROOT / "README.md")
+    said = "objects are found in {} % of the frames of the last minute, in {} with the likeliest tokens"
+    assert said.format(*last) in words_of(ROOT / "docs" / "results.md")
     assert "**More objects stay**: {} % in the last minute, where the likeliest tokens keep {}:".format(*last) in page
     assert f"Objects are found in {last[0]} % of the frames of the last minute, not in all" in page
     apart = [x for m in (10, 2) for x in gain("object_found", [(r, grown[k]) for k, r in drawn.items() if k[2] >= m])]

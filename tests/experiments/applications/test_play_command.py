@@ -1,0 +1,98 @@
+"""`hma play`: what it asks for, says and answers signals with."""
+
+import contextlib
+import os
+import signal
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("aiohttp", reason="needs the extra `play`")
+
+from aiohttp.test_utils import TestServer
+
+from experiments.applications.play import server
+from experiments.cli.main import main
+from hma_jax.config import ConfigError, require
+from hma_jax.runtime.exits import Exit
+from hma_jax.simulator.folder import DECODE, USUAL, save_decode
+from tests.experiments.applications.serving import until
+from tests.hma_jax.simulator.small import simulator, start
+
+
+def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
+    from experiments.applications import simulators
+
+    asked = []
+
+    def load(*_, decode, **__):
+        asked.append(decode.slide)
+        raise ConfigError("enough is known")
+
+    monkeypatch.setattr(simulators, "load_simulator", load)
+    save_decode(replace(USUAL, slide="streaming"), tmp_path / DECODE)
+    for more in ([], ["--window", "exact"]):
+        assert main(["play", str(tmp_path), *more]) == 2
+    assert asked == ["streaming", "exact"]
+
+
+def test_the_command_lets_more_act_at_once_as_they_are_compiled(monkeypatch, tmp_path):
+    from experiments.applications import simulators
+    from experiments.cli.play import play
+
+    first = []
+
+    async def serve(app, host, port, ready):
+        async with TestServer(app):
+            first.append(app[server.CROWD].together)
+            ready(port)
+            await until(lambda: app[server.CROWD].together == 2)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    play(tmp_path, visitors=2)
+    assert first == [1]
+
+
+def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, capsys):
+    """Those of a model that robots were added to: there are frames of these alone."""
+    from experiments.applications import simulators
+    from hma_jax.simulator import warm_up
+
+    model = simulator(episodes=1)
+    model.starts = (start(0, 2),)
+    first, *others = model.robots
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: model)
+    monkeypatch.setattr(warm_up, "warm_up", lambda *_, **__: require(False, "enough is said"))
+    assert main(["play", str(tmp_path)]) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"not on the page: {', '.join(others)}; there are no held-out frames" in said
+    assert said.endswith(f"{tmp_path}: {first}; compiling")
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])
+def test_a_signal_ends_the_command_with_its_code_and_a_true_word(number, code, monkeypatch, tmp_path, capsys):
+    from experiments.applications import simulators
+
+    async def serve(app, host, port, ready):
+        ready(port)
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(server, "serve", serve)
+    assert main(["play", str(tmp_path), "--visitors", "1"]) == code
+    assert capsys.readouterr().err.endswith("; the same command begins anew\n")
+
+
+def test_a_request_to_stop_that_was_lost_while_it_compiled_is_obeyed_before_it_serves(monkeypatch, tmp_path):
+    from experiments.applications import simulators
+    from hma_jax.simulator import warm_up
+
+    def lost(*_, **__):
+        with contextlib.suppress(KeyboardInterrupt):  # as in a library's callback
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, episodes, **__: simulator(episodes=episodes))
+    monkeypatch.setattr(warm_up, "warm_up", lost)
+    monkeypatch.setattr(server, "serve", lambda *_: pytest.fail("it serves"))
+    assert main(["play", str(tmp_path)]) == Exit.STOPPED

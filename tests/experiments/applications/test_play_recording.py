@@ -1,0 +1,68 @@
+"""What a visitor of the page records, as MP4 and as RLDS."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+
+pytest.importorskip("aiohttp", reason="needs the extra `play`")
+
+from data_pipelines.sources.rlds.dataset import RldsDataset
+from experiments.applications.play.recording import Recording
+from hma_jax.simulator.robots import Robot
+from tests.experiments.applications.serving import Player, ask, serving
+
+
+def test_a_recording_is_a_video_and_a_dataset(tmp_path):
+    async def test(client):
+        player = Player(client)
+        await player.enter()
+        assert (await client.get(f"/recording/{player.token}/mp4")).status == 404
+        assert (await ask(player.socket, type="record", on=True))["recording"]
+        await player.drive(0.5, 3)
+        assert (await ask(player.socket, type="rewind", frames=1))["recorded"] == 3
+        await player.drive(0.45, 1)
+        assert (await ask(player.socket, type="record", on=False))["recorded"] == 4
+        await player.drive(0.5, 1)
+        assert (await ask(player.socket, type="rewind", frames=2))["recorded"] == 4, (
+            "a finished recording stays as it is"
+        )
+
+        video = await (await client.get(f"/recording/{player.token}/mp4")).read()
+        import av
+
+        with av.open(io.BytesIO(video)) as container:
+            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        assert len(frames) == 4 and frames[0].shape == (32, 32, 3)
+
+        frame = await ask(player.socket, type="start", robot="pusher", start=0)
+        assert (frame["recorded"], frame["recording"]) == (4, False), "it can still be had when another episode begins"
+        packed = await (await client.get(f"/recording/{player.token}/rlds")).read()
+        zipfile.ZipFile(io.BytesIO(packed)).extractall(tmp_path)
+        ((images, actions),) = _episodes(tmp_path / "arm_played" / "1.0.0")
+        assert images.shape == (4, 8, 8, 3)
+        np.testing.assert_array_equal(actions[:, 0], np.float32([0.5, 0.5, 0.45, 0.0]))
+
+    serving(test)
+
+
+@pytest.mark.parametrize(("hz", "said"), [(10.0, 5.0), (5.0, 2.5), (0.0, None)])
+def test_a_recording_says_its_rate_where_it_is_known(hz, said):
+    recording = Recording(Robot("arm", 2, (0.0,), (1.0,), (0.0,), hz=hz))
+    recording.add(np.zeros((8, 8, 3), np.uint8), np.zeros((2, 1)), np.zeros((8, 8, 3), np.uint8))
+    metadata = json.loads(zipfile.ZipFile(io.BytesIO(recording.dataset())).read("arm_played/1.0.0/metadata.json"))
+    assert metadata.get("hz") == said
+    import av
+
+    with av.open(io.BytesIO(recording.video())) as container:
+        assert container.streams.video[0].average_rate == (said or 2), "the film is not in the robot's own time"
+
+
+def _episodes(directory):
+    source = RldsDataset(directory, "train")
+    for i in range(len(source)):
+        images = np.stack(source.frames(i, "observation/image", lambda steps: list(range(steps))))
+        with source.open_episode(i, "observation/image", ["action"]) as episode:
+            yield images, np.array(episode.actions)

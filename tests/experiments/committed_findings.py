@@ -1,0 +1,67 @@
+"""What tests of committed findings share: pages, rows, and robots of the studies."""
+
+import csv
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+from data_pipelines.suite.embodiments import TRAINED
+from experiments.report.robots import Robot, robots_of
+from experiments.rows import Row, read_rows
+from experiments.running.trial import trial_id
+from experiments.running.workspace import Workspace, load_record
+from experiments.sweeps.registry import plan_sweeps
+from experiments.sweeps.sweep import POINT
+from hma_jax.evaluation.windows import FILE as WINDOWS
+from hma_jax.evaluation.windows import WindowTable
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "experiments" / "results"
+
+
+def findings(study: str = "cpu-full") -> str:
+    return (RESULTS / study / "findings.md").read_text()
+
+
+@functools.cache
+def rows_of(study: str = "cpu-full") -> tuple[Row, ...]:
+    """The rows of its tables, which most tests need and which take seconds to read."""
+    return tuple(read_rows(Workspace(RESULTS / study)))
+
+
+def in_place_rows(name: str) -> list[dict[str, str]]:
+    """Where things stand at the end of windows of one model."""
+    with open(RESULTS / "in_place" / f"{name}.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def readme() -> str:
+    """On one line."""
+    return " ".join((ROOT / "README.md").read_text().split())
+
+
+ACTING = {e.name for e in TRAINED if not e.video_only}
+"""Robots that are trained with actions."""
+
+
+@functools.cache
+def robots_at(study: str, axis: str, role: str = POINT) -> dict[float, tuple[list[Robot], int]]:
+    """{x: (every robot, from every window's numbers, trials)} of the points of `role` of an axis of a study."""
+    workspace = Workspace(RESULTS / study)
+    record = load_record(workspace)
+    (sweep,) = plan_sweeps(record.study, (axis,))
+    points = tuple(replace(p, role=POINT) for p in sweep.points if p.role == role)
+    found = {}
+    for x in sorted({p.x for p in points}):
+        ids = [trial_id(p.trial, record.provenance) for p in points if p.x == x]
+        windows = {id: WindowTable.load(workspace.trials / id / WINDOWS) for id in ids}
+        at_x = replace(sweep, points=points, reference_x=x)
+        found[x] = robots_of([], at_x, record.provenance, windows), len(ids)
+    return found
+
+
+def counts(robots: list[Robot]) -> list[int]:
+    """How many are ahead of copying; of those that act, action-nats beyond 3 standard errors, delta PSNR beyond 2."""
+    follow = [r.follows for r in robots if r.name in ACTING]
+    beyond = [sum(f[metric].errors > n for f in follow) for metric, n in (("action_nats", 3), ("delta_psnr", 2))]
+    return [sum(r.ahead > 0 for r in robots), *beyond]
