@@ -72,7 +72,8 @@ def read_expected(path: Path) -> list[Expected]:
         reader = csv.DictReader(file)
         known = (columns, columns[:-1])
         require(reader.fieldnames in known, f"{path}: its columns have to be {','.join(known[1])}, and may be seeds")
-        found = []
+        found: list[Expected] = []
+        lines: dict[tuple, int] = {}  # of each number that is spoken of
         for record in reader:
             number = reader.line_num
             try:
@@ -84,6 +85,12 @@ def read_expected(path: Path) -> list[Expected]:
                 raise ConfigError(f"{path}, line {number}: no prediction ({error})") from error
             e = found[-1]
             require(e.low <= e.mean <= e.high, f"{path}, line {number}: low, mean and high do not ascend")
+            first = lines.setdefault((e.sweep, e.series, e.x, e.against, e.metric, frozenset(e.seeds)), number)
+            require(
+                first == number,
+                f"{path}, line {number}: of the same number as line {first}, which would count twice; keep the one that "
+                "was written first",
+            )
     return found
 
 

@@ -100,6 +100,18 @@ def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
         read_expected(path)
 
 
+@pytest.mark.parametrize("again", ["8,,cross_entropy,5,4,6,abc1234,0 2", "8,,cross_entropy,9,8,10,def5678,2 0"])
+def test_a_number_is_expected_once(tmp_path, again):
+    """A line that stood twice, and one beside another interval for the same, counted as two."""
+    path = tmp_path / FILE
+    lines = [f"{COLUMNS},seeds", "width,,8,,cross_entropy,5,4,6,abc1234,0 2", "width,,16,,cross_entropy,5,4,6,abc1234,"]
+    path.write_text("\n".join(lines))
+    assert len(read_expected(path)) == 2
+    path.write_text("\n".join([*lines, f"width,,{again}"]))
+    with pytest.raises(ConfigError, match=f"{FILE}, line 4: of the same number as line 2, which would count twice"):
+        read_expected(path)
+
+
 def test_the_table_may_come_from_a_spreadsheet_in_utf_8_alone(tmp_path):
     line = f"{COLUMNS}\nwidth,,8,,cross_entropy,5,4,6,abc1234\n"
     (tmp_path / FILE).write_text(line, encoding="utf-8-sig")
