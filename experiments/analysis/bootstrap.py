@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis.intervals import LEVEL, Interval, critical, satterthwaite
+from experiments.analysis.intervals import Interval, critical, satterthwaite
 from experiments.analysis.paired import NotComparable, agree, require_same_windows
 from hma_jax.config import require
 from hma_jax.evaluation.windows import WindowTable
@@ -136,7 +136,7 @@ def resample(
     return Draws(np.asarray(points), np.stack(found, axis=1))
 
 
-def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0, level: float = LEVEL) -> list[Interval]:
+def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0) -> list[Interval]:
     """For each point the mean, the standard deviation of its draws, and an interval.
 
     The interval joins those of the two levels resampled alone, each with its own Student's t: half its width squared
@@ -156,8 +156,8 @@ def bootstrap_intervals(panel: Panel, draws: int = DRAWS, seed: int = 0, level: 
         at += len(seeds)
         mean = float(value[own].mean())
         # nan, as the interval, if no robot has two episodes
-        t_episode = critical(_freedom(sums[own].mean(0), counts, ends), level)
-        t_seed = critical(len(seeds) - 1, level) if len(seeds) > 1 else 0.0
+        t_episode = critical(_freedom(sums[own].mean(0), counts, ends))
+        t_seed = critical(len(seeds) - 1) if len(seeds) > 1 else 0.0
         half = math.hypot(t_seed * by_seed[i], t_episode * by_episode[i])
         sem = float(both[i]) if episodes > len(ends) else math.nan
         found.append(Interval(mean, sem, mean - half, mean + half, len(panel.robot), episodes))

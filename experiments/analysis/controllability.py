@@ -71,19 +71,19 @@ def controllability(seeds: dict[int, WindowTable], role: str = POINT) -> list[Co
     return rows
 
 
-def beyond(rows: Iterable[Controlled], metric: str, errors: float = ENOUGH) -> tuple[int, int]:
-    """(robots whose metric is more than `errors` standard errors above that of a deaf model, robots that have it)."""
+def beyond(rows: Iterable[Controlled], metric: str) -> tuple[int, int]:
+    """(robots whose metric is more than ENOUGH standard errors above that of a deaf model, robots that have it)."""
     own = [row for row in rows if row.metric == metric]
-    return sum(row.errors > errors for row in own), len(own)
+    return sum(row.errors > ENOUGH for row in own), len(own)
 
 
-def by_chance(rows: Iterable[Controlled], metric: str, errors: float = ENOUGH) -> float:
+def by_chance(rows: Iterable[Controlled], metric: str) -> float:
     """How many of these robots a deaf model has there on average: few episodes make a rough standard error, so that it is
     Student's t, with as many degrees of freedom as episodes less one. A robot without actions, which has
     the value of a deaf model in every window, is never there."""
     own = [row for row in rows if row.metric == metric and row.episodes > 1]
     freedom = [row.episodes - 1 for row in own if max(abs(row.mean - row.deaf), row.sem) > ROUNDING]
-    return float(stdtr(freedom, -errors).sum())
+    return float(stdtr(freedom, -ENOUGH).sum())
 
 
 def _row(robot: str, metric: str, tables: dict[int, WindowTable], share: float, role: str) -> Sequence[Controlled]:

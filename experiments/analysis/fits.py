@@ -88,7 +88,7 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
 
 
-def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: bool = True) -> PowerFit:
+def fit_power(measured: Measured, draws: int = DRAWS, episodes: bool = True) -> PowerFit:
     """The saturating power law of a loss over one axis or two, or the reason why there is none.
 
     `episodes`: whether bootstraps draw episodes too. Without, intervals are conditional on the frozen windows, as
@@ -101,7 +101,7 @@ def fit_power(measured: Measured, draws: int = DRAWS, seed: int = 0, episodes: b
     weight = weight_of(noise)
     centre = np.log(measured.x).mean(0)
     z = np.log(measured.x) - centre
-    values = measured.draw(draws, np.random.default_rng(seed), episodes)
+    values = measured.draw(draws, np.random.default_rng(0), episodes)
     theta, thetas = fit_draws(z, measured.value, values, weight)
     residuals = np.log(measured.value) - predict_log(theta, z)
     found = _coefficients(theta, thetas, centre)

@@ -54,12 +54,12 @@ class Interval:
         return Interval(mean, self.sem * mean, _exp(self.low), _exp(self.high), self.n, self.episodes)
 
 
-def interval_of(stat: Stat, level: float = LEVEL) -> Interval:
+def interval_of(stat: Stat) -> Interval:
     """Of the mean over windows of one robot, t with as many degrees of freedom as episodes less one."""
-    return _around(stat, stat.clusters - 1, level)
+    return _around(stat, stat.clusters - 1)
 
 
-def overall(stats: Iterable[Stat], level: float = LEVEL) -> Interval:
+def overall(stats: Iterable[Stat]) -> Interval:
     """Of the mean over robots, each counting equally (`stratified`).
 
     The robots are fixed: the interval is about other episodes of these robots, not about other robots. Degrees of
@@ -67,7 +67,7 @@ def overall(stats: Iterable[Stat], level: float = LEVEL) -> Interval:
     """
     stats = list(stats)
     freedom = satterthwaite((s.sem**2, s.clusters - 1) for s in stats if s.sem > 0)
-    return _around(stratified(stats), freedom, level)
+    return _around(stratified(stats), freedom)
 
 
 def satterthwaite(estimates: Iterable[tuple[float, float]]) -> float:
@@ -88,8 +88,8 @@ def critical(df: float, level: float = LEVEL) -> float:
     return float(stdtrit(min(df, 1e9), (1 + level) / 2)) if df > 0 else math.nan
 
 
-def _around(stat: Stat, df: float, level: float) -> Interval:
-    half = critical(df, level) * stat.sem
+def _around(stat: Stat, df: float) -> Interval:
+    half = critical(df) * stat.sem
     return Interval(stat.mean, stat.sem, stat.mean - half, stat.mean + half, stat.n, stat.episodes)
 
 

@@ -69,13 +69,13 @@ class IsoFlop:
     refused: str = ""
 
 
-def fit_isoflop(measured: Measured, budgets: np.ndarray | None = None, draws: int = DRAWS, seed: int = 0) -> IsoFlop:
+def fit_isoflop(measured: Measured, budgets: np.ndarray | None = None, draws: int = DRAWS) -> IsoFlop:
     """Of losses over (size N, training FLOPs C). Without `budgets`, BUDGETS of them, evenly spread in log C over
     where at least LEAST_SIZES sizes were measured."""
     sizes = np.unique(measured.x[:, 0])
     if len(sizes) < LEAST_SIZES:
         return IsoFlop(refused=f"{len(sizes)} sizes; a minimum over sizes needs at least {LEAST_SIZES}")
-    values = np.concatenate([measured.value[None], measured.draw(draws, np.random.default_rng(seed))])  # [1 + R, n]
+    values = np.concatenate([measured.value[None], measured.draw(draws, np.random.default_rng(0))])  # [1 + R, n]
     lines = [_Line(measured, values, size) for size in sizes]
     budgets = _common_budgets(lines) if budgets is None else np.asarray(budgets, float)
     if not len(budgets):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis.fits import DRAWS, LEVEL, interval
+from experiments.analysis.fits import LEVEL, interval
 from experiments.analysis.measured import Place, measure
 from experiments.analysis.scaling import LOSS, Curve, fit_curve, noise_near
 from hma_jax.config import ConfigError, require
@@ -70,7 +70,6 @@ def predict(
     held_out: Sequence[Place],
     windows: Mapping[str, WindowTable],
     hashes: Mapping[str, str],
-    draws: int = DRAWS,
 ) -> Prediction:
     """Of the trials at one position, from the other finished ones of the curve.
 
@@ -81,7 +80,7 @@ def predict(
     there = [id for id in ids if id in windows]
     require(not there, f"{', '.join(there)} has a result already: a prediction is made before its trial is run")
     others = Curve(curve.name, curve.axes, tuple(p for p in curve.places if p.trial not in ids))
-    fitted = fit_curve(others, windows, draws, episodes=False)
+    fitted = fit_curve(others, windows, episodes=False)
     fit = fitted.fit
     require(not fit.refused, f"{curve.name}: nothing can be predicted: {fit.refused}")
     x = np.array([held_out[0].x])

@@ -30,9 +30,6 @@ BATCH = 16
 AT_LEAST = 8
 """Episodes that `store.min_val` is to hold out, where there are enough."""
 
-Spoil = Callable[[np.ndarray], np.ndarray]
-"""Changes recorded actions [n, T, stride, A]: for tests of the check itself."""
-
 
 def open_study(workspace: Workspace) -> Materials:
     """Tokenizer, tokens and windows of a study. Raises ConfigError where they are not there."""
@@ -72,14 +69,11 @@ def check_run(
     materials: Materials,
     robots: Sequence[str],
     windows: int,
-    spoil: Spoil = lambda actions: actions,
 ) -> dict[str, list[Effect]]:
     """Effects of each robot's dimensions, on so many held-out windows of each."""
     known = {r.name: r for r in find_robots(run, model.table)}
     loss = jax.jit(make_loss(model.config, model.table, model.run.train.masking.setting, model.execution))
-    return {
-        name: _check(model, loss, materials.store, materials.manifest, known[name], windows, spoil) for name in robots
-    }
+    return {name: _check(model, loss, materials.store, materials.manifest, known[name], windows) for name in robots}
 
 
 def shortage(store: TokenStore, manifest: EvalManifest, robot: str, windows: int, out: Path) -> str | None:
@@ -135,13 +129,12 @@ def _check(
     manifest: EvalManifest,
     robot: Robot,
     windows: int,
-    spoil: Spoil,
 ) -> list[Effect]:
     batches = list(eval_batches(store, model.table, manifest.thinned(windows), BATCH, (robot.name,)))
     valid = np.concatenate([batch["valid"] for batch in batches])
     width, chunk = model.table.action_width, robot.stride * robot.action_dim
     flat = np.concatenate([batch["actions"] for batch in batches])[..., :chunk]
-    actions = spoil(flat.reshape(*flat.shape[:2], robot.stride, robot.action_dim))
+    actions = flat.reshape(*flat.shape[:2], robot.stride, robot.action_dim)
     kept = [{key: batch[key] for key in ("tokens", "embodiment", "real") if key in batch} for batch in batches]
 
     def judge(changed: np.ndarray) -> np.ndarray:

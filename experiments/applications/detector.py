@@ -134,14 +134,13 @@ def train_detector(
     *,
     steps: int,
     size: int = BATCH,
-    seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Detector:
     """Goes on from the file `unfinished`, where a process that was killed has left it, and comes out as if it never had
     been. Raises ConfigError without scenes, for a damaged file, or where training diverges."""
     require(bool(scenes), "there is no robot to train a detector on")
-    own, rng = list(scenes.values()), np.random.default_rng(seed)
-    weights = init_detector(jax.random.key(seed), len(own), max(x.there.shape[-1] for x in own))
+    own, rng = list(scenes.values()), np.random.default_rng(0)
+    weights = init_detector(jax.random.key(0), len(own), max(x.there.shape[-1] for x in own))
     schedule = optax.warmup_cosine_decay_schedule(0.0, RATE, min(100, steps // 4), steps)
     optimizer = optax.chain(optax.clip_by_global_norm(5.0), optax.adamw(schedule, weight_decay=1e-3))
 

@@ -166,15 +166,15 @@ def _goes_to_places(store: TokenStore, name: str) -> bool:
     return 2 * hints.count("absolute") > len(hints)
 
 
-def find_starts(simulator: Simulator, workspace: Workspace, count: int = STARTS_PER_ROBOT) -> tuple[Start, ...]:
+def find_starts(simulator: Simulator, workspace: Workspace) -> tuple[Start, ...]:
     """Starts of every robot: of held-out episodes of its true simulator, otherwise those whose frames the token store kept."""
     store = TokenStore(workspace.store) if workspace.store.is_dir() else None
     starts: list[Start] = []
     for robot in simulator.robots.values():
         if has_truth(robot):
-            starts += true_starts(robot, count, START_FRAMES, simulator.tokenizer.image_size)
+            starts += true_starts(robot, STARTS_PER_ROBOT, START_FRAMES, simulator.tokenizer.image_size)
         elif store is not None and robot.name in store.names:
-            starts += _stored_starts(store, robot, simulator.tokenizer.image_shape, count)
+            starts += _stored_starts(store, robot, simulator.tokenizer.image_shape)
     return tuple(starts)
 
 
@@ -188,7 +188,7 @@ def held_out(robot: Robot, size: int, frames: int, count: int) -> tuple[list[Sta
     return starts, np.array(chunks, np.float32).reshape(len(starts), frames, robot.stride, robot.action_dim)
 
 
-def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int], count: int) -> list[Start]:
+def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int]) -> list[Start]:
     manifest, starts = store.manifest(robot.name), []
     every = robot.stride // manifest.frame_step
     if not every or robot.stride % manifest.frame_step:
@@ -201,6 +201,6 @@ def _stored_starts(store: TokenStore, robot: Robot, shape: tuple[int, int], coun
         starts.append(
             Start(robot.name, np.array(frames), np.array(episode.actions[: (START_FRAMES - 1) * robot.stride]))
         )
-        if len(starts) == count:
+        if len(starts) == STARTS_PER_ROBOT:
             break
     return starts

@@ -51,24 +51,24 @@ class Explained:
     moved: float
 
 
-def explained(spec: EmbodimentSpec, states: int = STATES, actions: int = ACTIONS) -> Explained:
+def explained(spec: EmbodimentSpec, states: int = STATES) -> Explained:
     """The share of one robot, a pure function of its arguments."""
     seeds = episode_seeds(spec, states, 0, "explained")
     rollout, rng = simulate(spec, seeds), np.random.default_rng(0)
     stride = stride_of(spec.hz)
     times = (rng.random(states) * (rollout.lengths - stride)).astype(int)
     starts = states_at(spec, rollout, times)
-    of = rng.integers(states, size=(states, actions))
+    of = rng.integers(states, size=(states, ACTIONS))
     when = (rng.random(of.shape) * (rollout.lengths[of] - stride)).astype(int)
     chunks = np.stack([rollout.actions[of.ravel(), when.ravel() + k] for k in range(stride)], 1)
 
     world = World(spec, seeds[:1])
-    world.state = starts.take(np.repeat(np.arange(states), actions))
+    world.state = starts.take(np.repeat(np.arange(states), ACTIONS))
     before = frames_of(spec, starts)
     for k in range(stride):
         world.step(chunks[:, k].astype(np.float64))
-    after = frames_of(spec, world.state).reshape(states, actions, -1)
-    spread = ((after - after.mean(1, keepdims=True)) ** 2).sum((1, 2)) / (actions - 1)
+    after = frames_of(spec, world.state).reshape(states, ACTIONS, -1)
+    spread = ((after - after.mean(1, keepdims=True)) ** 2).sum((1, 2)) / (ACTIONS - 1)
     change = ((after - before.reshape(states, 1, -1)) ** 2).sum(2).mean(1)
     share = spread.sum() / change.sum()
     sem = np.std(spread - share * change, ddof=1) / np.sqrt(states) / change.mean()

@@ -63,10 +63,10 @@ def make_panel(trials: Trials, seeds: tuple[int, ...], what: str = "success") ->
     return Panel(np.full(len(each), "robot"), each, tuple(points), tuple(own))
 
 
-def share_closed(panel: Panel, at: int, draws: int = 2000) -> Interval:
+def share_closed(panel: Panel, at: int) -> Interval:
     """Which share of the gap between few and all recorded trajectories condition `at` closes; the interval holds 95 %
     of the draws over seeds and starts in which there is a gap."""
-    found = resample(panel, draws)
+    found = resample(panel, 2000)
 
     def share(points: np.ndarray) -> np.ndarray:
         gap = points[..., ALL] - points[..., FEW]

@@ -64,31 +64,31 @@ class Agreement:
     over_starts: dict[str, Interval]  # these policies, other starts
 
 
-def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed: int = 0) -> Agreement:
+def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS) -> Agreement:
     """From successes bool [P, M] of P policies at the same M starts.
 
     Intervals are quantiles of `draws` bootstrap resamples of policies and starts, and of starts alone. A start drawn is
     drawn in both worlds and for all policies. Draws in which a measure is not defined are left out.
     """
-    return _agree(true_PM.mean(1), lambda columns: true_PM[:, columns].mean(1), learned_PM, draws, seed)
+    return _agree(true_PM.mean(1), lambda columns: true_PM[:, columns].mean(1), learned_PM, draws)
 
 
 def agree_with_counts(
-    successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS, seed: int = 0
+    successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS
 ) -> Agreement:
     """As `agree`, of policies of which elsewhere so many of so many episodes succeeded. Those are of other starts: while
     the model's are resampled, each count is drawn anew from a binomial distribution of its own rate."""
-    rates, rng = successes_P / episodes_P, np.random.default_rng([seed, 18])
-    return _agree(rates, lambda columns: rng.binomial(episodes_P, rates) / episodes_P, learned_PM, draws, seed)
+    rates, rng = successes_P / episodes_P, np.random.default_rng([0, 18])
+    return _agree(rates, lambda columns: rng.binomial(episodes_P, rates) / episodes_P, learned_PM, draws)
 
 
 def _agree(
-    true_P: np.ndarray, draw: Callable[[np.ndarray], np.ndarray], learned_PM: np.ndarray, draws: int, seed: int
+    true_P: np.ndarray, draw: Callable[[np.ndarray], np.ndarray], learned_PM: np.ndarray, draws: int
 ) -> Agreement:
     """`draw` gives true rates [P] anew, where the starts drawn are `columns`."""
     policies, starts = learned_PM.shape
     found: tuple[dict[str, list[float]], ...] = ({name: [] for name in MEASURES}, {name: [] for name in MEASURES})
-    for rows, columns in _resamples(policies, starts, draws, seed):
+    for rows, columns in _resamples(policies, starts, draws):
         rates = draw(columns), learned_PM[:, columns].mean(1)
         for kept, which in zip(found, (rows, slice(None)), strict=True):
             for name, measure in MEASURES.items():
@@ -101,7 +101,7 @@ def _agree(
     return Agreement(both, alone)
 
 
-def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS, seed: int = 0) -> Interval:
+def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS) -> Interval:
     """How many of the episodes `among_PM` are `same_PM`, both bool [P, M] of P policies at the same M starts.
 
     Episodes of one policy, and of one start, resemble each other, so the interval is over other policies and starts;
@@ -109,7 +109,7 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS, seed: i
     """
     alike = same_PM & among_PM
     wilson = rate_interval(same_PM[among_PM])
-    grids = (np.ix_(rows, columns) for rows, columns in _resamples(*same_PM.shape, draws, seed))
+    grids = (np.ix_(rows, columns) for rows, columns in _resamples(*same_PM.shape, draws))
     counts = [(alike[grid].sum(), among_PM[grid].sum()) for grid in grids]
     drawn = np.array([found / n for found, n in counts if n])
     clustered = _interval(wilson.mean, drawn, {"n": wilson.n, "episodes": wilson.episodes})
@@ -118,17 +118,17 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS, seed: i
     return dataclasses.replace(clustered, low=min(clustered.low, wilson.low), high=max(clustered.high, wilson.high))
 
 
-def mean_above(a_PM: np.ndarray, b_PM: np.ndarray, draws: int = DRAWS, seed: int = 0) -> Interval:
+def mean_above(a_PM: np.ndarray, b_PM: np.ndarray, draws: int = DRAWS) -> Interval:
     """By how much the success of P policies at M starts is higher in `a_PM` than in `b_PM`, both bool [P, M], on average;
     over other policies and starts."""
     apart = a_PM.astype(float) - b_PM
-    drawn = np.array([apart[np.ix_(rows, columns)].mean() for rows, columns in _resamples(*apart.shape, draws, seed)])
+    drawn = np.array([apart[np.ix_(rows, columns)].mean() for rows, columns in _resamples(*apart.shape, draws)])
     return _interval(float(apart.mean()), drawn, {"n": apart.size, "episodes": apart.shape[1]})
 
 
-def _resamples(policies: int, starts: int, draws: int, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _resamples(policies: int, starts: int, draws: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Policies and starts, drawn with replacement."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     for _ in range(draws):
         columns = rng.integers(starts, size=starts)
         yield rng.integers(policies, size=policies), columns

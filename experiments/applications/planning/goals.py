@@ -15,11 +15,11 @@ CELLS = 16
 """Cells along a side that a picture is averaged to before it is compared: speckle does not count, places do."""
 
 
-def coarse(images: np.ndarray, cells: int = CELLS) -> np.ndarray:
-    """float32 [..., rows, columns, C] in [0, 1]: means over equal parts of uint8 [..., H, W, C], `cells` along each
+def coarse(images: np.ndarray) -> np.ndarray:
+    """float32 [..., rows, columns, C] in [0, 1]: means over equal parts of uint8 [..., H, W, C], CELLS along each
     side or as many of them as divide it."""
     *lead, height, width, channels = images.shape
-    rows, columns = math.gcd(height, cells), math.gcd(width, cells)
+    rows, columns = math.gcd(height, CELLS), math.gcd(width, CELLS)
     split = images.reshape(*lead, rows, height // rows, columns, width // columns, channels)
     return split.mean((-4, -2), dtype=np.float32) / 255
 

@@ -29,10 +29,10 @@ class Outcome(NamedTuple):
     distance: np.ndarray  # float [n]: from the goal at the last frame, in halves of the floor's side
 
 
-def start_seeds(task: Task, count: int, seed: int = 0, least: float = 0.0) -> np.ndarray:
+def start_seeds(task: Task, count: int, least: float = 0.0) -> np.ndarray:
     """int64 [count]: of starts that no recording has, at least so far from the goal. More of them begin with the same
     ones. Raises ConfigError where there are hardly any."""
-    seeds = episode_seeds(task.spec, MOST_TRIED * count, seed, SPLIT)
+    seeds = episode_seeds(task.spec, MOST_TRIED * count, 0, SPLIT)
     far = seeds[away_at_start(task, seeds) >= least][:count]
     require(len(far) == count, f"{task.robot}: hardly a start is {least:g} away from its goal")
     return far
