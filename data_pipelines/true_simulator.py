@@ -15,7 +15,7 @@ import numpy as np
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
 from hma_jax.config.base import require_choice
-from hma_jax.simulator.interface import chosen_episodes
+from hma_jax.simulator.interface import chosen_episodes, whole_numbers
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 
@@ -52,6 +52,7 @@ class TrueSimulator(ABC, Generic[W]):
 
     def __init__(self, robots: Sequence[Robot], *, episodes: int = 1, image_size: int, outside: Outside = "clip"):
         """Raises ConfigError for robots that there are not, or with other actions."""
+        [episodes] = whole_numbers("episodes", [episodes])
         require_choice(outside, get_args(Outside), "outside")
         for robot in robots:
             dim = self.dims().get(robot.name)
@@ -129,6 +130,7 @@ class TrueSimulator(ABC, Generic[W]):
         return self.images
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
+        [frames] = whole_numbers("frames", [frames])
         which = chosen_episodes(episodes, len(self))
         worlds = {b: self._begun(b)[0] for b in which}
         for b in which:

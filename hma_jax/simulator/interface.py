@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
 
-from hma_jax.config import require
+from hma_jax.config import ConfigError, require
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
 
@@ -34,10 +35,18 @@ class AnySimulator(Protocol):
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray: ...
 
 
+def whole_numbers(what: str, values: Sequence[int]) -> list[int]:
+    """Raises ConfigError for others: 0.5 is not taken for 0."""
+    try:
+        return [operator.index(value) for value in values]
+    except TypeError as error:
+        raise ConfigError(f"{what}: whole numbers are needed, got {values!r}") from error
+
+
 def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
     """Which of `count` episodes a call is of; None: all. Raises ConfigError for numbers that repeat or that there are
     not."""
-    which = list(range(count)) if episodes is None else [int(b) for b in episodes]
+    which = list(range(count)) if episodes is None else whole_numbers("episodes", episodes)
     require(
         all(0 <= b < count for b in which) and len(set(which)) == len(which),
         f"episodes must be different numbers below {count}, got {which}",

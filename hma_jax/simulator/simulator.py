@@ -20,7 +20,7 @@ from hma_jax.config.base import require_choice
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
-from hma_jax.simulator.interface import chosen_episodes
+from hma_jax.simulator.interface import chosen_episodes, whole_numbers
 from hma_jax.simulator.programs import Beginning, Programs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -64,6 +64,7 @@ class Simulator:
         (`clipped` says which, and the log once) or refused."""
         config = model.config
         require_frames(model.run, "show")
+        [episodes], [history] = whole_numbers("episodes", [episodes]), whole_numbers("history", [history])
         require(episodes >= 1, f"a simulator has at least 1 episode, got {episodes}")
         require(history >= 0, f"episodes keep 0 frames or more to be taken back by, got history={history}")
         require_choice(outside, get_args(Outside), "outside")
@@ -149,7 +150,8 @@ class Simulator:
         """
         which = chosen_episodes(episodes, len(self))
         each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
-        numbers = [seeds + i for i in range(len(which))] if isinstance(seeds, (int, np.integer)) else list(seeds)
+        counted = isinstance(seeds, (int, np.integer))
+        numbers = [seeds + i for i in range(len(which))] if counted else whole_numbers("seeds", seeds)
         asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"
         require(len(each) == len(numbers) == len(which), asked)
         require(all(0 <= s < 2**32 for s in numbers), "seeds must lie in [0, 2^32)")
@@ -288,11 +290,12 @@ class Simulator:
 
     def branch(self, sources: Sequence[int]) -> np.ndarray:
         """Episode b goes on as a copy of episode sources[b], with its seed: what differs then, actions have done."""
-        fits = len(sources) == len(self) and all(0 <= s < len(self) for s in sources)
-        require(fits, f"branches need {len(self)} episodes below {len(self)} to copy, got {list(sources)}")
-        rows = np.asarray(sources, np.int32)
+        copied = whole_numbers("sources", sources)
+        fits = len(copied) == len(self) and all(0 <= s < len(self) for s in copied)
+        require(fits, f"branches need {len(self)} episodes below {len(self)} to copy, got {copied}")
+        rows = np.asarray(copied, np.int32)
         self._state, self._images = self._programs.take(self._state, rows), self._images[rows]
-        self._episodes = [copy.deepcopy(self._episodes[s]) for s in sources]
+        self._episodes = [copy.deepcopy(self._episodes[s]) for s in copied]
         return self.images
 
     def rewind(self, frames: int, episodes: Sequence[int] | None = None) -> np.ndarray:
@@ -301,6 +304,7 @@ class Simulator:
         What followed is forgotten, and comes again under the same actions: exactly with `decode.slide` "exact";
         with "streaming" the window is computed anew, which is nearer to exact than what had been there.
         """
+        [frames] = whole_numbers("frames", [frames])
         require(frames >= 0, f"an episode is taken back by 0 frames or more, got {frames}")
         which = chosen_episodes(episodes, len(self))
         if not which:

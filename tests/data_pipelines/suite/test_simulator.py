@@ -58,6 +58,10 @@ def test_what_is_refused_changes_no_episode():
         ):
             with pytest.raises(ConfigError, match="episodes must be different numbers below 2"):
                 refused()
+    with pytest.raises(ConfigError, match=r"frames: whole numbers are needed, got \[0.5\]"):
+        sim.rewind(0.5)
+    with pytest.raises(ConfigError, match=r"episodes: whole numbers are needed, got \[1.5\]"):
+        SuiteSimulator([PUSHER], episodes=1.5)
     with pytest.raises(ConfigError, match="with which seed"):
         sim.reset([start, unknown])
     with pytest.raises(ConfigError, match="episode 1 can be taken back by 0 frames"):
