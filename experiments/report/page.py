@@ -225,7 +225,8 @@ def _tokenizer_quality(workspace: Workspace) -> CurvePoint | None:
 
 
 def _fits(workspace: Workspace, numbers: Numbers) -> str:
-    if not numbers.fits:
+    """Nothing where no trial has the loss that is fitted, as of policies and latents; fits.csv says so."""
+    if not any(fitted.fit.trials for fitted in numbers.fits) and not numbers.outcomes:
         return ""
     figures = {"fits.png": "Scaling fits with residuals", "isoflop.png": "Best sizes for budgets"}
     drawn = "".join(picture(workspace.figures / name, title) for name, title in figures.items())

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from experiments.analysis.changes import find_changes
-from experiments.analysis.scaling import trunk_parameters
+from experiments.analysis.scaling import curves_of, fit_curve, trunk_parameters
 from experiments.optima import find_optima
 from experiments.presets import CPU_FULL
 from experiments.report import page, plots
 from experiments.report.draw import draw
 from experiments.report.findings import read_findings
+from experiments.report.numbers import Numbers
 from experiments.report.plot_families import plot_family
 from experiments.report.plot_names import plot_names
 from experiments.report.plot_style import LogTicks, count, save
@@ -258,6 +259,16 @@ def test_what_a_model_was_trained_for_is_drawn(drawn, measured, shown, title, tm
     assert "perplexity" not in cards and ("diffusion loss, untrained" in cards) == bool(title)
     listed = describe_robots(rows, sweep, robots_of(rows, sweep, PROVENANCE, {}), tmp_path / "data.json")
     assert ("s.e. above zero" in listed) == ("delta_psnr" in measured) and "ahead of copying" not in listed
+
+
+def test_the_page_speaks_of_fits_where_a_trial_has_the_loss_that_is_fitted(drawn):
+    """Of policies and of latents it explained a fit in nats per token, of which there was none."""
+    sweep = plan_width(STUDY)
+    windows = {id: windows_of(trial) for id, trial in unique_trials([sweep], PROVENANCE).items()}
+    [curve] = curves_of([sweep], PROVENANCE)
+    for there, said in (({}, False), (windows, True)):  # two widths: a fit that is refused, with its reason
+        section = page._fits(drawn, Numbers({}, there, [fit_curve(curve, there)], None, []))
+        assert ("No fit: 2 distinct trunk parameters" in section) == bool(section) == said
 
 
 def test_the_error_of_one_seed_is_not_said_to_be_over_seeds(drawn):
