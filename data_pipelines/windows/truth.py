@@ -5,7 +5,6 @@ Owns the file. Who can simulate fills it (`experiments.preparing.counterfactual`
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from data_pipelines.errors import DataError
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.runtime.arrays import UNREADABLE, write_arrays
 
 META = "made_for"
 
@@ -30,9 +29,7 @@ class OtherTruth:
     def save(self, path: Path) -> None:
         """Whole or not at all, the same bytes for the same frames."""
         meta = np.frombuffer(json.dumps({"manifest": self.manifest, "prompt": self.prompt}).encode(), np.uint8)
-        content = io.BytesIO()
-        np.savez_compressed(content, **{META: meta}, **dict(self.frames))
-        write_file(path, content.getvalue())
+        write_arrays(path, {META: meta} | dict(self.frames))
 
     @classmethod
     def load(cls, path: Path) -> OtherTruth:

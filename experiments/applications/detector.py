@@ -15,7 +15,6 @@ it was stopped, and keeps a detector that is there.
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,7 +41,7 @@ from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
 from hma_jax.evaluation.detector import Found, Weights, init_detector, points_loss, watch
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.robots import Robot
 from hma_jax.tokenizers.shared import BaseTokenizer
 
@@ -95,22 +94,16 @@ class Detector:
         return Found(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
     def save(self, path: Path) -> None:
-        content = io.BytesIO()
-        arrays = {name: np.asarray(x, np.float16) for name, x in self.weights.items()}
-        np.savez_compressed(content, robots=np.array(self.robots), **arrays)
-        write_file(path, content.getvalue())
+        weights = {name: np.asarray(x, np.float16) for name, x in self.weights.items()}
+        write_arrays(path, {"robots": np.array(self.robots)} | weights)
 
     @classmethod
     def load(cls, path: Path) -> Detector:
         """Raises ConfigError where there is none."""
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                weights = {name: jnp.asarray(file[name], jnp.float32) for name in file.files if name != "robots"}
-                return cls(weights, [str(name) for name in file["robots"]])
-        except UNREADABLE as error:
-            raise ConfigError(
-                f"{path} is no detector ({error}); make one with python -m experiments.applications.detector RUN"
-            ) from error
+        advice = "make a detector with python -m experiments.applications.detector RUN"
+        with reading_arrays(path, advice) as arrays:
+            weights = {name: jnp.asarray(x, jnp.float32) for name, x in arrays.items() if name != "robots"}
+            return cls(weights, [str(name) for name in arrays["robots"]])
 
 
 def batches(scenes: Sequence[Scenes], rng: np.random.Generator, size: int) -> Iterator[tuple]:
@@ -166,22 +159,17 @@ def train_detector(
 
 def _keep(path: Path, done: int, trained: Any, rng: np.random.Generator) -> None:
     """All that the steps after `done` ones depend on, besides the scenes."""
-    arrays = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(trained))}
-    content = io.BytesIO()
-    np.savez(content, done=done, rng=json.dumps(rng.bit_generator.state), **arrays)
-    write_file(path, content.getvalue())
+    leaves = {f"leaf/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(trained))}
+    write_arrays(path, {"done": done, "rng": json.dumps(rng.bit_generator.state)} | leaves, compressed=False)
 
 
 def _go_on(path: Path, fresh: Any, rng: np.random.Generator) -> tuple[int, Any]:
     """(steps, what is trained) as `_keep` left them, in the structure of `fresh`; `rng` stands there again."""
     leaves, structure = jax.tree.flatten(fresh)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            kept = [jnp.asarray(file[f"leaf/{i}"]) for i in range(len(leaves))]
-            rng.bit_generator.state = json.loads(str(file["rng"]))
-            return int(file["done"]), jax.tree.unflatten(structure, kept)
-    except UNREADABLE as error:
-        raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command trains anew") from error
+    with reading_arrays(path, "remove it, the same command trains anew") as arrays:
+        kept = [jnp.asarray(arrays[f"leaf/{i}"]) for i in range(len(leaves))]
+        rng.bit_generator.state = json.loads(str(arrays["rng"]))
+        return int(arrays["done"]), jax.tree.unflatten(structure, kept)
 
 
 def errors(detector: Detector, robot: str, scenes: Scenes) -> list[dict[str, object]]:

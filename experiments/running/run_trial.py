@@ -12,7 +12,6 @@ A trial's directory holds
 from __future__ import annotations
 
 import dataclasses
-import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,6 @@ from experiments.running.trial import Trial, loader_of
 from experiments.running.workspace import Workspace
 from hma_jax.config import EvalConfig, ExecutionConfig, ModelConfig, Setting
 from hma_jax.config.json import to_dict
-from hma_jax.runtime.files import write_file
 
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
@@ -288,10 +286,6 @@ def write_evaluation(directory: Path, evaluation: Evaluation) -> None:
 
 def write_samples(path: Path, samples: dict[str, dict[str, Any]]) -> None:
     """Stores {dataset: {true, predicted, random: uint8 [n, T, H, W, 3]}} as '<dataset>/<kind>'."""
-    import numpy as np
+    from hma_jax.runtime.arrays import write_arrays
 
-    content = io.BytesIO()
-    np.savez_compressed(
-        content, **{f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()}
-    )
-    write_file(path, content.getvalue())
+    write_arrays(path, {f"{name}/{kind}": clip for name, kinds in samples.items() for kind, clip in kinds.items()})

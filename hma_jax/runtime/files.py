@@ -4,20 +4,9 @@ from __future__ import annotations
 
 import os
 import secrets
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-UNREADABLE = (
-    OSError, ValueError, KeyError, IndexError, TypeError, EOFError, RuntimeError,
-    zipfile.BadZipFile, zlib.error, tokenize.TokenError,
-)  # fmt: skip
-"""What numpy raises for an .npz file that is missing or damaged, and what comes of one that lacks an array:
-RuntimeError when a flipped bit claims encryption or an unknown compression, EOFError for an empty file, TokenError
-for the header of an array."""
 
 
 def sync(path: Path) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.config import require
+from hma_jax.runtime.arrays import reading_arrays, write_arrays
 
 FILE = "starts.npz"
 
@@ -42,22 +41,15 @@ def save_starts(starts: Sequence[Start], path: Path) -> None:
         seed = [] if start.seed is None else [start.seed]
         for name, value in (("images", start.images), ("actions", start.actions), ("seed", np.array(seed, np.int64))):
             arrays[f"{i:04d}/{start.robot}/{name}"] = value
-    content = io.BytesIO()
-    np.savez_compressed(content, **arrays)
-    write_file(path, content.getvalue())
+    write_arrays(path, arrays)
 
 
 def load_starts(path: Path) -> tuple[Start, ...]:
     """What `save_starts` wrote. Raises ConfigError for a file that is damaged or something else."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        names = sorted({name.rsplit("/", 1)[0] for name in arrays})
+    with reading_arrays(path, "make it again") as arrays:
         starts = []
-        for name in names:
+        for name in sorted({name.rsplit("/", 1)[0] for name in arrays}):
             seed = arrays[f"{name}/seed"]
             images, actions = arrays[f"{name}/images"], arrays[f"{name}/actions"]
             starts.append(Start(name.split("/")[1], images, actions, int(seed[0]) if len(seed) else None))
         return tuple(starts)
-    except UNREADABLE as error:
-        raise ConfigError(f"{path} cannot be read as starts of episodes ({error}); make it again") from error

@@ -6,7 +6,6 @@ scale of latents. It is written last, so a directory holds a whole tokenizer or 
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,8 @@ from flax import nnx
 from hma_jax.config import AnyTokenizerConfig, ConfigError, require
 from hma_jax.config.json import diff, from_dict, to_dict
 from hma_jax.model.params import Params, path_name
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.runtime.arrays import UNREADABLE, write_arrays
+from hma_jax.runtime.files import write_file
 from hma_jax.tokenizers.continuous import ContinuousTokenizer
 from hma_jax.tokenizers.lfq import LfqTokenizer
 from hma_jax.tokenizers.pixels import PixelTokenizer
@@ -48,9 +48,7 @@ def save_tokenizer(tokenizer: BaseTokenizer, directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         (directory / DESCRIPTION).unlink(missing_ok=True)
-        content = io.BytesIO()
-        np.savez(content, **arrays)
-        write_file(directory / WEIGHTS, content.getvalue())
+        write_arrays(directory / WEIGHTS, arrays, compressed=False)
         write_file(directory / DESCRIPTION, json.dumps(description, indent=2, sort_keys=True) + "\n")
     except OSError as error:
         raise ConfigError(

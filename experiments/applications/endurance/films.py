@@ -6,7 +6,6 @@ every `BLOCK` of frames is kept in a file until the films are whole: half an hou
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -15,9 +14,8 @@ import numpy as np
 
 from experiments.applications.detector import Detector
 from experiments.applications.endurance.drives import Drive
-from hma_jax.config import ConfigError
 from hma_jax.evaluation.metrics import psnr
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.episode import as_arrays, from_arrays
 from hma_jax.simulator.simulator import Simulator
 
@@ -89,10 +87,8 @@ def _keep(simulator: Simulator, parts: Sequence[Sequence[Mapping[str, np.ndarray
     """All that there is of the films after so many frames."""
     arrays = as_arrays(simulator.snapshot()) | {"made": np.array(frames)}
     arrays |= {f"film/{i}/{name}": array for i, mine in enumerate(parts) for name, array in _joined(mine).items()}
-    content = io.BytesIO()
-    np.savez(content, **arrays)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, content.getvalue())
+    write_arrays(path, arrays, compressed=False)
 
 
 def _go_on(
@@ -100,16 +96,10 @@ def _go_on(
 ) -> tuple[int, list[list[Mapping[str, np.ndarray]]]]:
     """(frames, parts) as `_keep` left them; the simulator, whose episodes have begun, stands there again. ConfigError for
     a damaged file."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+    with reading_arrays(path, "remove it, the same command films from the start") as arrays:
         parts = [[{f.name: arrays[f"film/{i}/{f.name}"] for f in fields(Film)}] for i in range(len(drives))]
         simulator.restore(from_arrays(arrays, simulator.snapshot()))
         return int(arrays["made"]), parts
-    except UNREADABLE as error:
-        raise ConfigError(
-            f"{path} cannot be read ({error}); remove it, the same command films from the start"
-        ) from error
 
 
 def _measured(
@@ -140,18 +130,13 @@ def colours_of(images: np.ndarray) -> np.ndarray:
 
 
 def save_films(films: Mapping[str, Film], path: Path) -> None:
-    content = io.BytesIO()
     arrays = {f"{robot}/{f.name}": getattr(film, f.name) for robot, film in films.items() for f in fields(Film)}
-    np.savez_compressed(content, **{k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in arrays.items()})
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_file(path, content.getvalue())
+    write_arrays(path, {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in arrays.items()})
 
 
 def load_films(path: Path) -> dict[str, Film]:
     """Raises ConfigError for a damaged file."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            robots = list(dict.fromkeys(name.split("/")[0] for name in file.files))
-            return {robot: Film(**{f.name: file[f"{robot}/{f.name}"] for f in fields(Film)}) for robot in robots}
-    except UNREADABLE as error:
-        raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command makes it again") from error
+    with reading_arrays(path, "remove it, the same command makes it again") as arrays:
+        robots = list(dict.fromkeys(name.split("/")[0] for name in arrays))
+        return {robot: Film(**{f.name: arrays[f"{robot}/{f.name}"] for f in fields(Film)}) for robot in robots}

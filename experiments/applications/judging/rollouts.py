@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -18,7 +17,7 @@ from experiments.applications.policies.policy import Policy
 from experiments.applications.policies.tasks import AnyTask, Task, reached
 from experiments.applications.simulators import START_FRAMES, true_starts, true_worlds
 from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.runtime.arrays import reading_arrays, write_arrays
 from hma_jax.simulator.interface import AnySimulator
 from hma_jax.simulator.robots import Robot
 from hma_jax.simulator.starts import Start
@@ -114,15 +113,10 @@ def _reached(simulator: AnySimulator, task: AnyTask) -> np.ndarray:
 
 def save_rollout(rollout: Rollout, path: Path) -> None:
     """Whole or not at all."""
-    content = io.BytesIO()
-    np.savez_compressed(content, **{f.name: getattr(rollout, f.name) for f in fields(rollout)})
-    write_file(path, content.getvalue())
+    write_arrays(path, vars(rollout))
 
 
 def load_rollout(path: Path) -> Rollout:
     """Raises ConfigError for a damaged file."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return Rollout(**{f.name: file[f.name] for f in fields(Rollout)})
-    except UNREADABLE as error:
-        raise ConfigError(f"{path} cannot be read ({error}); remove it, the same command makes it again") from error
+    with reading_arrays(path, "remove it, the same command makes it again") as arrays:
+        return Rollout(**{f.name: arrays[f.name] for f in fields(Rollout)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -11,8 +10,8 @@ import numpy as np
 
 from experiments.applications.policies.driving import Driven, drive, new_episodes
 from experiments.applications.policies.tasks import Task, held
-from hma_jax.config import ConfigError, require
-from hma_jax.runtime.files import UNREADABLE, write_file
+from hma_jax.config import require
+from hma_jax.runtime.arrays import reading_arrays, write_arrays
 
 SPLIT = "demonstrations"
 """Their seeds are those of no episode that a world model is trained or judged on."""
@@ -117,15 +116,10 @@ def _finished(task: Task, driven: Driven, seeds: np.ndarray, after: int | None) 
 
 def save_demonstrations(demos: Demonstrations, path: Path) -> None:
     """Compressed, whole or not at all."""
-    content = io.BytesIO()
-    np.savez_compressed(content, **{f.name: getattr(demos, f.name) for f in fields(demos)})
-    write_file(path, content.getvalue())
+    write_arrays(path, vars(demos))
 
 
 def load_demonstrations(path: Path) -> Demonstrations:
     """What `save_demonstrations` wrote. Raises ConfigError for a file that is damaged or something else."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return Demonstrations(**{f.name: file[f.name] for f in fields(Demonstrations)})
-    except UNREADABLE as error:
-        raise ConfigError(f"{path} cannot be read as demonstrations ({error}); record them again") from error
+    with reading_arrays(path, "record them again") as arrays:
+        return Demonstrations(**{f.name: arrays[f.name] for f in fields(Demonstrations)})
