@@ -35,6 +35,8 @@ STARTS_PER_ROBOT = 6
 START_FRAMES = 3
 """Frames that an episode begins with: enough to see what moves."""
 
+DEAF = "the model was trained without actions (train.masking.setting passive): what it shows does not depend on them"
+
 
 def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any) -> Simulator:
     """The learned simulator of a run, with robots and starts: those that lie beside it (`simulator.folder`), otherwise

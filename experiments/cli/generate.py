@@ -59,7 +59,7 @@ def generate(
     from experiments.applications.generating.compare import compare
     from experiments.applications.generating.source import SHARD_BYTES, GeneratedSource, checkpoint_hash
     from experiments.applications.generating.trajectories import open_trajectories, told_of_frames
-    from experiments.applications.simulators import load_simulator
+    from experiments.applications.simulators import DEAF, load_simulator
     from experiments.running.workspace import Workspace
     from hma_jax.simulator.folder import find_decode
 
@@ -78,6 +78,8 @@ def generate(
         run, own_starts=True, tokenizer=tokenizer, execution=ExecutionConfig(remat="none"), episodes=batch,
         decode=decode, history=1,
     )  # fmt: skip
+    if simulator.deaf:
+        console.print(f"note: {DEAF}", soft_wrap=True)
     robots, stores = dict(simulator.robots), Workspace.of_run(run).store
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)

@@ -55,7 +55,7 @@ def play(
         if error.name != "aiohttp":
             raise
         raise ConfigError("the page needs aiohttp: pip install 'hma-jax[play]'") from error
-    from experiments.applications.simulators import in_suite, keep_places, load_simulator, true_simulator
+    from experiments.applications.simulators import DEAF, in_suite, keep_places, load_simulator, true_simulator
     from hma_jax.simulator.folder import find_decode
     from hma_jax.simulator.warm_up import warm_up, warm_up_more
 
@@ -79,6 +79,8 @@ def play(
             "the model knew before it was given others",
             soft_wrap=True,
         )
+    if simulator.deaf:
+        console.print(f"note: {DEAF}", soft_wrap=True)
     console.print(f"{run}: {few([name for name in simulator.robots if name in begins])}; compiling", soft_wrap=True)
     warm_up(simulator, together=1)
     raise_lost_request()

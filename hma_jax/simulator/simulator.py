@@ -123,6 +123,11 @@ class Simulator:
         """Frames of each episode so far, those that it began with included; 0: it has not begun."""
         return tuple(0 if e is None else e.count for e in self._episodes)
 
+    @property
+    def deaf(self) -> bool:
+        """Whether the model was trained without actions, so that none has an effect."""
+        return self.model.run.train.masking.setting == "passive"
+
     def describe(self, robots: Sequence[Robot]) -> None:
         """Takes better descriptions of robots, for episodes that begin from now on. ConfigError if one does not fit."""
         for robot in robots:

@@ -84,7 +84,8 @@ async def _crowd(app: web.Application, simulator: Simulator, truth: Truth, toget
 
 
 def describe(simulator: Simulator, truth: Truth) -> list[dict]:
-    """Every robot with its commands, its starts as pictures, and whether its true simulator is here."""
+    """Every robot with its commands, its starts as pictures, whether the model is deaf to them, and whether its true
+    simulator is here."""
     described = []
     for robot in simulator.robots.values():
         starts = [start for start in simulator.starts if start.robot == robot.name]
@@ -94,6 +95,7 @@ def describe(simulator: Simulator, truth: Truth) -> list[dict]:
             **to_dict(robot),
             "starts": [picture(start.images[-1]) for start in starts],
             "first": [command(robot, s.actions[-1] if len(s.actions) else None) for s in starts],
+            "deaf": simulator.deaf,
             "truth": truth(robot) is not None and all(start.seed is not None for start in starts),
         })  # fmt: skip
     return described

@@ -19,7 +19,7 @@ from experiments.applications.generating import trajectories as trajectories_mod
 from experiments.applications.generating.trajectories import describe, open_trajectories
 from experiments.applications.simulators import load_simulator
 from experiments.cli.main import main
-from hma_jax.config import ConfigError
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.simulator.folder import save_robots
 from hma_jax.simulator.robots import Robot
@@ -139,6 +139,12 @@ def test_actions_that_stand_in_another_order_than_the_model_learnt_are_not_repla
 
 def episode_seed(i: int) -> int:
     return source_module.episode_seed(0, f"pusher_sand/val/{i}")
+
+
+def test_that_a_model_without_actions_follows_none_is_said(tmp_path, capsys):
+    run = make_run(tmp_path / "study", TrainConfig(masking=MaskingConfig(setting="passive")))
+    assert generate(run, tmp_path / "none", tmp_path / "out") == 1
+    assert "note: the model was trained without actions" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

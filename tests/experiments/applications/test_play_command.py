@@ -13,11 +13,12 @@ from aiohttp.test_utils import TestServer
 
 from experiments.applications.play import server
 from experiments.cli.main import main
-from hma_jax.config import ConfigError, require
+from hma_jax.config import ConfigError, MaskingConfig, TrainConfig, require
 from hma_jax.runtime.exits import Exit
+from hma_jax.simulator import Simulator
 from hma_jax.simulator.folder import DECODE, USUAL, save_decode
-from tests.experiments.applications.serving import until
-from tests.hma_jax.simulator.small import simulator, start
+from tests.experiments.applications.serving import no_truth, until
+from tests.hma_jax.simulator.small import parts, simulator, start
 
 
 def test_the_command_fills_frames_as_the_run_says_unless_it_is_told_otherwise(monkeypatch, tmp_path):
@@ -68,6 +69,22 @@ def test_the_command_names_robots_that_nobody_can_drive(monkeypatch, tmp_path, c
     said = " ".join(capsys.readouterr().out.split())
     assert f"not on the page: {', '.join(others)}; there are no held-out frames" in said
     assert said.endswith(f"{tmp_path}: {first}; compiling")
+
+
+def test_the_command_and_the_page_say_that_a_model_without_actions_follows_none(monkeypatch, tmp_path, capsys):
+    from experiments.applications import simulators
+    from hma_jax.simulator import warm_up
+
+    monkeypatch.setattr(simulators, "load_simulator", lambda *_, **__: model)
+    monkeypatch.setattr(warm_up, "warm_up", lambda *_, **__: require(False, "enough is said"))
+    for setting in ("forward", "passive"):
+        trained, tokenizer = parts()
+        run = replace(trained.run, train=TrainConfig(masking=MaskingConfig(setting=setting)))
+        model = Simulator(replace(trained, run=run), tokenizer, starts=[start(0, 2)])
+        assert main(["play", str(tmp_path)]) == 2
+        said, known = " ".join(capsys.readouterr().out.split()), server.describe(model, no_truth)
+        deaf = "note: the model was trained without actions (train.masking.setting passive)" in said
+        assert deaf == known[0]["deaf"] == (setting == "passive")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, Exit.INTERRUPTED), (signal.SIGTERM, Exit.STOPPED)])

@@ -319,6 +319,18 @@ def test_a_key_that_is_held_begins_or_pauses_once_and_none_before_there_is_a_rob
     browsing(test)
 
 
+def test_the_page_says_that_a_model_without_actions_follows_none(browsing):
+    async def test(browser, address, client):
+        page = await opened(browser, address)
+        assert "it goes back to rest" in await page.inner_text("#holds")
+        await page.evaluate("state.robots.forEach(robot => { robot.deaf = true; })")
+        await page.click("#robots button[data-name=arm]")
+        assert "trained without actions: they change nothing" in await page.inner_text("#holds.bad")
+        assert not page.faults
+
+    browsing(test)
+
+
 def test_a_place_to_go_to_stays_when_the_comparison_ends_and_goes_back_with_a_rewind(browsing):
     async def test(browser, address, client):
         simulator = client.server.app[CROWD].simulator
