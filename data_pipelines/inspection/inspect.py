@@ -37,6 +37,9 @@ WIDEST = 256
 """Values of an action field at most; wider ones are embeddings or images in disguise. But `action` itself is what was
 done, however wide: a model's frame has the actions of its whole stride."""
 
+NOT_READ = "no camera"
+"""What a picture is called that is not read as one, as LeRobot's depths and grey ones."""
+
 BLANK_STD = 1.5
 """Grey levels: a frame that varies less over its pixels shows nothing (JPEG noise included)."""
 
@@ -46,7 +49,7 @@ class FieldFacts:
     """A field of the schema, by the key under which an entry would name it."""
 
     key: str
-    kind: str  # image, depth, number, list (of numbers, however long), bytes (that numbers are kept as) or text
+    kind: str  # image, depth, number, list (of them, however long), bytes (that they are kept as), text or NOT_READ
     shape: tuple[int | None, ...]
     dtype: str
     per_step: bool  # False: once per episode
@@ -210,12 +213,15 @@ def _describe(source: EpisodeSource) -> tuple[tuple[FieldFacts, ...], tuple[Spli
     """Fields of a step and of the episode, and all splits."""
     if isinstance(source, RldsDataset):
         return _read_schema(source.directory)
-    fields = [
-        FieldFacts(key.removeprefix("steps/"), "image", (None, None, 3), "uint8", per_step=True)
-        if feature.image
-        else FieldFacts(key.removeprefix("steps/"), "number", (feature.size,), "float32", per_step=True)
-        for key, feature in source.features.items()
-    ]
+    fields = []
+    for key, feature in source.features.items():
+        if feature.image:
+            what: tuple = "image", (None, None, 3), "uint8"
+        elif feature.shape:
+            what = NOT_READ, feature.shape, feature.dtype
+        else:
+            what = "number", (feature.size,), "float32"
+        fields.append(FieldFacts(key.removeprefix("steps/"), *what, per_step=True))
     return tuple(fields), (SplitFacts(source.split, len(source), source.files, int(source.sizes().sum())),)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_pipelines.inspection.action_stats import WRAPPING
-from data_pipelines.inspection.inspect import CameraFacts, Facts
+from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, Facts
 from data_pipelines.registry import DatasetSpec
 from data_pipelines.registry.angles import AngleForm, AngleUnit
 from data_pipelines.sources.rlds.schema import field_slice
@@ -109,6 +109,8 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
         return None
     keys, dims, about = _choose_actions(facts)
     reasons = [f"camera: {why}", f"action: {about}"]
+    if others := [field.key for field in facts.fields if field.kind == NOT_READ]:
+        reasons.append(f"left out: {', '.join(others)}: pictures that are not of three colours are no cameras")
     angles, unit = _choose_angles(facts, keys, dims)
     if angles:
         reasons.append(

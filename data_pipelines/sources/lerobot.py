@@ -4,7 +4,7 @@ Row t of an episode was recorded at t / fps seconds; its camera frame is the one
 shows at the row's timestamp (plus, in 3.0, the time at which the episode begins in its file).
 Cameras become `observation/<name>`, other numeric features vectors under `observation/` and
 `action`; texts follow `task_index`. Success is the last `next.success`, where there is one.
-Depth cameras are left out.
+Depth cameras and grey ones are left out (`left_out`, with their shapes).
 """
 
 from __future__ import annotations
@@ -44,23 +44,21 @@ class LeRobotSource:
         features = self.meta.features
         _check_names(features, self.root / "meta" / "info.json")
         there = {_short(key): key for key, feature in features.items() if _is_camera(feature)}
+        others = {
+            key: tuple(feature["shape"])
+            for key, feature in features.items()
+            if feature["dtype"] in PICTURES and not _is_camera(feature)
+        }
         if not there:
-            others = [
-                f"{shown(k)}: {'x'.join(map(str, f['shape']))}"
-                for k, f in features.items()
-                if f.get("dtype") in PICTURES
-            ]
-            found = (
-                f" (there are {', '.join(others)}; grey ones are to be written as red, green and blue)"
-                if others
-                else ""
-            )
+            listed = ", ".join(f"{shown(key)}: {'x'.join(map(str, shape))}" for key, shape in others.items())
+            found = f" (there are {listed}; grey ones are to be written as red, green and blue)" if others else ""
             raise DataError(
                 f"{self.root / 'meta' / 'info.json'}: no feature is a video or an image of 3 channels{found}."
             )
         wanted = [_short(camera) for camera in settings.camera]
         names = choose(wanted, tuple(there), "camera", str(self.root))
         self.cameras = {f"observation/{name}": there[name] for name in names}
+        self.left_out = {f"observation/{_short(key)}": shape for key, shape in others.items()}
         self.vectors = {_key(k): k for k, feature in features.items() if _is_vector(k, feature)}
         if "action" not in {key.partition("/")[0] for key in self.vectors}:
             raise DataError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 
@@ -10,10 +11,11 @@ import pytest
 
 from data_pipelines.errors import DataError
 from data_pipelines.inspection.action_stats import dimension_facts
-from data_pipelines.inspection.inspect import CameraFacts, inspect_dataset
+from data_pipelines.inspection.inspect import NOT_READ, CameraFacts, inspect_dataset
 from data_pipelines.inspection.suggest import choose_camera, suggest_entry, window_facts
 from data_pipelines.registry import DatasetSpec, get_spec
 from data_pipelines.registry.own import OWN
+from data_pipelines.sources.lerobot_dataset import LeRobotDataset
 from data_pipelines.sources.rlds.dataset import RldsDataset
 from hma_jax.config import ConfigError
 from tests.data_pipelines.convert.sources import HEIGHT, WIDTH, picture, write_lerobot, write_robomimic
@@ -174,6 +176,23 @@ def test_a_grey_camera_is_one(tmp_path):
     assert suggest_entry(facts, 4).image_key == "observation/image" and not facts.damaged
     image = RldsDataset(directory).episode(0, "observation/image", ("action",)).images[1]
     np.testing.assert_array_equal(image, np.repeat(np.eye(8, dtype=np.uint8)[..., None] * 80, 3, -1))
+
+
+def test_pictures_of_lerobot_that_are_no_cameras_are_named(tmp_path):
+    """A grey camera and a depth beside one of three colours were left out without a word."""
+    root = write_lerobot(tmp_path / "toy", "v2.1", camera="image")
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    depth = {"dtype": "image", "shape": [4, 6, 3], "info": {"video.is_depth_map": True}}
+    info["features"] |= {"observation.images.ir": {"dtype": "image", "shape": [8, 8, 1]}, "observation.depth": depth}
+    path.write_text(json.dumps(info))
+    facts = inspect_dataset(root).facts
+    left = {f.key: f.shape for f in facts.fields if f.kind == NOT_READ}
+    assert left == {"observation/ir": (8, 8, 1), "observation/depth": (4, 6, 3)}
+    assert "left out: observation/ir, observation/depth" in " ".join(suggest_entry(facts, 10).reasons)
+    assert [c.key for c in facts.cameras] == ["observation/top"]
+    with pytest.raises(ConfigError, match="'observation/ir' is not an image; images: observation/top"):
+        LeRobotDataset(root).check_keys("observation/ir", ("action",))
 
 
 def test_actions_that_are_kept_as_bytes_are_told_and_not_called_damage(tmp_path):
