@@ -88,7 +88,8 @@ class TrueSimulator(ABC, Generic[W]):
     def reset(
         self, starts: Start | Sequence[Start], *, seeds: int | Sequence[int] = 0, episodes: Sequence[int] | None = None
     ) -> np.ndarray:
-        """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no effect."""
+        """Begins at the last frames of `starts`, which must have the seeds of their episodes; `seeds` have no
+        effect."""
         del seeds
         which = chosen_episodes(episodes, len(self))
         each = [starts] * len(which) if isinstance(starts, Start) else list(starts)

@@ -25,9 +25,9 @@ def guarded(
     skipping: str = "",
 ) -> int:
     """Does `work` and returns the exit code; what a user can mend is one message on stderr, with `debug` or HMA_DEBUG=1
-    a traceback, as of a bug. `own_process`: the process has nothing else to do; `resumes`: after a stop the same command
-    goes on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves out records
-    that cannot be read."""
+    a traceback, as of a bug. `own_process`: the process has nothing else to do; `resumes`: after a stop the same
+    command goes on where it was, otherwise it begins anew and `keeps` what is named; `skipping`: the option that leaves
+    out records that cannot be read."""
     debug = debug or os.environ.get("HMA_DEBUG", "0") not in ("", "0")
     if own_process and not debug:
         _silence_background()

@@ -148,7 +148,7 @@ def plan_trials(
 
 
 def checkpoint_bytes(plan: TrialPlan) -> int:
-    """Size of the checkpoints that a finished trial leaves: weights and two moments in float32, and the weights' average
-    where there is one."""
+    """Size of the checkpoints that a finished trial leaves: weights and two moments in float32, and the weights'
+    average where there is one."""
     copies = 3 + (plan.trial.train.ema_decay > 0)
     return UNWATCHED.keep_checkpoints * copies * 4 * plan.cost.parameters

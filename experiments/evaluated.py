@@ -69,7 +69,8 @@ def _protocol(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _differences_of_windows(place: Path, wanted: MadeFrom) -> list[str]:
-    """For results of an earlier version, which have no stamp: lines on their datasets, and on how many windows of each."""
+    """For results of an earlier version, which have no stamp: lines on their datasets, and on how many windows of
+    each."""
     from hma_jax.evaluation.windows import FILE, WindowTable
 
     try:

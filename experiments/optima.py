@@ -39,8 +39,8 @@ class Optimum:
     near_high: float
     moved: float  # steps of the grid from the best x of the base series, downwards negative; nan without one
     transferred_x: float  # the best x of the base series in the same role; nan without one
-    # By how much the loss is higher there than at the best x, both chosen by the other seeds where every point has several;
-    # inf if it diverged, nan if it has no result.
+    # By how much the loss is higher there than at the best x, both chosen by the other seeds where every point has
+    # several; inf if it diverged, nan if it has no result.
     penalty: float
     penalty_seed_sem: float
 

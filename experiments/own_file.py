@@ -42,8 +42,8 @@ def run_file(path: Path, signature: str, what: str, page: str) -> types.ModuleTy
 
 @contextmanager
 def naming_line(path: Path, page: str) -> Iterator[None]:
-    """What the file at `path`, or what it calls, raises becomes a ConfigError in the exception's own words that names the
-    line of the file. Errors of data and of the system have a message of their own."""
+    """What the file at `path`, or what it calls, raises becomes a ConfigError in the exception's own words that names
+    the line of the file. Errors of data and of the system have a message of their own."""
     try:
         yield
     except (DataError, OSError):

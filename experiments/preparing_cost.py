@@ -51,8 +51,8 @@ class Frames:
 def estimate_preparing(
     study: Study, simulated: bool = True, trained: bool = True, tokenised: bool = True
 ) -> PreparingCost:
-    """`simulated`: the suite is made, no data is given. `trained`: the tokenizer is trained, none is given. `tokenised`:
-    tokens are made, which are not there yet; when they are, nothing else is made either."""
+    """`simulated`: the suite is made, no data is given. `trained`: the tokenizer is trained, none is given.
+    `tokenised`: tokens are made, which are not there yet; when they are, nothing else is made either."""
     if not tokenised:
         return PreparingCost()
     counts = {name: count_frames(study, name) for name in study.all_names()}

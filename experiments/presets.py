@@ -106,8 +106,8 @@ CPU = Study(
         optimizer=OptimizerConfig(learning_rate=4e-3, warmup_steps=30, schedule="wsd", final_fraction=0.05),
         masking=MaskingConfig(max_corrupt_rate=0.0, non_mlm_ratio=0.0),
     ),
-    # Each other sequence costs a seventh of what evaluation costs without any: three, of which a trial's evaluation takes
-    # a third longer, say whether actions are followed; the sixteen of retrieval need fifteen.
+    # Each other sequence costs a seventh of what evaluation costs without any: three, of which a trial's evaluation
+    # takes a third longer, say whether actions are followed; the sixteen of retrieval need fifteen.
     eval=EvalConfig(windows_per_dataset=8, batch=8, other_actions=3),
     dataset_counts=(5, 20, 40),
     trajectory_counts=(4, 32, 500),

@@ -89,7 +89,8 @@ PROGRAM = ("hma_jax", "jax", "jaxlib", "flax", "optax", "numpy")
 
 
 class Replacing(pytest.MonkeyPatch):
-    """Where a part of the program is replaced, no step that was traced before is used, and none is left to other tests."""
+    """Where a part of the program is replaced, no step that was traced before is used, and none is left to other
+    tests."""
 
     replaced = False
 

@@ -1,4 +1,5 @@
-"""The plan of the house: who may import whom, and that there are no circles (docs/development.md, "Map of the house")."""
+"""The plan of the house: who may import whom, and that there are no circles (docs/development.md, "Map of the
+house")."""
 
 from __future__ import annotations
 

@@ -34,7 +34,8 @@ from hma_jax.config import ConfigError, require
 from hma_jax.runtime.locks import Held
 
 GENERATOR = 1
-"""Raise it when simulation, behaviour, drawing or encoding change: older datasets are then told apart (`made_before`)."""
+"""Raise it when simulation, behaviour, drawing or encoding change: older datasets are then told apart
+(`made_before`)."""
 
 JOB_EPISODES = 10
 """At most so many episodes in one process: starting one costs a few seconds."""

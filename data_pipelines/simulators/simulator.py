@@ -1,4 +1,5 @@
-"""Robots of public simulators as `TrueSimulator`s. Only those of one environment: a `Start` names a robot and a seed."""
+"""Robots of public simulators as `TrueSimulator`s. Only those of one environment: a `Start` names a robot and a
+seed."""
 
 from __future__ import annotations
 

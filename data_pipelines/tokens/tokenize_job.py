@@ -141,8 +141,8 @@ def plan_dataset(
 
 
 def stored_step(spec: DatasetSpec, frame_step: int | None, rate: float | None = FRAME_RATE) -> int:
-    """Every how many native frames one is stored: `frame_step`, or the stride at `rate` Hz (None: native) if it is None.
-    Raises ConfigError for a step that does not divide that stride."""
+    """Every how many native frames one is stored: `frame_step`, or the stride at `rate` Hz (None: native) if it is
+    None. Raises ConfigError for a step that does not divide that stride."""
     stride = spec.stride_at(rate)
     frame_step = stride if frame_step is None else frame_step
     require(

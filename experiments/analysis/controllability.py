@@ -78,8 +78,8 @@ def beyond(rows: Iterable[Controlled], metric: str) -> tuple[int, int]:
 
 
 def by_chance(rows: Iterable[Controlled], metric: str) -> float:
-    """How many of these robots a deaf model has there on average: few episodes make a rough standard error, so that it is
-    Student's t, with as many degrees of freedom as episodes less one. A robot without actions, which has
+    """How many of these robots a deaf model has there on average: few episodes make a rough standard error, so that it
+    is Student's t, with as many degrees of freedom as episodes less one. A robot without actions, which has
     the value of a deaf model in every window, is never there."""
     own = [row for row in rows if row.metric == metric and row.episodes > 1]
     freedom = [row.episodes - 1 for row in own if max(abs(row.mean - row.deaf), row.sem) > ROUNDING]

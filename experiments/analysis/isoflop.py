@@ -4,8 +4,8 @@ Each size's run gives its loss at several budgets, by its decay branches; betwee
 the logarithm (modified Akima, no further out than TOLERANCE). At one budget the loss over log N is fitted by a
 parabola, whose minimum is N_opt; then N_opt = k C^a over budgets. A budget at which the smallest or the largest size
 has the lowest loss, or whose parabola has no minimum between them, is refused: the best size may lie beyond. A parabola
-through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter it is said:
-its minimum is then where no bootstrap looks for an error.
+through losses that only flatten has a minimum, too. Where sizes lie off the parabola by more than seeds scatter it is
+said: its minimum is then where no bootstrap looks for an error.
 """
 
 from __future__ import annotations
@@ -164,8 +164,8 @@ def _fit_budget(lines: list[_Line], flops: float) -> tuple[Budget, np.ndarray]:
 
 
 def _misfit(residuals: np.ndarray, seeds: Sequence[int]) -> str:
-    """Of `residuals` [m, 1 + R] of log losses, those of the values before those of the draws, which scatter around them as
-    means over `seeds` [m] do: an F test of lack of fit, as `fits` makes it of a power law."""
+    """Of `residuals` [m, 1 + R] of log losses, those of the values before those of the draws, which scatter around them
+    as means over `seeds` [m] do: an F test of lack of fit, as `fits` makes it of a power law."""
     scatter = float(((residuals[:, 1:] - residuals[:, :1]) ** 2).sum(0).mean())
     if min(seeds) < 2 or scatter == 0:
         return ""

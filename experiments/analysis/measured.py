@@ -100,9 +100,9 @@ class Measured:
         """[draws, n]: the losses with seeds, and unless told otherwise episodes, drawn with replacement.
 
         Seeds are drawn per run, so that branches of a run move together. A seed's deviation from the mean of its
-        position is taken sqrt(m / (m - 1)) times for m seeds, and `_stretch` times where levels were taken out: otherwise
-        the spread of few would come out too small. With a single seed nothing is known of the spread, and the loss keeps
-        it.
+        position is taken sqrt(m / (m - 1)) times for m seeds, and `_stretch` times where levels were taken out:
+        otherwise the spread of few would come out too small. With a single seed nothing is known of the spread, and the
+        loss keeps it.
         """
         number = int(rng.integers(2**31))
         if self.panel is None:

@@ -42,8 +42,8 @@ def open_study(workspace: Workspace) -> Materials:
 def choose_robots(
     run: Path, model: Model, materials: Materials, robots: Sequence[str], windows: int, out: Path
 ) -> tuple[list[str], dict[str, str]]:
-    """(robots to be checked, why each of the others has too few episodes) of those that are asked for, () for all of the
-    study in `out`, whose tokens are the model's.
+    """(robots to be checked, why each of the others has too few episodes) of those that are asked for, () for all of
+    the study in `out`, whose tokens are the model's.
 
     Raises ConfigError where the study does not know a robot, or none is left.
     """

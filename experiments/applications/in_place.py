@@ -6,7 +6,8 @@ Expected: what moved is found within 2 pixels of 32 of its true place in most la
 
 Held-out episodes of every robot that the suite can simulate go on from a prompt of `START_FRAMES` frames to the end of
 the model's window, under the recorded actions, in the learned and in the true simulator. Blur costs little PSNR and
-this much. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it is not there yet.
+this much. Writes DIR/in_place.csv, a row for each thing that is seen at the end, and the detector, if it is not there
+yet.
 """
 
 from __future__ import annotations

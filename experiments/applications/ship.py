@@ -3,15 +3,15 @@
 Command: hma train --preset play --out runs/play
          python -m experiments.applications.ship runs/play/model --out runs/play/shipped --unmask-steps 8 \
              --temperature 0.7
-Cost: the first an hour and a half of one core and its tokenizer, resumed where it was stopped; the second three minutes.
-      Of the model that is served: docs/simulator.md.
+Cost: the first an hour and a half of one core and its tokenizer, resumed where it was stopped; the second three
+      minutes. Of the model that is served: docs/simulator.md.
 Expected: frames under held-out actions are nearer to the truth than the last frame kept, and than frames under
           actions of other episodes.
 
 Writes weights (in half precision; their average, where the run keeps one), tokenizer, the robots' commands, starts of
 held-out episodes, how frames are to be filled, and report.json: PSNR against the true simulator by frame, of the model,
-of a still picture and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch 1.
-clip.gif shows the first of them.
+of a still picture and of shuffled actions, over `EPISODES` held-out episodes of each robot; frames per second at batch
+1. clip.gif shows the first of them.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def ship(
 ) -> None:
     """Replaces `out`, whole or not at all, by the model and by what `add` writes beside it.
 
-    Raises ConfigError where `out` is something else than what was shipped before, for a robot outside the suite, and if it
-    would be too large.
+    Raises ConfigError where `out` is something else than what was shipped before, for a robot outside the suite, and if
+    it would be too large.
     """
     shipped = not out.exists() or (out / REPORT).is_file() or not any(out.iterdir())
     require(shipped, f"--out {out} holds no {REPORT}, so that it is no shipped model; all of it would be removed")
@@ -116,7 +116,8 @@ def forget_places(checkpoint: Path) -> None:
 
 
 class Seen(NamedTuple):
-    """Frames under held-out actions, uint8 [1 + FRAMES, EPISODES, H, W, 3]: the first ones, and one after each chunk."""
+    """Frames under held-out actions, uint8 [1 + FRAMES, EPISODES, H, W, 3]: the first ones, and one after each
+    chunk."""
 
     true: np.ndarray
     model: np.ndarray

@@ -65,8 +65,8 @@ def load_simulator(run: Path | str, *, own_starts: bool = False, **options: Any)
 
 
 def save_beside(simulator: Simulator, directory: Path, decode: DecodeConfig | None) -> None:
-    """Writes beside a run in `directory` what `load_simulator` takes from there: tokenizer, robots, starts and, where it
-    is given, how frames are filled."""
+    """Writes beside a run in `directory` what `load_simulator` takes from there: tokenizer, robots, starts and, where
+    it is given, how frames are filled."""
     save_tokenizer(simulator.tokenizer, directory / TOKENIZER)
     save_robots(tuple(simulator.robots.values()), directory / ROBOTS)
     save_starts(simulator.starts, directory / STARTS)
@@ -148,8 +148,8 @@ def _describe(entry: Embodiment, store: TokenStore | None) -> Robot:
 
 
 def keep_places(simulator: Simulator, run: Path | str) -> None:
-    """Describes robots anew whose actions are places to go to, as the study's held-out episodes tell: keys then move the
-    place from where it was, and letting go leaves it there, where `rest` would be a jump.
+    """Describes robots anew whose actions are places to go to, as the study's held-out episodes tell: keys then move
+    the place from where it was, and letting go leaves it there, where `rest` would be a jump.
 
     What lies beside the run, and the suite, say it themselves. For whoever drives; no simulated frame depends on it.
     """
@@ -169,7 +169,8 @@ def _goes_to_places(store: TokenStore, name: str) -> bool:
 
 
 def find_starts(simulator: Simulator, workspace: Workspace) -> tuple[Start, ...]:
-    """Starts of every robot: of held-out episodes of its true simulator, otherwise those whose frames the token store kept."""
+    """Starts of every robot: of held-out episodes of its true simulator, otherwise those whose frames the token store
+    kept."""
     store = TokenStore(workspace.store) if workspace.store.is_dir() else None
     starts: list[Start] = []
     for robot in simulator.robots.values():

@@ -94,7 +94,8 @@ def find_devices(topology: str) -> list[Any]:
 
 def chips_of(topology: str) -> str:
     """The topology of a cloud's name: v4:2x2x4 of v4-32, v5e:2x4 of v5e-8, as close to a square or a cube as powers of
-    two allow. Other names are returned as they are. Raises ConfigError for a number of chips that is not 4, 8, 16, ..."""
+    two allow. Other names are returned as they are. Raises ConfigError for a number of chips that is not 4, 8,
+    16, ..."""
     found = re.fullmatch(r"(v\d\w*)-(\d+)", topology)
     if found is None or found[1] not in CORES_PER_CHIP:
         return topology

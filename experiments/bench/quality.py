@@ -77,8 +77,8 @@ def judge(
     setting: Setting,
     progress: Callable[[str, int], None],
 ) -> tuple[list[Judged], list[Stage]]:
-    """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time, `setting` is what
-    the model was trained for."""
+    """One row per decoding, and a stage of whole rollouts; `batches()` gives the same windows each time, `setting` is
+    what the model was trained for."""
     rows, calls, reference = [], {}, None
     for done, (name, config) in enumerate(settings.items()):
         progress(name, done)

@@ -1,10 +1,10 @@
 """A process that runs stages of the official PyTorch release when told to, as `stages` runs ours.
 
 It is started in an environment of its own, which has torch and what the release imports, with a checkout of
-the release (github.com/liruiw/HMA) on its path; nothing of it is part of this project. Its arguments are the examples at
-a time and what is computed in. On CPU the release's `.cuda()` must mean nothing, and its attention is the one it has
-without xformers. On a GPU it computes as its training program does: float32 products at "medium" precision, attention by
-a fused kernel, which is torch's own where xformers is not installed.
+the release (github.com/liruiw/HMA) on its path; nothing of it is part of this project. Its arguments are the examples
+at a time and what is computed in. On CPU the release's `.cuda()` must mean nothing, and its attention is the one it has
+without xformers. On a GPU it computes as its training program does: float32 products at "medium" precision, attention
+by a fused kernel, which is torch's own where xformers is not installed.
 """
 
 from __future__ import annotations

@@ -168,9 +168,9 @@ def say_what_it_may_have_seen(trained: Run, names: Sequence[str], store: TokenSt
 
 
 def trained_on_other_tokens(trained: Run, names: Sequence[str], store: TokenStore) -> list[str]:
-    """Those of `names` that a model, or the one it goes on from, was trained on and not, as far as can be told, with the
-    tokens of `store`: another choice of held-out episodes is another store. A run holds one hash of all its datasets, so
-    that one of them that is another, or not here, makes all of them doubtful."""
+    """Those of `names` that a model, or the one it goes on from, was trained on and not, as far as can be told, with
+    the tokens of `store`: another choice of held-out episodes is another store. A run holds one hash of all its
+    datasets, so that one of them that is another, or not here, makes all of them doubtful."""
     found: list[str] = []
     provenance = trained.provenance
     while "loader" in provenance:

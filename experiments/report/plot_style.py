@@ -113,8 +113,8 @@ def plain_log(panel: Axes, axis: Axis, label: Callable[[float], str] = plain_num
 
 
 def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room: float | None = None) -> None:
-    """Ticks are the points themselves, and `room` the factor that is left beyond the ends, where it matters. A log axis,
-    but where one of them has no logarithm: it would be left out."""
+    """Ticks are the points themselves, and `room` the factor that is left beyond the ends, where it matters. A log
+    axis, but where one of them has no logarithm: it would be left out."""
     if min(xs) > 0:
         panel.set_xscale("log")
         if room:
@@ -124,8 +124,8 @@ def axis_of_points(panel: Axes, xs: Sequence[float], names: Sequence[str], room:
 
 
 def show_control(panel: Axes, points: list[CurvePoint]) -> None:
-    """The trials on shuffled actions, where on the axis they stand, with their standard errors. One seed of them, as there
-    mostly is, stands beside means over several: it is said."""
+    """The trials on shuffled actions, where on the axis they stand, with their standard errors. One seed of them, as
+    there mostly is, stands beside means over several: it is said."""
     if points:
         alone = all(len(p.seeds) == 1 for p in points)
         panel.errorbar(
@@ -141,8 +141,8 @@ def show_tally(panel: Axes, rows: Iterable[Row], sweep: str) -> None:
 
 
 def show_legend(figure: plt.Figure, panels: Iterable[Axes]) -> None:
-    """What the lines of `panels` are, above all of them: within one, words would lie on what they are about. The first may
-    be empty, or lack what others have, while trials run."""
+    """What the lines of `panels` are, above all of them: within one, words would lie on what they are about. The first
+    may be empty, or lack what others have, while trials run."""
     shown: dict[str, Artist] = {}
     for panel in panels:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):

@@ -149,7 +149,8 @@ def _change(changes: Sequence[Change]) -> str:
 
 
 def _with_interval(found: AtBest | Change | Growth, sign: str = "", words: str = "") -> str:
-    """'0.31 (`words`0.22 to 0.4)', the mean alone where nobody knows its error; `sign`: "+" for one before every value."""
+    """'0.31 (`words`0.22 to 0.4)', the mean alone where nobody knows its error; `sign`: "+" for one before every
+    value."""
     low, high = (f"{end:{sign}.3g}" for end in (found.low, found.high))
     told = f" ({words}{low} to {high})" if math.isfinite(found.low) else ""
     return f"{found.mean:{sign}.3g}{told}".replace("-", "\u2212")

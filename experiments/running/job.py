@@ -12,7 +12,8 @@ from hma_jax.config.json import from_dict
 
 
 def read_job(record: dict[str, Any]) -> tuple[Trial, ExecutionConfig, Shared]:
-    """(the trial, how it is computed, what it shares with others). Fields that came after the job was written take their defaults.
+    """(the trial, how it is computed, what it shares with others). Fields that came after the job was written take
+    their defaults.
 
     Earlier versions counted how a trial is computed to the trial itself. Raises ConfigError for what is no job.
     """

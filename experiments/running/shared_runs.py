@@ -76,7 +76,8 @@ def begin_shared(directory: Path, before: Iterable[tuple[str, int]]) -> tuple[st
 
 
 def latest_common(trials: Path, before: Iterable[tuple[str, int]]) -> tuple[str, int]:
-    """Which of those `before` a trial has the latest checkpoint in common with it, and its step; 0 where none has any."""
+    """Which of those `before` a trial has the latest checkpoint in common with it, and its step; 0 where none has
+    any."""
     from hma_jax.training.branch import last_step
 
     there = [(last_step(trials / id / RUN, until), id) for id, until in before]

@@ -1,6 +1,8 @@
-"""Finished trials that lie in a study's directory and are not of it: what they were trained for need not be trained again.
+"""Finished trials that lie in a study's directory and are not of it: what they were trained for need not be trained
+again.
 
-A study that is to be judged otherwise (`eval`, `--replace study`) has trials of other names. Their training is the same.
+A study that is to be judged otherwise (`eval`, `--replace study`) has trials of other names. Their training is the
+same.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from hma_jax.training.claim import CHECKPOINTS
 def find_trained(
     trials: Path, ids: Collection[str], provenance: Provenance, sources: Closure | None
 ) -> dict[str, Trial]:
-    """Finished trials in `trials` by id, without those of `ids`, that were trained on the same tokens, are what today's code
-    would name so, and have checkpoints.
+    """Finished trials in `trials` by id, without those of `ids`, that were trained on the same tokens, are what today's
+    code would name so, and have checkpoints.
 
     `sources`: those that they have to have run; None: whichever. What cannot be read is nothing to go on from.
     """

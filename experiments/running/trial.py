@@ -112,7 +112,8 @@ def _identity(trial: Trial) -> dict[str, Any]:
 
 
 def drop_later_fields(fields: dict[str, Any]) -> None:
-    """Takes away the fields of configurations that came later (`LATER`), where they have the value that all had before."""
+    """Takes away the fields of configurations that came later (`LATER`), where they have the value that all had
+    before."""
     for path, before in LATER.items():
         if "." in path:
             _drop(fields, path.split("."), before)

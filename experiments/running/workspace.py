@@ -26,7 +26,8 @@ class Busy(Held):
 
 @dataclass(frozen=True)
 class Workspace:
-    """Paths under `root`. Deleting any of them is safe, the next run makes it again, but for predictions and findings."""
+    """Paths under `root`. Deleting any of them is safe, the next run makes it again, but for predictions and
+    findings."""
 
     root: Path
 
@@ -205,8 +206,8 @@ def find_record(workspace: Workspace) -> Record | None:
 
 
 def load_record(workspace: Workspace) -> Record:
-    """The study that lives there, whose own registry entries are added to the registry for the rest of this process: its
-    axes are planned with them. Raises ConfigError if there is none, or one that does not say what its axes are."""
+    """The study that lives there, whose own registry entries are added to the registry for the rest of this process:
+    its axes are planned with them. Raises ConfigError if there is none, or one that does not say what its axes are."""
     record = find_record(workspace)
     if record is None:
         raise ConfigError(

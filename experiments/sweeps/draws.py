@@ -16,8 +16,9 @@ Kinship = Literal["any", "siblings", "strangers"]
 
 
 def draw_judged(study: Study, seed: int, count: int | None = None) -> tuple[str, ...]:
-    """The robots that a seed judges, `designs.judged` or as many as given, in the study's order. In the suite each is of another family, and none is video
-    alone: no action of such a one could be judged. Raises ConfigError if there are too few."""
+    """The robots that a seed judges, `designs.judged` or as many as given, in the study's order. In the suite each is
+    of another family, and none is video alone: no action of such a one could be judged. Raises ConfigError if there are
+    too few."""
     names, families = study.dataset_names(), _families()
     found: list[str] = []
     for name in _drawn(names, seed):

@@ -57,8 +57,8 @@ def plan(study: Study) -> Sweep:
 
 
 def count_episodes(study: Study, cap: int | None) -> int:
-    """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly; of others what
-    the registry says, which counts those that are held out. Raises ConfigError where it says nothing."""
+    """Training trajectories of all robots under a cap (None: that of the reference): of the suite exactly; of others
+    what the registry says, which counts those that are held out. Raises ConfigError where it says nothing."""
     from data_pipelines.registry import get_spec
     from data_pipelines.suite.embodiments import EMBODIMENTS
     from data_pipelines.suite.generate import episode_count

@@ -10,8 +10,8 @@ Paper figure: none.
 Command: python -m experiments.sweeps.ladder --preset cpu-full
 Cost: four training runs, two of them with longer branches, per seed of `ablation_seeds`, one for each change alone and
     for changes tenfold, the control and the long ones; `--dry-run` prints it.
-Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of fewer nats, not of more dB;
-    changes that count more of neither. What came: experiments/results/ladder/findings.md.
+Expected outcome: recall and Muon ahead of the reference, both ahead of each; chained factors of fewer nats, not of more
+    dB; changes that count more of neither. What came: experiments/results/ladder/findings.md.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ LONGER = RUNGS | {
 
 
 def plan(study: Study) -> Sweep:
-    """All datasets and trajectories on every rung; `LONGER` for longer, which the label says, unless rungs take as long."""
+    """All datasets and trajectories on every rung; `LONGER` for longer, which the label says, unless rungs take as
+    long."""
     seeds, first = study.ablation_seeds, study.ablation_seeds[0]
     sweep = make_ablation(
         study,

@@ -8,8 +8,8 @@ Cost: three training runs per seed of `ablation_seeds`, and the control; `--dry-
 Expected outcome: forward is best, full between it and passive. Passive has a delta PSNR of zero
     by construction; the shuffled-action control should score as passive does.
 
-What predicts actions cannot be trained with teacher forcing. So that like is compared with like, every setting is trained
-as the release trains, whatever the study's other axes do.
+What predicts actions cannot be trained with teacher forcing. So that like is compared with like, every setting is
+trained as the release trains, whatever the study's other axes do.
 """
 
 from __future__ import annotations

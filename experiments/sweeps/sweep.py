@@ -144,9 +144,9 @@ def make_sweep(
     """The sweep whose trial at x is `change(reference, x)`, for every seed, plus the control: at the reference, and
     at the ends of a numbered axis if the study wants `end_controls`.
 
-    `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError without `values`, and where the
-    study's reference trial does not stand at `reference_x`: `change` has to leave it there as it is, but for whom it is
-    judged on.
+    `seeds` are the study's unless given, `steps` those of every trial. Raises ConfigError without `values`, and where
+    the study's reference trial does not stand at `reference_x`: `change` has to leave it there as it is, but for whom
+    it is judged on.
     """
     require(len(values) > 0, f"axis {name}: values is empty, so that its control alone would run; give it positions")
     seeds = study.seeds if seeds is None else seeds

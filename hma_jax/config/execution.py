@@ -59,8 +59,8 @@ class ExecutionConfig:
     """Number format, memory, kernels and devices of a program."""
 
     dtype: Dtype = "float32"  # of activations and of weights where they are used; parameters are float32
-    # The least memory, so that what fits at all fits without a choice. Where there is four times as much for activations,
-    # "products" is a seventh faster on CPU (twelve layers; docs/performance.md).
+    # The least memory, so that what fits at all fits without a choice. Where there is four times as much for
+    # activations, "products" is a seventh faster on CPU (twelve layers; docs/performance.md).
     remat: Remat = "everything"
     attention: Attention = "auto"  # what computes it; auto: what suits platform and shapes
     accumulate: int = 1  # micro-batches per optimiser step

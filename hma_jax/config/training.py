@@ -56,11 +56,11 @@ class MaskingConfig:
     # Rounds in which own_past is drawn, each after what the one before drew; a step passes over every frame once more
     # for each.
     own_past_rounds: int = 1
-    # With teacher forcing: the probability of each of a few rectangles of the past that show what stands elsewhere, for some
-    # frames (`objective.displaced`). DIFFERS: the release has nothing like it.
+    # With teacher forcing: the probability of each of a few rectangles of the past that show what stands elsewhere, for
+    # some frames (`objective.displaced`). DIFFERS: the release has nothing like it.
     displaced_past: float = 0.0
-    # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one that
-    # stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
+    # How much a discrete token that differs from the one at its place a frame earlier counts in the loss, beside one
+    # that stays: most of a video stands still. DIFFERS: the release counts all alike. What it does: docs/models.md.
     change_weight: float = 1.0
     max_corrupt_rate: float = 0.2  # largest share of tokens that random ones replace; of ids alone, as the next two
     clean_rate_min: float = 0.2  # least share of tokens kept in the first frame after a clean prompt
@@ -119,8 +119,8 @@ class MaskingConfig:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    # At the muP base width. DIFFERS: the release multiplies what it is told by batch / 64, between 1 and 8; here the rate
-    # is what is said, so that runs of several batch sizes say what differs.
+    # At the muP base width. DIFFERS: the release multiplies what it is told by batch / 64, between 1 and 8; here the
+    # rate is what is said, so that runs of several batch sizes say what differs.
     learning_rate: float = 1e-4
     schedule: Literal["constant", "cosine", "wsd"] = "constant"  # of the learning rate, after the warmup
     warmup_steps: int = 500  # over which the learning rate rises from 0

@@ -20,7 +20,8 @@ from hma_jax.training.state import TrainState
 
 
 def write_run(run: Run, directory: Path, beside: Mapping[str, str] | None = None) -> None:
-    """Writes a checkpoint of step 0 with an optimiser that has not moved yet, and texts beside it, by their files' names.
+    """Writes a checkpoint of step 0 with an optimiser that has not moved yet, and texts beside it, by their files'
+    names.
 
     Raises ConfigError if `directory` exists.
     """

@@ -34,14 +34,15 @@ OPTIONAL = (
     "action_error_of_mean",
     "action_gain",
 )
-"""Metrics that some windows have not (nan): there is no other episode, nobody simulates their robot, or it has no actions
-to predict."""
+"""Metrics that some windows have not (nan): there is no other episode, nobody simulates their robot, or it has no
+actions to predict."""
 
 
 def under_each(
     judge: Callable[[jax.Array], dict[str, jax.Array]], actions_BTU: jax.Array, others_BNTU: jax.Array
 ) -> dict[str, jax.Array]:
-    """`judge`, which maps actions [B, T, U] to numbers of each window [B], of the true ones and all others: [1 + N, B]."""
+    """`judge`, which maps actions [B, T, U] to numbers of each window [B], of the true ones and all others:
+    [1 + N, B]."""
     sequences = jnp.concatenate([actions_BTU[:, None], others_BNTU], axis=1)
     return jax.lax.map(judge, jnp.moveaxis(sequences, 1, 0))
 

@@ -41,8 +41,8 @@ PAIRS = 45
 make the frames no likelier as they are."""
 
 LISTENS, DIFFERS = 2.0, 3.0
-"""Standard errors from which on a difference counts: of holding a dimension still, and (of many changes the best one) of
-a change back."""
+"""Standard errors from which on a difference counts: of holding a dimension still, and (of many changes the best one)
+of a change back."""
 
 
 FEWEST = 4
@@ -96,8 +96,8 @@ class Difference:
 
 @dataclass(frozen=True)
 class Effect:
-    """What was found of one dimension. `worth` is what holding it still costs, in nats per token (continuous: in units of
-    the diffusion loss), all that was found wrong being changed back."""
+    """What was found of one dimension. `worth` is what holding it still costs, in nats per token (continuous: in units
+    of the diffusion loss), all that was found wrong being changed back."""
 
     dimension: int
     worth: Difference
@@ -167,8 +167,8 @@ def _clustered(differences: np.ndarray, episode: Sequence[int]) -> Difference:
 def make_loss(
     model: ModelConfig, table: EmbodimentTable, setting: Setting, execution: ExecutionConfig = ExecutionConfig()
 ) -> Callable[[Params, dict[str, jax.Array], jax.Array], jax.Array]:
-    """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted; the batch
-    is as `protocol.Batch` says, `setting` what the model was trained for."""
+    """f(params, batch, actions [B, T, U]) -> loss of each window's frames [B] after their true past, to be jitted; the
+    batch is as `protocol.Batch` says, `setting` what the model was trained for."""
     declared = declare_model(model, table, execution)
 
     def loss(params: Params, batch: dict[str, jax.Array], actions: jax.Array) -> jax.Array:

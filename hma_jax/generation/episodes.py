@@ -101,5 +101,6 @@ def take(episodes: Episodes, rows_B: jax.Array) -> Episodes:
 
 
 def put(episodes: Episodes, rows_n: jax.Array, new: Episodes) -> Episodes:
-    """Episode `rows_n[i]` goes on as the i-th of `new`, the others as they are. A row may stand twice with equal ones."""
+    """Episode `rows_n[i]` goes on as the i-th of `new`, the others as they are. A row may stand twice with equal
+    ones."""
     return jax.tree.map(lambda whole, part: whole.at[rows_n].set(part), episodes, new)

@@ -51,8 +51,8 @@ def backend_of(platform: str) -> str:
 
 
 def find_backend(name: str) -> Backend:
-    """The backend called `name`; `auto` is the one of the platform that is compiled for: of the mesh, or else of the default
-    device. Raises ConfigError for a name that is unknown, or a kernel that the platform has not."""
+    """The backend called `name`; `auto` is the one of the platform that is compiled for: of the mesh, or else of the
+    default device. Raises ConfigError for a name that is unknown, or a kernel that the platform has not."""
     mesh_device = jax.sharding.get_abstract_mesh().abstract_device
     platform = mesh_device.platform if mesh_device else jax.default_backend()
     suits = backend_of(platform)

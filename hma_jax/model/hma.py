@@ -35,7 +35,8 @@ def causal(frames: int) -> jax.Array:
 class Outputs(NamedTuple):
     """What a pass says of the frames it was given, or of those from `said_from` on."""
 
-    # Of tokens, float32: logits [B, T, S, Q, V]; where factors are chained, or of the denoiser, conditions [B, T, S, D].
+    # Of tokens, float32: logits [B, T, S, Q, V]; where factors are chained, or of the denoiser, conditions
+    # [B, T, S, D].
     said: jax.Array
     actions: jax.Array | None  # mean output of each frame's action tokens [B, T, D]; None without any
     cache: TemporalCache | None  # of the frames that are to be remembered

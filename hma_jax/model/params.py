@@ -37,7 +37,8 @@ Use = Literal["always", "actions_shown", "actions_hidden", "actions_predicted", 
 robot's do: no update, no decay, no count."""
 
 MatrixAxes = tuple[tuple[int, ...], tuple[int, ...]]
-"""The axes, counted from the last, that a `hidden` parameter maps from and to. Along others there are more such matrices."""
+"""The axes, counted from the last, that a `hidden` parameter maps from and to. Along others there are more such
+matrices."""
 
 Initializer = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 """init(rng, shape) -> float32 array."""

@@ -21,7 +21,8 @@ Choose = Callable[[int, jax.Array], jax.Array]
 
 
 class Readout(nnx.Module):
-    """Trunk outputs [..., D] -> what is said of tokens: float32 logits [..., Q, V] of factors, independent of each other."""
+    """Trunk outputs [..., D] -> what is said of tokens: float32 logits [..., Q, V] of factors, independent of each
+    other."""
 
     def __init__(self, config: ModelConfig, precise: bool = False):
         self.factors, self.multiplier = config.factors, config.mup_multiplier("readout")

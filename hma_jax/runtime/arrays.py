@@ -34,8 +34,8 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compressed: bool = True)
 
 @contextmanager
 def reading_arrays(path: Path, advice: str) -> Iterator[Mapping[str, np.ndarray]]:
-    """The arrays of a file, for the block that makes something of them. Raises ConfigError, which ends with the `advice`,
-    where the file is missing, damaged or of something else."""
+    """The arrays of a file, for the block that makes something of them. Raises ConfigError, which ends with the
+    `advice`, where the file is missing, damaged or of something else."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             yield arrays

@@ -91,7 +91,8 @@ class Signs:
 
 
 class Board(socketserver.ThreadingTCPServer):
-    """Where process 0 keeps everybody's last sign: whoever brings one, and the program's `word`, is told all of them."""
+    """Where process 0 keeps everybody's last sign: whoever brings one, and the program's `word`, is told all of
+    them."""
 
     daemon_threads, allow_reuse_address, request_queue_size = True, True, 1024
 

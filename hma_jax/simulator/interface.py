@@ -55,8 +55,8 @@ def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
 
 
 Judge = Callable[[AnySimulator], tuple[np.ndarray, np.ndarray]]
-"""What the present frames are worth: (rewards float [B], bool [B]: the task is done and the episode over). One that has a
-method `begin(simulator, episodes)` is told of episodes that have just begun."""
+"""What the present frames are worth: (rewards float [B], bool [B]: the task is done and the episode over). One that has
+a method `begin(simulator, episodes)` is told of episodes that have just begun."""
 
 
 def no_judge(simulator: AnySimulator) -> tuple[np.ndarray, np.ndarray]:

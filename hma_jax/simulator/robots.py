@@ -38,7 +38,8 @@ class Robot:
     dimensions: tuple[str, ...] = ()  # what each value is called
     unit: str = ""  # of the values, for people
     keeps: bool = False  # an action is a place to go to: keys move it; otherwise letting go of them is `rest`
-    # What the keys right, up, D and W do to each value, in shares of half its range; left, down, A and S do the opposite.
+    # What the keys right, up, D and W do to each value, in shares of half its range; left, down, A and S do the
+    # opposite.
     keys: tuple[tuple[float, ...], ...] = ()
     hz: float = 0.0  # native actions per second; 0: not known
     recorded: bool = True

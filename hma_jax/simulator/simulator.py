@@ -284,7 +284,8 @@ class Simulator:
         return Snapshot(self._copied(self._state), self._images, copy.deepcopy(tuple(self._episodes)))
 
     def restore(self, snapshot: Snapshot) -> np.ndarray:
-        """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same frames."""
+        """Goes on from a snapshot of this simulator, any number of times; the same actions then give the same
+        frames."""
         require(
             len(snapshot.episodes) == len(self),
             f"the snapshot is of {len(snapshot.episodes)} episodes, not {len(self)}",

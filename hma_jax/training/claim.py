@@ -13,7 +13,8 @@ from hma_jax.runtime.locks import Held, Lock, exclusive
 NAME, EVALUATION = ".lock", ".evaluation.lock"
 
 CHECKPOINTS = "checkpoints"
-"""The folder of a run directory with a folder for each; named, and listed, where nothing is imported that reads them."""
+"""The folder of a run directory with a folder for each; named, and listed, where nothing is imported that reads
+them."""
 
 
 def list_steps(directory: Path) -> list[int]:

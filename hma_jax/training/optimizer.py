@@ -111,8 +111,8 @@ def init_adam(params: Params, embodiments: int) -> AdamState:
 
 MUON_MOMENTUM = 0.95  # with one look ahead (Nesterov)
 MUON_GAIN = 0.2
-"""Root mean square of a square matrix's update in units of the rate, about what Adam's is (Liu et al. 2025), so that both
-take the same rate."""
+"""Root mean square of a square matrix's update in units of the rate, about what Adam's is (Liu et al. 2025), so that
+both take the same rate."""
 
 
 def muon_direction(momentum: jax.Array, spec: ParamSpec, multiplier: float) -> jax.Array:

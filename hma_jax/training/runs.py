@@ -102,9 +102,9 @@ def require_frames(run: Run, deed: str) -> None:
 def load_run(run_dir: str | Path, weights: Weights = "last") -> Run:
     """The parameters and description of a run's latest checkpoint; its moments are not read.
 
-    The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint while
-    it is read, a newer one is taken. Raises CheckpointError if there is no checkpoint, or it is damaged or foreign, and
-    ConfigError for an average that the run does not keep, and for weights called otherwise.
+    The parameters lie on this process's default device. Of a run that is being trained, and removes the checkpoint
+    while it is read, a newer one is taken. Raises CheckpointError if there is no checkpoint, or it is damaged or
+    foreign, and ConfigError for an average that the run does not keep, and for weights called otherwise.
     """
     require_choice(weights, get_args(Weights), "weights")
     run_dir = Path(run_dir)

@@ -51,7 +51,8 @@ def test_every_trial_of_a_table_is_finished_and_judged(name):
 
 
 def computed_again(name: str, at: Path) -> Workspace:
-    """The study `name`, copied, with nothing that can be computed but what is computed again; its tables are as they were."""
+    """The study `name`, copied, with nothing that can be computed but what is computed again; its tables are as they
+    were."""
     shutil.copytree(RESULTS / name, at / name)
     workspace = Workspace(at / name)
     tables = [*workspace.root.glob("*.csv"), *workspace.root.glob("*.parquet")] if workspace.trials.exists() else []

@@ -1,5 +1,5 @@
-"""What is said of the axes of cpu-full and of its model on latents, and of where things stand in models of eight robots,
-follows from what is kept of them."""
+"""What is said of the axes of cpu-full and of its model on latents, and of where things stand in models of eight
+robots, follows from what is kept of them."""
 
 import csv
 import json

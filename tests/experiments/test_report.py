@@ -329,7 +329,8 @@ def test_robots_that_are_others_for_every_seed_are_shown_of_the_seed_that_judges
 
 @pytest.mark.parametrize("axes", [("settings", "width"), ("conditioning", "horizon"), ("newcomers", "horizon")])
 def test_the_page_shows_the_reference_in_whichever_order_axes_come(axes):
-    """The ablations of cpu-full have a default of their own, for fewer steps; where all robots are poor, so has that."""
+    """The ablations of cpu-full have a default of their own, for fewer steps; where all robots are poor, so has
+    that."""
     for order in (axes, axes[::-1]):
         shown = page._choose_shown(plan_sweeps(CPU_FULL, order), CPU_FULL)
         assert (shown.by.name, shown.name) == (axes[1], "reference")

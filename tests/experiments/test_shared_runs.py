@@ -72,7 +72,8 @@ def test_a_trial_begins_at_the_latest_step_that_it_has_in_common(tmp_path):
 
 
 def test_a_trial_that_is_judged_otherwise_goes_on_from_what_is_trained(tmp_path):
-    """Of its finished namesake in all but the judging: from the last step, or, with other steps, from before the decay."""
+    """Of its finished namesake in all but the judging: from the last step, or, with other steps, from before the
+    decay."""
     former = {"200": trial(200), "other": replace(trial(200), tau=1.0)}
     judged = replace(trial(200), eval=replace(trial(200).eval, random_actions=3))
     adapted = replace(judged, source=trial(100))

@@ -49,7 +49,8 @@ def few(monkeypatch):
 
 
 def test_the_error_of_a_reconstruction_counts_episodes_within_datasets():
-    """In three hundred tries the standard error is what means scatter by, up to three in ten: episodes tell it badly."""
+    """In three hundred tries the standard error is what means scatter by, up to three in ten: episodes tell it
+    badly."""
     means, sems, rng = [], [], np.random.default_rng(0)
     for _ in range(300):
         found = reconstruction_psnr(Off(), Frames(rng))

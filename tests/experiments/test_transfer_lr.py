@@ -147,7 +147,8 @@ def test_what_a_choice_costs_is_judged_on_seeds_that_it_was_not_made_by():
     own = [point(1.0, 1.0, 1.2, 1.1), point(2.0, 1.2, 1.0, 1.1)]
     base = [point(1.0, 0.5, 0.5, 0.5), point(2.0, 0.9, 0.9, 0.9)]
     mean, error = chosen_by_others(own, base, set())
-    # Left out 0 the others choose 2, which costs it 0.2; left out 1 they choose 1, which costs 0.2; the base stays at 1.
+    # Left out 0 the others choose 2, which costs it 0.2; left out 1 they choose 1, which costs 0.2; the base stays at
+    # 1.
     assert mean == pytest.approx((1.0 - 1.2 + 0 + 0) / 3) and error > 0
     assert chosen_by_others([point(1.0, 1.0), point(2.0, 2.0)], base, set()) is None
     clear = [point(1.0, 1.3, 1.4, 1.5), point(2.0, 1.0, 1.1, 1.2)]

@@ -80,7 +80,8 @@ def test_a_lease_of_another_machine_holds_until_it_expires(tmp_path: Path):
 
 
 def test_a_lease_from_a_clock_that_was_ahead_is_over_as_well(tmp_path: Path):
-    """Of a machine that died before its clock was set right, or this one: it would be held for as long as it was ahead."""
+    """Of a machine that died before its clock was set right, or this one: it would be held for as long as it was
+    ahead."""
     path = tmp_path / "lock"
     leave(path, age=-locks.EXPIRES + 5)
     with pytest.raises(Held, match="process 7 on other"), exclusive(path, lease=True):

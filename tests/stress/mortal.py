@@ -31,8 +31,8 @@ from tests.stress.tokenize_process import end_in_save, write
 def run(
     arguments: list[str], output: Path, log: Path, ends_in: int, how: signal.Signals, begun: multiprocessing.Event
 ) -> None:
-    """`hma ARGUMENTS`, which writes what it says to `output`, once `begun` is set. `ends_in`: sends itself the signal `how` before
-    this step of its saves, from 1 on; 0: before none. `log` says how many there were."""
+    """`hma ARGUMENTS`, which writes what it says to `output`, once `begun` is set. `ends_in`: sends itself the signal
+    `how` before this step of its saves, from 1 on; 0: before none. `log` says how many there were."""
     os.environ[children._PARENT] = str(os.getppid())
     children.enter_child()  # it ends with the server, and that with the program that kills
     said = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_APPEND)

@@ -1,9 +1,11 @@
-"""python -m tests.stress.recordings --judged DIR --out OUT: what `hma judge --recordings` says where the truth is known.
+"""python -m tests.stress.recordings --judged DIR --out OUT: what `hma judge --recordings` says where the truth is
+known.
 
-Takes a robot of the suite for one without a true simulator. OUT/NAME/1.0.0 has recordings of it as RLDS, with a reward of 1
-after every step that leads to the goal: a third are play, the others its expert with three kinds of noise. `--judged` is a
-finished judgement of the same task with a true world: OUT/policies.py gives its cloned policies, as if they were a user's
-own, and OUT/real.csv their successes there, as if they were the real robot's. The last line is the command that judges.
+Takes a robot of the suite for one without a true simulator. OUT/NAME/1.0.0 has recordings of it as RLDS, with a reward
+of 1 after every step that leads to the goal: a third are play, the others its expert with three kinds of noise.
+`--judged` is a finished judgement of the same task with a true world: OUT/policies.py gives its cloned policies, as if
+they were a user's own, and OUT/real.csv their successes there, as if they were the real robot's. The last line is the
+command that judges.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@ Command: python -m experiments.applications.endurance RUN --minutes 10 --out DIR
 Cost: ten minutes of eight robots, half an hour of one core for each variant.
 Expected: the robot is where its commands put it for as long as it is driven; objects and PSNR are lost before.
 
-Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped, also in the
-middle of a film. Writes DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every variant, a
-sheet of frames, the truth above. A detector is needed (experiments.applications.detector).
+Each variant's measures are a file under DIR/films, made once: the same command goes on where it was stopped, also in
+the middle of a film. Writes DIR/endurance.csv (a row per variant, drive, robot and minute), its curves and, of every
+variant, a sheet of frames, the truth above. A detector is needed (experiments.applications.detector).
 """
 
 from __future__ import annotations
@@ -64,7 +64,8 @@ def film_path(
 
 
 def true_starts_of(simulator: Simulator, robots: Mapping[str, Robot], count: int) -> dict[str, list[Start]]:
-    """The first `count` starts of each robot that the true simulator can begin at. ConfigError where there are fewer."""
+    """The first `count` starts of each robot that the true simulator can begin at. ConfigError where there are
+    fewer."""
     found = {n: [s for s in simulator.starts if s.robot == n and s.seed is not None][:count] for n in robots}
     for name, starts in found.items():
         require(

@@ -56,8 +56,8 @@ def make_films(
     unfinished: Path,
     progress: Progress = lambda done, total: None,
 ) -> dict[str, Film]:
-    """One film for each drive, named by its robot: `simulator` has as many episodes. Goes on from the file `unfinished`,
-    where a process that was killed has left it, and comes out as if it never had been."""
+    """One film for each drive, named by its robot: `simulator` has as many episodes. Goes on from the file
+    `unfinished`, where a process that was killed has left it, and comes out as if it never had been."""
     simulator.reset([drive.start for drive in drives], seeds=0)
     begun, parts = _go_on(simulator, drives, unfinished) if unfinished.exists() else (0, [[] for _ in drives])
     images, longest = [simulator.images.copy()], max(map(len, drives))
@@ -94,8 +94,8 @@ def _keep(simulator: Simulator, parts: Sequence[Sequence[Mapping[str, np.ndarray
 def _go_on(
     simulator: Simulator, drives: Sequence[Drive], path: Path
 ) -> tuple[int, list[list[Mapping[str, np.ndarray]]]]:
-    """(frames, parts) as `_keep` left them; the simulator, whose episodes have begun, stands there again. ConfigError for
-    a damaged file."""
+    """(frames, parts) as `_keep` left them; the simulator, whose episodes have begun, stands there again. ConfigError
+    for a damaged file."""
     with reading_arrays(path, "remove it, the same command films from the start") as arrays:
         parts = [[{f.name: arrays[f"film/{i}/{f.name}"] for f in fields(Film)}] for i in range(len(drives))]
         simulator.restore(from_arrays(arrays, simulator.snapshot()))

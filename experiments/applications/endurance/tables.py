@@ -53,9 +53,9 @@ def measure(film: Film, part: slice, tools: int) -> dict[str, float]:
 def motion(true: np.ndarray, seen: np.ndarray, there: np.ndarray, prefix: str) -> dict[str, float]:
     """How the motion of tools [n, M, 2] that is seen follows what the commands do in the true simulator, from frame to
     frame where a tool is in view. Pearson's correlations: `follows`, of displacements across and down, their mean;
-    `moves`, of how far they go alone; `steers`, of displacements along and aside of the one before, their mean. The last
-    two do not mind that a robot is turned otherwise than in truth, as one whose commands are velocities in its own frame
-    will be after the first error; `steers` minds where it goes from there."""
+    `moves`, of how far they go alone; `steers`, of displacements along and aside of the one before, their mean. The
+    last two do not mind that a robot is turned otherwise than in truth, as one whose commands are velocities in its own
+    frame will be after the first error; `steers` minds where it goes from there."""
     both = there[1:] & there[:-1]
     asked, done = np.diff(true, axis=0), np.diff(seen, axis=0)
     pairs = {"follows": [(asked[both][:, a], done[both][:, a]) for a in (0, 1)]}

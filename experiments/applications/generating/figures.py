@@ -22,8 +22,8 @@ def draw_conditions(
     path: Path,
     what: str,
 ) -> None:
-    """Success or action error by condition: a bar with its interval, a dot for every seed. `control` and `ends`: places of those that
-    are not trained on generated trajectories."""
+    """Success or action error by condition: a bar with its interval, a dot for every seed. `control` and `ends`: places
+    of those that are not trained on generated trajectories."""
     most, label = {"success": (1, "success in the true simulator"), "error": (None, "action error, held out")}[what]
     with plt.rc_context(STYLE):
         figure, panel = plt.subplots(figsize=(7.2, 3.4), layout="constrained")

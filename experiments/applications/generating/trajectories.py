@@ -234,8 +234,9 @@ def _trajectory(origin: str, images: np.ndarray, actions: np.ndarray, robot: Rob
 
 
 def rewards_of_frames(native_N: np.ndarray, stride: int) -> np.ndarray:
-    """float32 [M], of N native steps: the reward of the action that led to each frame, nan for the first. The last frame
-    has the greatest of that and of what came after it, which no frame shows: many recordings reward their last step alone.
+    """float32 [M], of N native steps: the reward of the action that led to each frame, nan for the first. The last
+    frame has the greatest of that and of what came after it, which no frame shows: many recordings reward their last
+    step alone.
     """
     before = np.arange(0, len(native_N), stride) - 1
     rewards = np.where(before < 0, np.nan, native_N[before]).astype(np.float32)

@@ -76,8 +76,8 @@ def agree(true_PM: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS) -> Ag
 def agree_with_counts(
     successes_P: np.ndarray, episodes_P: np.ndarray, learned_PM: np.ndarray, draws: int = DRAWS
 ) -> Agreement:
-    """As `agree`, of policies of which elsewhere so many of so many episodes succeeded. Those are of other starts: while
-    the model's are resampled, each count is drawn anew from a binomial distribution of its own rate."""
+    """As `agree`, of policies of which elsewhere so many of so many episodes succeeded. Those are of other starts:
+    while the model's are resampled, each count is drawn anew from a binomial distribution of its own rate."""
     rates, rng = successes_P / episodes_P, np.random.default_rng([0, 18])
     return _agree(rates, lambda columns: rng.binomial(episodes_P, rates) / episodes_P, learned_PM, draws)
 
@@ -119,8 +119,8 @@ def share(same_PM: np.ndarray, among_PM: np.ndarray, draws: int = DRAWS) -> Inte
 
 
 def mean_above(a_PM: np.ndarray, b_PM: np.ndarray, draws: int = DRAWS) -> Interval:
-    """By how much the success of P policies at M starts is higher in `a_PM` than in `b_PM`, both bool [P, M], on average;
-    over other policies and starts."""
+    """By how much the success of P policies at M starts is higher in `a_PM` than in `b_PM`, both bool [P, M], on
+    average; over other policies and starts."""
     apart = a_PM.astype(float) - b_PM
     drawn = np.array([apart[np.ix_(rows, columns)].mean() for rows, columns in _resamples(*apart.shape, draws)])
     return _interval(float(apart.mean()), drawn, {"n": apart.size, "episodes": apart.shape[1]})

@@ -61,8 +61,8 @@ button { font: inherit; padding: .5rem 1rem; margin: .6rem .4rem 0 0; }
 
 
 def choose(judged: Judged, clips: int, seed: int = 0) -> list[tuple[str, str, int]]:
-    """(policy, world, start) of `clips` episodes, drawn from all of the true world, if there is one, and the learned one,
-    shuffled."""
+    """(policy, world, start) of `clips` episodes, drawn from all of the true world, if there is one, and the learned
+    one, shuffled."""
     worlds = [world for world in (TRUE, LEARNED) if world in judged.worlds]
     every = [(p, w, m) for p in judged.policies for w in worlds for m in range(judged.config.starts)]
     drawn = np.random.default_rng([seed, 15]).permutation(len(every))[:clips]

@@ -77,8 +77,8 @@ def apply_head(params: Params, config: HeadConfig, frames: jax.Array) -> jax.Arr
 
 
 class Head(Protocol):
-    """Whoever tells from frames whether the goal is reached. `measured` is what it is worth on recorded episodes that it
-    was not trained on."""
+    """Whoever tells from frames whether the goal is reached. `measured` is what it is worth on recorded episodes that
+    it was not trained on."""
 
     measured: dict[str, float]
 
@@ -187,7 +187,8 @@ def measure_head(head: Head, demos: Demonstrations, task: Task) -> dict[str, flo
 def worth_of(
     head: Head, frames: np.ndarray, labels: np.ndarray, by_head: np.ndarray, successes: np.ndarray
 ) -> dict[str, float]:
-    """From probabilities [n] and labels of frames, and what the head says of episodes [N] beside what is true of them."""
+    """From probabilities [n] and labels of frames, and what the head says of episodes [N] beside what is true of
+    them."""
     return {
         "frames": float(len(labels)),
         "positive": float(labels.mean()),

@@ -85,11 +85,11 @@ def judge_recorded(
     counted: Sequence[str] = (),
 ) -> Judged:
     """The same for a robot without a true simulator, whose recordings in `dataset` say what success looks like. Of the
-    starts and episodes at once that are asked for, as many as recordings are held out. `counted` are the policies that the
-    real robot was seen to act by.
+    starts and episodes at once that are asked for, as many as recordings are held out. `counted` are the policies that
+    the real robot was seen to act by.
 
-    Raises ConfigError as `judge_run` does, for recordings that are not the robot's, and for too few of them; EpisodeError
-    for one that cannot be read.
+    Raises ConfigError as `judge_run` does, for recordings that are not the robot's, and for too few of them;
+    EpisodeError for one that cannot be read.
     """
     simulator = load_simulator(run_directory, own_starts=True)
     _require_some(simulator, own is not None)
@@ -107,7 +107,8 @@ def _require_some(simulator: Simulator, given: bool | int) -> None:
 
 
 def _acts(simulator: Simulator) -> bool:
-    """Whether the model itself is a policy: heads alone do not make it one, which know nothing until actions are trained."""
+    """Whether the model itself is a policy: heads alone do not make it one, which know nothing until actions are
+    trained."""
     return predicts_actions(simulator.model.config, simulator.model.run.train.masking.setting)
 
 

@@ -69,8 +69,8 @@ def load_own(path: Path, robot: Robot) -> tuple[dict[str, CheckedPolicy], OwnSuc
     """What `policies(robot)` of the file gives, and what it says of success, if it does. Modules beside the file can be
     imported by it, as where it is a program.
 
-    Raises ConfigError for another thing than policies, for names that rollouts cannot be kept under, and, with its line,
-    for what the file raises.
+    Raises ConfigError for another thing than policies, for names that rollouts cannot be kept under, and, with its
+    line, for what the file raises.
     """
     beside = str(path.resolve().parent)
     if beside not in sys.path:

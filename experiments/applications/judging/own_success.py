@@ -26,7 +26,8 @@ class OwnSuccess:
         self.measured: dict[str, float] = {}
 
     def probabilities(self, images: np.ndarray, first: np.ndarray) -> np.ndarray:
-        """See `Head`. Raises ConfigError for anything but a number between 0 and 1, or a truth value, for each image."""
+        """See `Head`. Raises ConfigError for anything but a number between 0 and 1, or a truth value, for each
+        image."""
         shape = images.shape[-3:]
         seen, begun = (x.reshape(-1, *shape) for x in (images, np.broadcast_to(first, images.shape)))
         pieces = [slice(at, at + PIECE) for at in range(0, len(seen), PIECE)]

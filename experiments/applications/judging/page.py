@@ -94,8 +94,8 @@ def draw_scatter(summary: dict[str, Any], path: Path) -> None:
 
 
 def place(words: Sequence[Annotation], panel: Axes) -> None:
-    """Moves each name to a corner of its point where it comes near no other point and covers no name before it, and hides
-    it where there is none: the table has all names."""
+    """Moves each name to a corner of its point where it comes near no other point and covers no name before it, and
+    hides it where there is none: the table has all names."""
     points = panel.transData.transform([word.xy for word in words])
     kept: list[Bbox] = []
     for word, own in zip(words, points, strict=True):

@@ -1,9 +1,9 @@
-"""A robot without a true simulator: recordings that say whether they succeeded teach the head, and episodes begin as they
-did.
+"""A robot without a true simulator: recordings that say whether they succeeded teach the head, and episodes begin as
+they did.
 
 A recording is looked at from where a policy would take over, the last frame of a start. Where its rewards say frame by
-frame whether the goal is reached, all of them teach the head. Otherwise those at which nobody knows, between the first half
-of a success and its last `hold` frames, are left out.
+frame whether the goal is reached, all of them teach the head. Otherwise those at which nobody knows, between the first
+half of a success and its last `hold` frames, are left out.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ HELD_OUT = 4
 episodes begin as they did."""
 
 TUNED_ON = 5
-"""Of those learnt from, every so many of a kind say after how many steps training was best: of few recordings a head soon
-knows each by heart."""
+"""Of those learnt from, every so many of a kind say after how many steps training was best: of few recordings a head
+soon knows each by heart."""
 
 LIGHT, SHIFT = 0.15, 1 / 8
-"""For the same reason frames are shown in more kinds of light than `HeadConfig` does, and moved by up to this share of a
-side. With 230 recordings of a pusher, half of them successes, that told 54 of 76 held-out ones instead of 39."""
+"""For the same reason frames are shown in more kinds of light than `HeadConfig` does, and moved by up to this share of
+a side. With 230 recordings of a pusher, half of them successes, that told 54 of 76 held-out ones instead of 39."""
 
 FIRST, CHECKPOINTS = 50, 12
 """Steps of training after which a head may be best: the fewest, and how many of them."""
@@ -117,7 +117,8 @@ class Recordings:
         )
 
     def _read_rewards(self, least: float | None, frames: Sequence[int]) -> list[np.ndarray] | None:
-        """By their rewards, of every recording at which of the frames that are looked at the goal is reached, bool [n]."""
+        """By their rewards, of every recording at which of the frames that are looked at the goal is reached,
+        bool [n]."""
         if least is None:
             return None
         reached = []
@@ -164,8 +165,8 @@ class Recordings:
         return heads[best]
 
     def _pairs(self, i: int, reconstruct: Reconstruct) -> tuple[np.ndarray, np.ndarray]:
-        """Of one recording what `fit_heads` takes; half of it, drawn, as the tokenizer shows it. Taken in turn, the frames of
-        one kind could all be of one turn."""
+        """Of one recording what `fit_heads` takes; half of it, drawn, as the tokenizer shows it. Taken in turn, the
+        frames of one kind could all be of one turn."""
         images, rng = self._images(i), np.random.default_rng([self.config.seed, i, 17])
         chosen, label = self._labelled(i, len(images))
         seen = np.stack([np.broadcast_to(images[0], images[chosen].shape), images[chosen]], 1)
@@ -175,8 +176,8 @@ class Recordings:
         return shrink_bytes(seen, self.config.head.encoder.size), label
 
     def measure(self, head: Head, reconstruct: Reconstruct) -> dict[str, float]:
-        """From first to last frame of the recordings that are held out; also as the model's tokenizer shows them, which is
-        how it sees those of the model."""
+        """From first to last frame of the recordings that are held out; also as the model's tokenizer shows them, which
+        is how it sees those of the model."""
         hold, successes = self.config.task.hold, self._success[self.held_out]
         scores, labels, said, said_decoded = [], [], [], []
         for i in self.held_out:
@@ -218,8 +219,9 @@ class Recordings:
 
 
 def labelled(length: int, success: bool, hold: int) -> tuple[np.ndarray, np.ndarray]:
-    """Frames of a recording without rewards of which it is known whether the goal is reached, int [n], and whether it is,
-    bool [n]: no frame of a failure, of a success all of its last `hold` and none of its first half, as far as these leave it.
+    """Frames of a recording without rewards of which it is known whether the goal is reached, int [n], and whether it
+    is, bool [n]: no frame of a failure, of a success all of its last `hold` and none of its first half, as far as these
+    leave it.
     """
     if not success:
         return np.arange(length), np.zeros(length, bool)

@@ -1,7 +1,8 @@
 """Who is there: visitors, their seats in the simulator, what they wait for and what waits for them.
 
 Everything here runs in the event loop's thread but `turn.answer`, of which one runs at a time in another. Queues are
-bounded on both ends: of a visitor who asks faster than frames are made no more is read, one who does not read is let go.
+bounded on both ends: of a visitor who asks faster than frames are made no more is read, one who does not read is let
+go.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ SEND_SECONDS = 10.0
 """That a message may take until the visitor's computer has it."""
 
 WORKING_SECONDS = 3.0
-"""Of work on a round, after each of which those who wait are told of it: a page that hears nothing for three times as long
-takes its connection for lost."""
+"""Of work on a round, after each of which those who wait are told of it: a page that hears nothing for three times as
+long takes its connection for lost."""
 
 PARTING_SECONDS = 1.0
 """That a page which loses its seat has to hear of it."""

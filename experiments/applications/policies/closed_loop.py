@@ -44,8 +44,8 @@ def away_at_start(task: Task, seeds: np.ndarray) -> np.ndarray:
 
 
 def run_policy(task: Task, policy: Policy, seeds: np.ndarray, image_size: int, stride: int = 1) -> Outcome:
-    """One episode of `task.frames` frames from each start, the first of which is the start: a goal that is reached there
-    counts. A function of its arguments."""
+    """One episode of `task.frames` frames from each start, the first of which is the start: a goal that is reached
+    there counts. A function of its arguments."""
     world, looks = World(task.spec, seeds), draw_appearance(task.spec, seeds)
     reached = []
     policy.reset(seeds=[int(seed) % 2**32 for seed in seeds])

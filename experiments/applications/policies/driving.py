@@ -37,7 +37,8 @@ def new_episodes(task: Task, count: int, seed: int, split: str) -> np.ndarray:
 
 
 def drive(task: Task, seeds: np.ndarray, stride: int, image_size: int, *, noise: float, play: bool) -> Driven:
-    """`task.frames` frames from each start, a function of the arguments; an action is held for `stride` native steps."""
+    """`task.frames` frames from each start, a function of the arguments; an action is held for `stride` native
+    steps."""
     kind = _drive_suite if task.in_suite else _drive_physics
     return kind(task, seeds, stride, image_size, noise, play)
 
@@ -63,8 +64,8 @@ def _drive_suite(task: Task, seeds: np.ndarray, stride: int, image_size: int, no
 
 
 def _drive_physics(task: Task, seeds: np.ndarray, stride: int, image_size: int, noise: float, play: bool) -> Driven:
-    """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its hand forgets by what it misses over
-    `JITTER` frames, where that of the data forgets over 0.1 s; `play` wanders."""
+    """The expert of `hma data sim`, but it looks once a frame, has no lapses, and its hand forgets by what it misses
+    over `JITTER` frames, where that of the data forgets over 0.1 s; `play` wanders."""
     spec, world = task.physics, PhysicsWorld(task.physics, image_size)
     shape = len(seeds), task.frames
     images = np.zeros((*shape, image_size, image_size, 3), np.uint8)

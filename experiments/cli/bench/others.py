@@ -1,4 +1,5 @@
-"""`hma bench quality|tokenize|simulate|load|release|report`: trained models, tokenizers, data, the release, and the tables."""
+"""`hma bench quality|tokenize|simulate|load|release|report`: trained models, tokenizers, data, the release, and the
+tables."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """A physics simulator that anyone has: a hand on a line; its drawer is open once the hand is far enough to the right.
-Like a real one it remembers something that is not in its physics: how many steps it took, which the last colour shows."""
+Like a real one it remembers something that is not in its physics: how many steps it took, which the last colour
+shows."""
 
 from __future__ import annotations
 

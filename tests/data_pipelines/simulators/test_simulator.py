@@ -1,4 +1,5 @@
-"""Robots of physics simulators as true simulators. The physics is a stand-in: that of packages is in test_simulators."""
+"""Robots of physics simulators as true simulators. The physics is a stand-in: that of packages is in
+test_simulators."""
 
 import numpy as np
 import pytest

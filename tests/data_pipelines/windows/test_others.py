@@ -24,7 +24,8 @@ def batches(store, count: int, prompt: int | None = None, **options):
 
 
 def episodes_and_steps(batch):
-    """What each other sequence's actions say where they are from: episode and step of every frame, int [B, N, T] each."""
+    """What each other sequence's actions say where they are from: episode and step of every frame, int [B, N, T]
+    each."""
     return (batch["other_actions"][..., i].astype(int) for i in (0, 1))
 
 

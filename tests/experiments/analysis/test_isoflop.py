@@ -57,8 +57,8 @@ def test_a_loss_that_only_flattens_has_no_best_size():
 
 @pytest.mark.parametrize(("steeper", "seeds"), [(0.0, 3), (0.06, 3), (0.06, 1)])
 def test_sizes_off_the_parabola_are_said(steeper, seeds):
-    """The best size then lies where the form puts it, within an interval that knows of seeds and episodes alone. Left of
-    its minimum the loss rises as right of it, or by `steeper` more; with one seed nothing tells that from luck."""
+    """The best size then lies where the form puts it, within an interval that knows of seeds and episodes alone. Left
+    of its minimum the loss rises as right of it, or by `steeper` more; with one seed nothing tells that from luck."""
     sizes = np.geomspace(1e4, 1e6, 5)
     x = np.array([(n, c) for n in sizes for c in BUDGETS])
     off = np.log(x[:, 0] / 1e5)

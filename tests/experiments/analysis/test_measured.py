@@ -35,7 +35,8 @@ def levelled(rng: np.random.Generator, lacking: Sequence[tuple[int, int]] = (), 
 
 
 def test_taking_levels_out_leaves_the_spread_of_seeds_as_it_is():
-    """Of noise, and of the mean of a position in draws; without the degrees of freedom that levels took both are 3/4."""
+    """Of noise, and of the mean of a position in draws; without the degrees of freedom that levels took both are
+    3/4."""
     rng, noise, drawn = np.random.default_rng(0), [], []
     for _ in range(120):
         points = levelled(rng)

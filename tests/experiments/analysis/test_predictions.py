@@ -168,7 +168,8 @@ def test_the_sweeps_of_the_page_have_the_seeds_that_a_prediction_needs():
 
 
 def with_own_axis(root, change):
-    """The study has a file's axis `own`, too: its widths once more, its trials finished; `change` is what becomes of it."""
+    """The study has a file's axis `own`, too: its widths once more, its trials finished; `change` is what becomes of
+    it."""
     (root / "axes").mkdir()
     (root / "axes/mine.py").write_text(
         "from dataclasses import replace\nfrom experiments.sweeps import width\n\n\n"

@@ -26,8 +26,8 @@ def recorded(seed: int = 0) -> np.ndarray:
 def find(given: np.ndarray):
     """Of actions `given` for frames that `recorded` ones made, by a model that knows the law exactly, but for noise.
 
-    What is seen is a place in two dimensions, so that exchanged effects can be told apart; a model has nothing to say of
-    actions that are far from all it was trained on.
+    What is seen is a place in two dimensions, so that exchanged effects can be told apart; a model has nothing to say
+    of actions that are far from all it was trained on.
     """
     law = np.stack([WEIGHTS / UNITS, OTHER / UNITS])
     noise = np.random.default_rng(1).normal(size=(WINDOWS, 5, 2)) * 0.3

@@ -1,4 +1,5 @@
-"""Simulators of equal models share what they compile: it is a function of their settings, and takes weights as arguments."""
+"""Simulators of equal models share what they compile: it is a function of their settings, and takes weights as
+arguments."""
 
 from __future__ import annotations
 

@@ -21,7 +21,8 @@ NOT_RECOGNISED = {"pythonClassName": "somebody.features.Own", "text": {}}
 
 
 def tfds_fields(feature, key: str = "", lists: int = 0) -> dict[str, tuple]:
-    """(image, size, shape, dtype) of each field, by tfds itself; `lists`: sequences that it lies in, one in the other."""
+    """(image, size, shape, dtype) of each field, by tfds itself; `lists`: sequences that it lies in, one in the
+    other."""
     import tensorflow_datasets as tfds
 
     if isinstance(feature, tfds.features.FeaturesDict):

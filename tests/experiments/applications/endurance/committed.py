@@ -21,7 +21,8 @@ SHOWN = {
 
 
 def check_tables(page: Path, shown: Mapping[str, Callable[[str], list[dict]]]) -> None:
-    """Every line of the page's tables is the mean over eight robots; `shown`: header -> a line's rows by its first cell."""
+    """Every line of the page's tables is the mean over eight robots; `shown`: header -> a line's rows by its first
+    cell."""
     for header, rows_of in shown.items():
         for label, cells in table(page, header).items():
             mine = rows_of(label)
@@ -49,7 +50,8 @@ def rows_of_trained() -> list[dict]:
 
 
 def gains(name: str, measure: str, beside: str = "shipped") -> tuple[float, float]:
-    """(mean, half its interval) over robots, from 20 to 60 s, from the same starts; of the variance, how much nearer it is."""
+    """(mean, half its interval) over robots, from 20 to 60 s, from the same starts; of the variance, how much nearer it
+    is."""
 
     def goodness(row: dict) -> float:
         return -abs(row[measure] - 1) if measure == "variance" else row[measure]

@@ -250,8 +250,8 @@ def test_rewards_are_read_in_every_format_that_has_them(tmp_path):
 
 @pytest.mark.slow
 def test_rewards_teach_the_head_at_every_frame_and_say_what_succeeded(study, tmp_path, capsys, few_draws):
-    """Whatever the flag of success says: of these 20 the first 10 stay at the goal, seven of them from the first frame on,
-    three from their fifth. Policies begin where it is not reached yet."""
+    """Whatever the flag of success says: of these 20 the first 10 stay at the goal, seven of them from the first frame
+    on, three from their fifth. Policies begin where it is not reached yet."""
     begin = [0] * 7 + [3] * 3
     written = write_rlds(tmp_path, SPEC, [9] * 20, rewards=lambda i: (i < 10) * (np.arange(9) >= begin[i % 10]))
     out, asked = tmp_path / "out", ("--recordings", str(written), "--frames", "3", "--reward")
