@@ -29,7 +29,7 @@ help:
 study: $(VENV)/installed$(addprefix -,$(EXTRA))
 	$(BIN)/hma study --preset $(PRESET) --out $(OUT) --workers $(WORKERS)
 
-# Of the committed model tokens are drawn: objects stay longer (docs/endurance.md).
+# Of the committed model tokens are drawn: more objects were found so (docs/endurance.md).
 play: $(VENV)/installed-play
 	JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache $(BIN)/hma play $(if $(RUN),$(RUN),--temperature 0.7) --port $(PORT)
 

@@ -9,15 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from data_pipelines.suite.world import World
 from experiments.analysis.bootstrap import Panel, bootstrap_intervals
+from experiments.analysis.compare import Difference, Side, compare
 from experiments.analysis.intervals import Interval
 from experiments.applications import DRIVEN
 from experiments.applications.plan_actions import Settings, read_trials
 from experiments.applications.policies.tasks import Task
 from experiments.bench.beside import OURS, RELEASED, THEIRS
 from experiments.bench.record import read_record
+from experiments.bench.report import markdown
 from experiments.rows import OVERALL, Row, read_csv
 from hma_jax.config import EvalConfig
 from hma_jax.evaluation.summary import summarise
@@ -100,6 +103,72 @@ def test_the_speed_on_a_gpu_beside_the_release():
     (shown,) = read_record(next(gpu.glob("simulate-*.json"))).stages
     for rate in (one, many, shown.frames_per_second):
         assert f" {rate:.0f} frames/s" in " ".join(page.split())
+
+
+SPEED = ROOT / "docs" / "performance.md"
+WEIGHTS = re.compile(r"\d+ times 1 of (\d+) x (\d+) x (\d+)")
+"""A product without batch: of a weight, or of its gradient."""
+
+
+@pytest.mark.parametrize("kind", ["eval-recorded-base-layers-2", "generate-base", "load-store-none", "train-base"])
+def test_the_page_of_speed_shows_records_as_they_are_reported(kind):
+    (path,) = BENCH.glob(f"{kind}*.json")
+    assert " ".join(markdown([read_record(path)]).split()) in " ".join(SPEED.read_text().split())
+
+
+def test_the_page_of_speed_shows_the_release_and_products_of_two_cores():
+    record = read_record(BENCH / "release-base-float32-cpu.json")
+    rows = table(SPEED, "| stage | median | p90 | the release over ours |")
+    few = "continuous fill, 10 evaluations by dpm++"
+    assert len(rows) == len(record.stages)
+    for label, (median, p90, ratio) in rows.items():
+        name = "continuous few" if label == few else label
+        stage = record.stage(name if name.startswith(THEIRS) else OURS + name, 1)
+        assert (median, p90) == tuple(f"{1e3 * x:,.0f} ms" for x in (stage.timing.median, stage.timing.p90)), label
+        theirs = THEIRS + RELEASED[name] if name in RELEASED else ""
+        assert ratio == (theirs and f"{record.stage(theirs, 1).timing.median / stage.timing.median:.2f}"), label
+
+    rates, smallest, plain = [], [], []
+    for program in ("forward", "fill", "slide", "step"):
+        products = read_record(BENCH / f"products-{program}-base-float32-cpu.json")
+        plain.append(products.matmul_flops_per_second / 1e9)
+        (row,) = (cells for label, cells in table(SPEED, "| program | time |").items() if label == PROGRAMS[program])
+        whole, *each = products.stages
+        took = sum(stage.timing.median for stage in each)
+        assert row[:2] == [f"{whole.timing.median:.2f} s", f"{took:.2f} s"], program
+        for stage in each:
+            sizes = WEIGHTS.fullmatch(stage.name)
+            if sizes and min(map(int, sizes.groups())) >= 256:
+                rate = stage.flops / stage.timing.median / 1e9
+                (smallest if sizes.groups() == ("320", "256", "256") else rates).append(rate)
+    slow, *others = sorted(rates)
+    page = " ".join(SPEED.read_text().split())
+    said = (
+        "Products with weights run at {:.0f} to {:.0f} GFLOP/s (the smallest, of a matrix 256 wide with one frame, at {:.0f} "
+        "to {:.0f}, one of the step's at {:.0f}), a plain square product at {:.0f} to {:.0f};"
+    )
+    assert said.format(others[0], others[-1], min(smallest), max(smallest), slow, min(plain), max(plain)) in page
+
+
+PROGRAMS = {
+    "forward": "a pass over the window",
+    "fill": "a frame while the window fills",
+    "slide": "a frame past the window, exact",
+    "step": "a training step",
+}
+
+
+def test_the_page_of_speed_shows_what_cheaper_decoding_costs():
+    with (BENCH.parent / "quality-continuous" / "quality-12.csv").open(newline="") as file:
+        judged = {
+            row["decoding"]: {k: float(x) for k, x in row.items() if k != "decoding"} for row in csv.DictReader(file)
+        }
+    rows = table(SPEED, "| sampler | PSNR (dB) | beside DDPM 100 |")
+    for label, cells in rows.items():
+        row = judged[label.strip("*").removesuffix(", as released").lower()]
+        gap = f"{row['psnr_gap']:.2f} ± {row['psnr_gap_sem']:.2f}" if row["psnr_gap"] else ""
+        psnr, delta = (f"{row[name]:.2f} ± {row[f'{name}_sem']:.2f}" for name in ("psnr", "delta_psnr"))
+        assert cells[:4] == [psnr, gap, f"{row['ssim']:.3f}", delta], label
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "experiments" / "results").rglob("results.csv")), ids=str)
@@ -206,7 +275,36 @@ def test_plans_from_further_starts_are_as_their_page_says():
     first = f"the first, the one in the table of thirty, has {rates[0]:.2f}"
     assert f"from {rates.min():.2f} to {rates.max():.2f}; {first}" in page
     assert "came to {:.2f}, {:.2f} and {:.2f}".format(*rates[:3]) in page
+    best = policies[rates.argmax()]
+    alone = (best > plans).sum(), (plans > best).sum()
+    assert "succeeds alone from {} of them, MPPI from {}.".format(*alone) in page
+    thirty = planned_from_thirty("MPPI in the model")
+    counts = [[tried.sum(), len(tried) - tried.sum()] for tried in (thirty, plans)]
+    chance = scipy.stats.fisher_exact(counts)[1]
+    assert (
+        f"where it had {thirty.mean():.2f}, a difference that chance makes in {100 * chance:.0f} of 100 cases" in page
+    )
     assert f"which came to {plans.mean() - rates[:3].mean():.2f}." in page
+
+
+def planned_from_thirty(way: str) -> np.ndarray:
+    """Success [starts] in the served model, from the first starts."""
+    trials = read_trials(ROOT / "experiments/results/planning_grown/trials.csv")
+    return np.array([float(trial["success"]) for trial in trials[way]])
+
+
+def test_ways_of_acting_are_compared_start_by_start_as_their_page_says():
+    page = " ".join((ROOT / "docs" / "planning.md").read_text().split())
+    mppi, cem, true, cloned = map(
+        planned_from_thirty,
+        (
+            "MPPI in the model", "CEM in the model", "CEM in the true simulator",
+            "behaviour cloning of 1000 trajectories",
+        ),
+    )  # fmt: skip
+    assert f"at the mark from {mppi.sum():.0f} of 30 starts**, CEM from {cem.sum():.0f}." in page
+    assert f"MPPI succeeds alone {(mppi > cloned).sum()} times, it alone {(cloned > mppi).sum()} times" in page
+    assert f"(alone {(true > cem).sum()} times, CEM in the model alone {(cem > true).sum()} times)" in page
 
 
 MODELS = {"first": "planning", "weighed": "planning_weighed", "grown, served": "planning_grown"}
@@ -231,6 +329,10 @@ def planned(name: str) -> dict[str, dict[str, str]]:
     return {row["way"]: {key: row[key] for key in ("mean", "low", "high")} for row in rows}
 
 
+def told_apart(row: Difference) -> bool:
+    return not row.low <= 0 <= row.high
+
+
 def test_the_page_of_the_simulator_gives_what_its_windows_say():
     by_label = {
         "perplexity": ("perplexity", 2),
@@ -253,6 +355,19 @@ def test_the_page_of_the_simulator_gives_what_its_windows_say():
         texts = [f"{stat.mean:.{digits}f} ± {stat.sem:.{digits}f}" for stat in shown_of]
         assert [cell for cell in cells[label] if cell] == texts, label
     assert all((windows.metrics["retrieval"] == 1).all() for windows in judged.values())
+    weighed, first = (Side(name, {0: judged[name]}, "") for name in ("weighed", "first"))
+    apart = {row.metric: row for row in compare(weighed, first) if row.scope == OVERALL}
+    told = {
+        metric
+        for metric in ("cross_entropy", *dict(by_label.values()))
+        if metric in apart and told_apart(apart[metric])
+    }
+    assert told == {"cross_entropy", "action_nats", "lpips", "counterfactual_gain"}
+    psnr, page = apart["psnr"], " ".join((ROOT / "docs" / "simulator.md").read_text().split())
+    assert (
+        f"PSNR ({psnr.mean:.2f} ± {(psnr.high - psnr.low) / 2:.2f}, 95 %), SSIM and ΔPSNR do not tell them apart"
+        in page
+    )
     beaten = {
         name: [d for d, s in by.datasets.items() if s["lpips"].mean > s["lpips_copy"].mean] for name, by in of.items()
     }

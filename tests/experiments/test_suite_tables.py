@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -68,6 +69,15 @@ def test_siblings_share_dynamics_in_every_family():
         assert float(row["over_strangers_low"]) > 0, family
         assert float(row["over_shuffled_low"]) > 0, family
         assert float(row["siblings"]) < 0.5, f"{family}: half of the motion is not predicted"
+    errors = {
+        name: [round(100 * float(row[name])) for row in rows.values()] for name in ("siblings", "strangers", "shuffled")
+    }
+    page = " ".join((Path(__file__).parents[2] / "docs" / "suite.md").read_text().split())
+    assert f"with {min(errors['siblings'])} to {max(errors['siblings'])} % of the motion" in page
+    assert f"equally many action values with {min(errors['strangers'])} % or more" in page
+    assert f"their actions shuffled with {min(errors['shuffled'])} % or more" in page
+    shares = [round(100 * row.share) for row in read_table().values()]
+    assert f"decide is {min(shares)} to {max(shares)} % of the change of its pixels" in page
 
 
 def test_a_prediction_from_siblings_uses_the_actions():

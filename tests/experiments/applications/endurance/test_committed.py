@@ -58,10 +58,16 @@ def test_ten_minutes_are_as_the_page_says():
     following = [robot for robot, minute in mine if minute == 1 and mine[robot, 1]["follows"] > 0.5]
     keeping = [robot for robot in following if mine[robot, 10]["follows"] >= mine[robot, 1]["follows"] / 2]
     assert f"Of {len(following)} robots that follow at all (above 0.5 in the first minute) {len(keeping)} keep" in page
-    places = [f"{100 * mine[robot, 10]['tool_close']:.0f}" for robot in ("gripper_wood", "gripper_night")]
-    assert f"{places[0]} and {places[1]} % of the last minute of the two grippers" in page
+    places = {robot: round(100 * row["tool_close"]) for (robot, minute), row in mine.items() if minute == 10}
+    grippers, arms, pusher_in_place = (
+        [places.pop(f"{kind}_{name}") for name in names]
+        for kind, names in (("gripper", ("wood", "night")), ("arm", ("chalk", "sand")), ("pusher", ("sand",)))
+    )
+    assert "{} and {} % of the last minute of the two grippers".format(*grippers) in page
+    said = "in place in {} %, the two arms in {} and {}, the other three in {} at most"
+    assert said.format(*pusher_in_place, *arms, max(places.values())) in page and len(places) == 3
     pusher = mine["pusher_sand", 10]
-    assert f"follows by {pusher['follows']:.2f} and stands {pusher['tool_px']:.0f} pixels beside the truth" in page
+    assert f"follows by {pusher['follows']:.2f}, stands {pusher['tool_px']:.0f} pixels beside the truth" in page
     change = [(mine[robot, 10], mine[robot, 2]) for robot, minute in mine if minute == 10]
     for measure, words in (
         ("psnr", "PSNR changes by {:+.1f} ± {:.1f} dB"), ("follows", "follows by {:+.2f} ± {:.2f}"),
@@ -166,7 +172,7 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
     assert f"| {last[0]} % of objects, {tools} % of tools |" in words_of(ROOT / "README.md")
     said = "objects are found in {} % of the frames of the last minute, in {} with the likeliest tokens"
     assert said.format(*last) in words_of(ROOT / "docs" / "results.md")
-    assert "**More objects stay**: {} % in the last minute, where the likeliest tokens keep {}:".format(*last) in page
+    assert "{} % in the last minute, where the likeliest tokens keep {}:".format(*last) in page
     assert f"Objects are found in {last[0]} % of the frames of the last minute, not in all" in page
     apart = [x for m in (10, 2) for x in gain("object_found", [(r, grown[k]) for k, r in drawn.items() if k[2] >= m])]
     assert "robot {:+.2f} ± {:.2f}, from the second minute on {:+.2f} ± {:.2f}.".format(*apart) in page
@@ -186,21 +192,27 @@ def test_what_drawing_tokens_does_is_as_the_page_says():
         return gain(measure, [(row, both[1][k]) for k, row in both[0].items() if k[2] >= first])
 
     objects = [x for first in (2, 5) for x in over_both("object_found", first)]
-    assert "both starts that is {:+.2f} ± {:.2f}, in the fifth minute {:+.2f} ± {:.2f}.".format(*objects) in page
+    assert "both starts that is {:+.2f} ± {:.2f}, in the fifth minute {:+.2f} ± {:.2f},".format(*objects) in page
+    every = [mine | dict(of) for mine, of in zip(later, (drawn, grown), strict=True)]
+    filmed = gain("object_found", [(row, every[1][k]) for k, row in every[0].items() if k[2] >= 2])
+    assert "over all that was filmed from the second minute on {:+.2f} ± {:.2f}.".format(*filmed) in page
     cost = [x for measure in ("psnr", "tool_close", "follows") for x in over_both(measure, 2)]
     said = "PSNR {:+.1f} ± {:.1f} dB, tools in place {:+.2f} ± {:.2f}, follows {:+.2f} ± {:.2f};"
     assert said.format(*cost) in page
 
     less = read_rows(RESULTS / "drawn_less.csv")
-    shares = [
-        percent([r for r in less if r["variant"] == v and r["part"] >= 2]) for v in ("temperature 0.4", "two likeliest")
+    each = [[r for r in less if r["variant"] == v and r["part"] >= 2] for v in ("temperature 0.4", "two likeliest")]
+    beside = [
+        x for rows in each for x in gain("object_found", [(r, grown[r["robot"], r["start"], r["part"]]) for r in rows])
     ]
+    assert "({:+.2f} ± {:.2f} and {:+.2f} ± {:.2f}), where temperature 0.7 has".format(*beside) in page
+    shares = [percent(rows) for rows in each]
     shares += [percent([row for k, row in of.items() if 2 <= k[2] <= 5]) for of in (grown, drawn)]
     said = (
         "in {} % of the frames from the second minute to the fifth at temperature 0.4 and in {} % where one of the two "
-        "likeliest entries of each factor is drawn, as in {} % by the likeliest tokens, where temperature 0.7 has {} %"
+        "likeliest entries of each factor is drawn, as in {} % by the likeliest tokens ("
     )
-    assert said.format(*shares) in page
+    assert said.format(*shares[:3]) in page and f"where temperature 0.7 has {shares[3]} %" in page
 
 
 def test_size_and_data_keep_objects():

@@ -32,6 +32,36 @@ def test_the_page_shows_what_was_measured():
     )
 
 
+def test_no_way_of_filling_frames_and_no_past_of_its_own_is_better():
+    page = words_of(SMALL)
+    variants, own_past = (
+        {(r["variant"], r["robot"], r["part"]): r for r in read_rows(RESULTS / f"{name}.csv")}
+        for name in ("variants", "own_past")
+    )
+
+    def beside(measure: str, variant: str, parts: tuple[int, ...], of: dict = variants) -> tuple[float, float]:
+        other = "model/shipped" if of is variants else variant.replace("own_past", "model")
+        rows = {k[1:]: row for k, row in of.items() if k[0] == variant and k[2] in parts}
+        return gain(measure, [(row, variants[other, *k]) for k, row in rows.items()])
+
+    late = [x for v in ("likeliest", "temperature_0.4") for x in beside("object_found", f"model/{v}", (2, 3))]
+    assert "by {:+.2f} ± {:.2f} (likeliest), {:+.2f} ± {:.2f} (temperature 0.4)".format(*late) in page
+    confidence = beside("object_found", "model/confidence", (2, 3))
+    assert "and {:.2f} ± {:.2f} (confidence)".format(*confidence) in page
+    objects, tools = (beside(measure, "model/streaming", (2, 3)) for measure in ("object_found", "tool_found"))
+    said = "objects are found in {:.2f} ± {:.2f} more of the frames, but tools in {:.2f} ± {:.2f} fewer"
+    assert said.format(*objects, -tools[0], tools[1]) in page
+    psnr, follows = (beside(measure, "model/streaming", (1,)) for measure in ("psnr", "follows"))
+    assert f"it costs {-psnr[0]:.1f} ± {psnr[1]:.1f} dB in the first 20 seconds" in page
+    assert "any more ({:.2f} ± {:.2f} there)".format(*follows) in page
+    for name, said in (
+        ("likeliest", "objects found {:+.2f} ± {:.2f}, PSNR {:.2f} ± {:.2f} dB;"),
+        ("shipped", "temperature of 0.7 {:+.2f} ± {:.2f} and {:.2f} ± {:.2f} dB."),
+    ):
+        found = [x for m in ("object_found", "psnr") for x in beside(m, f"own_past/{name}", (2, 3), own_past)]
+        assert said.format(*found) in page, name
+
+
 def test_chained_factors_keep_bodies_and_cost_decibels():
     page, found = words_of(SMALL), partial(gains, "chained")
     for measure, words in (
@@ -183,6 +213,8 @@ def test_ten_minutes_are_as_the_page_says():
     assert f"Objects are found in {objects[2]} % of the frames of the last minute" in page
     variance = sum(mean("variance", minute) for minute in range(2, 11)) / 9
     assert f"variance ({variance:.2f} of the truth's)" in page
+    level, half, _ = over_robots([row for (_, minute), row in mine.items() if minute > 1], "level")
+    assert f"mean level ({level:.1f} ± {half:.1f} grey levels too high)" in page
     colours = mean("histogram", 1), mean("histogram", 10)
     assert "({:.2f} of the histogram differs in the first minute, {:.2f} in the last)".format(*colours) in page
     before = percent("tool_found", 10, first), percent("object_found", 10, first)
