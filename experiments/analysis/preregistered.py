@@ -85,7 +85,8 @@ def read_expected(path: Path) -> list[Expected]:
                 raise ConfigError(f"{path}, line {number}: no prediction ({error})") from error
             e = found[-1]
             require(e.low <= e.mean <= e.high, f"{path}, line {number}: low, mean and high do not ascend")
-            first = lines.setdefault((e.sweep, e.series, e.x, e.against, e.metric, frozenset(e.seeds)), number)
+            places = tuple(map(_place, (e.x, e.against)))
+            first = lines.setdefault((e.sweep, e.series, places, e.metric, frozenset(e.seeds)), number)
             require(
                 first == number,
                 f"{path}, line {number}: of the same number as line {first}, which would count twice; keep the one that "
@@ -134,9 +135,12 @@ def _came(e: Expected, rows: Sequence[Row]) -> Came:
 
 def _names(text: str, x: float, label: str) -> bool:
     """Whether `text` means the position `x`, called `label` on an axis of names."""
-    if label:
-        return text == label
+    return text == label if label else _place(text) == x
+
+
+def _place(text: str) -> float | str:
+    """A position, or its name: 8 and 8.0 are one."""
     try:
-        return float(text) == x
+        return float(text)
     except ValueError:
-        return False
+        return text

@@ -100,7 +100,7 @@ def test_a_line_that_cannot_be_read_is_named(tmp_path, line, message):
         read_expected(path)
 
 
-@pytest.mark.parametrize("again", ["8,,cross_entropy,5,4,6,abc1234,0 2", "8,,cross_entropy,9,8,10,def5678,2 0"])
+@pytest.mark.parametrize("again", ["8,,cross_entropy,5,4,6,abc1234,0 2", "8.0,,cross_entropy,9,8,10,def5678,2 0"])
 def test_a_number_is_expected_once(tmp_path, again):
     """A line that stood twice, and one beside another interval for the same, counted as two."""
     path = tmp_path / FILE
