@@ -38,7 +38,7 @@ WIDEST = 256
 done, however wide: a model's frame has the actions of its whole stride."""
 
 NOT_READ = "no camera"
-"""What a picture is called that is not read as one, as LeRobot's depths and grey ones."""
+"""What pictures are called that are not read as such: LeRobot's depths and grey ones, robomimic's of other names."""
 
 BLANK_STD = 1.5
 """Grey levels: a frame that varies less over its pixels shows nothing (JPEG noise included)."""
@@ -218,7 +218,7 @@ def _describe(source: EpisodeSource) -> tuple[tuple[FieldFacts, ...], tuple[Spli
         if feature.image:
             what: tuple = "image", (None, None, 3), "uint8"
         elif feature.shape:
-            what = NOT_READ, feature.shape, feature.dtype
+            what = NOT_READ, feature.shape, ""
         else:
             what = "number", (feature.size,), "float32"
         fields.append(FieldFacts(key.removeprefix("steps/"), *what, per_step=True))

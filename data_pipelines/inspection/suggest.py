@@ -110,7 +110,7 @@ def suggest_entry(facts: Facts, hz: float | None) -> Suggestion | None:
     keys, dims, about = _choose_actions(facts)
     reasons = [f"camera: {why}", f"action: {about}"]
     if others := [field.key for field in facts.fields if field.kind == NOT_READ]:
-        reasons.append(f"left out: {', '.join(others)}: pictures that are not of three colours are no cameras")
+        reasons.append(f"left out: {', '.join(others)}; docs/own_data.md says what is a camera")
     angles, unit = _choose_angles(facts, keys, dims)
     if angles:
         reasons.append(

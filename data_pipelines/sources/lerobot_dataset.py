@@ -21,7 +21,6 @@ from data_pipelines.errors import DataError, EpisodeError
 from data_pipelines.sources.identity import EpisodeRun
 from data_pipelines.sources.lerobot import REWARD, SUCCESS, TASK, LeRobotSource
 from data_pipelines.sources.lerobot_meta import EpisodeEntry
-from data_pipelines.sources.rlds.features import FlatFeature
 from data_pipelines.sources.rlds.images import decode_image
 from data_pipelines.sources.rlds.location import retried
 from data_pipelines.sources.rlds.schema import field_slice, step_key
@@ -66,8 +65,7 @@ class LeRobotDataset(EpisodeSource):
         self.version = self._read.meta.version
         self._cameras = {step_key(k): name for k, name in self._read.cameras.items()}
         self._vectors = {step_key(k): name for k, name in self._read.vectors.items()}
-        others = {step_key(k): FlatFeature(False, 0, shape, "uint8") for k, shape in self._read.left_out.items()}
-        self.features = others | self._read.layout.flat_features()
+        self.features = self._read.layout.flat_features(self._read.left_out)
         self._numbered = np.asarray([e.index for e in self._entries], np.int64)
         self.runs = _runs(self._numbered)
         self._lengths = np.asarray([e.length for e in self._entries], np.int64)

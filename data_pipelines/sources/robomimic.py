@@ -58,7 +58,7 @@ class RobomimicSource:
                 raise DataError(f"{path}: no group 'data'; this is not a robomimic file.")
             args = _env_args(self.path, file["data"].attrs.get("env_args"))
             self.units = _demonstrations(self.path, file, settings.filter_key)
-            self.layout, self.cameras = self._read_layout(file["data"][self.units[0]], settings.camera)
+            self.layout, self.cameras, self.left_out = self._read_layout(file["data"][self.units[0]], settings.camera)
         self.task = str(args.get("env_name", "robomimic"))
         self.own_hz = _control_rate(self.path, args)
         self.hz = float(settings.hz or self.own_hz or CONTROL_RATE)
@@ -140,7 +140,11 @@ class RobomimicSource:
     def array(self, demo: Any, key: str, where: str) -> np.ndarray:
         return read_rows(demo, key, slice(None), where)
 
-    def _read_layout(self, demo: Any, wanted: tuple[str, ...]) -> tuple[Layout, tuple[str, ...]]:
+    def _read_layout(
+        self, demo: Any, wanted: tuple[str, ...]
+    ) -> tuple[Layout, tuple[str, ...], dict[str, tuple[int, ...]]]:
+        """Fields, the cameras among them, and pictures that are none of these: called otherwise, or depths; with their
+        shapes."""
         where = f"{self.path}: {demo.name.lstrip('/')}"
         obs = {k: v for k, v in demo.get("obs", {}).items() if hasattr(v, "dtype")}  # groups are none of robomimic's
         there = sorted(k.removesuffix("_image") for k in obs if k.endswith("_image"))
@@ -167,7 +171,9 @@ class RobomimicSource:
         if getattr(states, "ndim", 0) == 2 and states.shape[1]:
             vectors["observation/sim_state"] = int(states.shape[1])
         images = {f"observation/{c}": image_field(None, None) for c in cameras}
-        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras
+        others = sorted(key for key in obs if obs[key].ndim >= 3 and not key.endswith("_image"))
+        left_out = {f"observation/{key}": tuple(map(int, obs[key].shape[1:])) for key in others}
+        return Layout(images, vectors, "rewards" in demo or "dones" in demo), cameras, left_out
 
 
 @contextmanager

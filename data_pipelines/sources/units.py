@@ -32,9 +32,11 @@ class Layout:
     vectors: Mapping[str, int]
     knows_success: bool
 
-    def flat_features(self) -> dict[str, FlatFeature]:
-        """The same fields as an `EpisodeSource` states them."""
+    def flat_features(self, left_out: Mapping[str, tuple[int, ...]]) -> dict[str, FlatFeature]:
+        """The same fields as an `EpisodeSource` states them; before them pictures that are `left_out`, with their
+        shapes."""
         return {
+            **{step_key(key): FlatFeature(image=False, size=0, shape=shape) for key, shape in left_out.items()},
             **{step_key(key): FlatFeature(image=True, size=0) for key in self.images},
             **{step_key(key): FlatFeature(image=False, size=size) for key, size in self.vectors.items()},
         }

@@ -195,6 +195,16 @@ def test_pictures_of_lerobot_that_are_no_cameras_are_named(tmp_path):
         LeRobotDataset(root).check_keys("observation/ir", ("action",))
 
 
+def test_pictures_of_robomimic_that_are_no_cameras_are_named(tmp_path):
+    def change(file):
+        for demo in file["data"].values():
+            demo["obs/wrist_rgb"] = demo["obs/agentview_image"][:]
+
+    facts = inspect_dataset(write_robomimic(tmp_path / "toy.hdf5", change=change)).facts
+    assert {f.key: f.shape for f in facts.fields if f.kind == NOT_READ} == {"observation/wrist_rgb": (32, 32, 3)}
+    assert len(facts.cameras) == 2
+
+
 def test_actions_that_are_kept_as_bytes_are_told_and_not_called_damage(tmp_path):
     """All episodes could not be read: their action held bytes."""
     from tensorflow_datasets import features as tf
