@@ -26,6 +26,7 @@ from hma_jax.convert.neutral import describe_tensors
 from hma_jax.convert.table import flat, nested
 from hma_jax.convert.tensors import write_safetensors
 from hma_jax.generation import rollout
+from hma_jax.kernels.random import GENERATOR
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.objective.masking import never_shown
@@ -73,7 +74,7 @@ def generate_function(
     declared = declare_model(model, table, ExecutionConfig(attention="plain"))
 
     def generate(weights, prompt, actions, embodiment, key):
-        base = jax.random.wrap_key_data(key, impl="threefry2x32")
+        base = jax.random.wrap_key_data(key, impl=GENERATOR)
         keys = jax.vmap(lambda row: jax.random.fold_in(base, row))(jnp.arange(config.batch))
         hma, hidden = declared.merge(nested(weights)), never_shown(table, setting, embodiment, config.frames)
         return rollout(hma, prompt, actions[:, None], embodiment, keys, config.decode, hidden_BT=hidden)[:, 0]

@@ -19,6 +19,7 @@ import numpy as np
 from flax import nnx
 
 from hma_jax.config import ModelConfig, TrainConfig, require
+from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import HMA, declare_model
 from hma_jax.objective.losses import draw_noise
@@ -102,7 +103,7 @@ def observe(model: HMA, masked: Masked, batch: Batch) -> dict[str, jax.Array]:
     else:
         note("logits", model.logits(out.said, batch["tokens"]))
     if diffusion:
-        key = jax.random.key(0)
+        key = key_of(0)
         time, noise = draw_noise(key, batch["tokens"].shape, diffusion.steps)
         _watch(model.denoiser, "condition", lambda y: note("denoiser condition", y))
         note("denoiser", model.denoiser(noise, time, out.said))
@@ -128,7 +129,7 @@ def measure(
     nearly all the time.
     """
     mask = jax.jit(lambda key: mask_batch(key, batch["tokens"], batch["embodiment"], model, train.masking, table))
-    masked = mask(jax.random.key(train.seed))
+    masked = mask(key_of(train.seed))
     rows = []
     for width in widths:
         config = replace(model, width=width)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hma_jax.kernels.random import draw_flat
+from hma_jax.kernels.random import draw_flat, key_of
 from hma_jax.model.embodiments import EmbodimentTable
 
 Purpose = Literal["actions", "decoding", "likelihood", "policy"]
@@ -32,7 +32,7 @@ def window_keys(
     start_B: jax.Array,
 ) -> jax.Array:
     """A key for each window, [B]."""
-    base = jax.random.fold_in(jax.random.key(seed), get_args(Purpose).index(purpose))
+    base = jax.random.fold_in(key_of(seed), get_args(Purpose).index(purpose))
     name_E = jnp.asarray([_number(name) for name in table.names], jnp.uint32)
 
     def one(*name: jax.Array) -> jax.Array:
@@ -86,10 +86,10 @@ def _quantiles() -> np.ndarray:
     return np.asarray([normal.inv_cdf((i + 0.5) / QUANTILES) for i in range(QUANTILES)], np.float32)
 
 
-def _normal(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+def _normal(key: jax.Array, shape: tuple[int, ...], dtype: jnp.dtype) -> jax.Array:
     """N(0, 1) to 16 bits, by a table: `jax.random.normal` computes a logarithm, whose last bit depends on
     the shape of the array and on the processor."""
-    return jnp.asarray(_quantiles())[jax.random.bits(key, shape, jnp.uint32) >> 16]
+    return jnp.asarray(_quantiles(), dtype)[jax.random.bits(key, shape, jnp.uint32) >> 16]
 
 
 def _number(name: str) -> np.uint32:

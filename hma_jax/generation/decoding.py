@@ -110,7 +110,7 @@ def _decode_tokens(model: HMA, said: jax.Array, predict: Predict, key_B: jax.Arr
         keys = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, step)))(key_B)
         sampled, score = sample_tokens(model.frame_head, said, keys[:, 0], decode.temperature, decode.top_k)
         if decode.order == "random":
-            score = jax.vmap(lambda k: jax.random.uniform(k, (size,)))(keys[:, 1])
+            score = jax.vmap(lambda k: jax.random.uniform(k, (size,), jnp.float32))(keys[:, 1])
         return unmask(frame, sampled, score, still_masked)
 
     def look(frame: Frame, at: tuple[jax.Array, jax.Array]) -> tuple[Frame, None]:

@@ -1,4 +1,8 @@
-"""Random numbers that are quick to compile."""
+"""Random numbers that are quick to compile, and the same whatever JAX's own settings are.
+
+A run's numbers are a function of its seed. So keys of the library are made by `key_of`, and what draws with one says
+the type of the numbers: those of JAX's default types are others under JAX_ENABLE_X64.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,26 @@ import math
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 
-Sample = Callable[[jax.Array, tuple[int, ...]], jax.Array]
-"""A function of `jax.random`: (key, shape) -> numbers."""
+GENERATOR = "threefry2x32"
+"""JAX's default, from which JAX_DEFAULT_PRNG_IMPL may lead away; of others, numbers depend on batches and devices."""
+
+Sample = Callable[[jax.Array, tuple[int, ...], jnp.dtype], jax.Array]
+"""A function of `jax.random`: (key, shape, dtype) -> numbers."""
+
+
+def key_of(seed: int | jax.Array) -> jax.Array:
+    """The key of a seed."""
+    return jax.random.key(seed, impl=GENERATOR)
 
 
 def draw_flat(sample: Sample, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """`sample(key, shape)`, the same numbers. `key` may be an array of keys, each with numbers of its own:
+    """`sample(key, shape, float32)`, the same numbers. `key` may be an array of keys, each with numbers of its own:
     [*key.shape, *shape].
 
     Drawn in a row and then given its shape: XLA's CPU compiler takes three to four times as long for three axes as for
     one.
     """
-    numbers = jax.vmap(lambda one: sample(one, (math.prod(shape),)))(key.reshape(-1))
+    numbers = jax.vmap(lambda one: sample(one, (math.prod(shape),), jnp.float32))(key.reshape(-1))
     return numbers.reshape(*key.shape, *shape)

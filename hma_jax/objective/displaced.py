@@ -31,7 +31,7 @@ def displace_patches(past: jax.Array, share: float, key_B: jax.Array) -> jax.Arr
     def sources(key: jax.Array) -> jax.Array:
         """int [T - 1, S]: the place that each token is taken from."""
         # Each [P, 1], for P rectangles: beside it stand frames T, or places S.
-        chosen, first, last, high, wide, top, left, down, right = jax.random.uniform(key, (9, PATCHES, 1))
+        chosen, first, last, high, wide, top, left, down, right = jax.random.uniform(key, (9, PATCHES, 1), jnp.float32)
         begin = jnp.floor(first * frames)
         end = begin + 1 + jnp.floor(last * (frames - begin))
         frame_T = jnp.arange(frames)

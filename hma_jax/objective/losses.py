@@ -59,8 +59,8 @@ def noise_keys(key: jax.Array, rows: int) -> jax.Array:
 
 
 def weigh_tokens(masked: Masked, tokens: jax.Array, masking: MaskingConfig) -> jax.Array:
-    """float32 [B, T, S]: how much each of `tokens`, as recorded, counts in the loss: 0 where it is no target, else 1, or
-    `masking.change_weight` where it is another than a frame earlier. Accuracy is weighted alike."""
+    """float32 [B, T, S]: how much each of `tokens`, as recorded, counts in the loss: 0 where it is no target, else 1,
+    or `masking.change_weight` where it is another than a frame earlier. Accuracy is weighted alike."""
     weight = masked.targets_TS.astype(jnp.float32)
     if masking.change_weight == 1:
         return weight
@@ -183,7 +183,7 @@ def frame_diffusion_loss(
 def draw_noise(key: jax.Array, shape: tuple[int, ...], steps: int, shift: float = 1.0) -> tuple[jax.Array, jax.Array]:
     """(time int [...], noise [..., C]) for values of `shape` [..., C]; `shift` as `DiffusionConfig.time_shift`."""
     time_key, noise_key = jax.random.split(key)
-    time = jax.random.randint(time_key, shape[:-1], 0, steps)
+    time = jax.random.randint(time_key, shape[:-1], 0, steps, jnp.int32)
     if shift != 1:
         u = (time + 0.5) / steps
         time = (steps * shift * u / (1 + (shift - 1) * u)).astype(jnp.int32)

@@ -84,7 +84,7 @@ def draw(key: jax.Array, config: ModelConfig, masking: MaskingConfig) -> Masking
         shapes = MaskingDraws((), (t, s, q), (t, s, q), (2,), (), (t,), (t, s, q), (t,), (t, s))
     # One call for all numbers: random generators are slow to compile.
     sizes = [math.prod(shape) for shape in shapes]
-    flat = jax.random.uniform(key, (sum(sizes),))
+    flat = jax.random.uniform(key, (sum(sizes),), jnp.float32)
     pieces = jnp.split(flat, list(itertools.accumulate(sizes))[:-1])
     u = type(shapes)(*[piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)])
 
@@ -144,10 +144,10 @@ def hide_actions(key: jax.Array, frames: int, masking: MaskingConfig) -> jax.Arr
     if masking.setting in ("passive", "inverse"):
         return jnp.ones(frames, bool)
     if masking.setting == "full":  # as the release: a rate per example, then every step by itself
-        u = jax.random.uniform(key, (frames + 1,))
+        u = jax.random.uniform(key, (frames + 1,), jnp.float32)
         return u[1:] < u[0]
     if masking.setting == "policy":
-        return jnp.arange(frames) >= jax.random.randint(key, (), 0, frames)
+        return jnp.arange(frames) >= jax.random.randint(key, (), 0, frames, jnp.int32)
     return jnp.zeros(frames, bool)
 
 

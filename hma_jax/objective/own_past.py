@@ -40,8 +40,8 @@ def draw_own_past(
     def choose_frames(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         """(a key for the ids, bool [T - 2]: the frames from the second on that are the model's)."""
         ids_key, share_key, frame_key = jax.random.split(key, 3)
-        share = greatest_share * jax.random.uniform(share_key)
-        return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,)) < share
+        share = greatest_share * jax.random.uniform(share_key, (), jnp.float32)
+        return ids_key, jax.random.uniform(frame_key, (before.shape[1] - 1,), jnp.float32) < share
 
     def draw(key: jax.Array, said_TS: jax.Array) -> jax.Array:
         digits, _ = head.factors_in_turn(said_TS, drawing(key, head.shape(said_TS)))

@@ -16,6 +16,7 @@ import numpy as np
 
 from hma_jax.config import DecodeConfig
 from hma_jax.generation.episodes import Episodes, advance_each, put, start_each, take
+from hma_jax.kernels.random import key_of
 from hma_jax.model.params import Params
 from hma_jax.simulator.episode import Episode
 from hma_jax.tokenizers.shared import BaseTokenizer
@@ -90,7 +91,7 @@ class Programs:
         def advance(
             weights: Weights, state: Episodes, rows_n: jax.Array, chunk_nU: jax.Array, seed_n: jax.Array
         ) -> tuple[Episodes, jax.Array, jax.Array]:
-            keys = jax.vmap(jax.random.key)(seed_n)
+            keys = jax.vmap(key_of)(seed_n)
             before, hma = take(state, rows_n), declared.merge(weights.model)
             new, frames = advance_each(hma, before, chunk_nU, keys, decode, hidden=hidden)
             return put(state, rows_n, new), frames, decoded(weights, frames)

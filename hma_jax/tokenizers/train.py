@@ -17,6 +17,7 @@ import optax
 
 from hma_jax.config import TokenizerConfig, TokenizerTrainConfig
 from hma_jax.config.json import from_dict, to_dict
+from hma_jax.kernels.random import key_of
 from hma_jax.model.params import Declared, Params
 from hma_jax.runtime.devices import default_device
 from hma_jax.tokenizers.autoencoder import AutoencoderTokenizer, declare_tokenizer
@@ -44,8 +45,8 @@ def train_tokenizer(
     """Trains, or goes on training, in `run_dir`; saves the tokenizer there and returns it.
 
     `make_batches(start)` yields uint8 images [B, image_size, image_size, 3] from step `start`
-    on; `provenance` says where they come from, `records` what a batch is made of. Raises DivergedError, Interrupted, and
-    CheckpointError when `run_dir` holds a run of another configuration or other images.
+    on; `provenance` says where they come from, `records` what a batch is made of. Raises DivergedError, Interrupted,
+    and CheckpointError when `run_dir` holds a run of another configuration or other images.
     """
     declared = declare_tokenizer(config)
     optimizer = make_optimizer(train, declared)
@@ -108,7 +109,7 @@ def tokenizer_loss(
     if config.quantise:
         passed, (penalty, terms) = quantize(z), _regularisers(z, config)
     else:
-        passed = z + config.latent_noise * jax.random.normal(key, z.shape)
+        passed = z + config.latent_noise * jax.random.normal(key, z.shape, jnp.float32)
         penalty, terms = 0.0, {"latent_std": jnp.std(z)}
     error = jnp.mean((model.decoder(passed) - target) ** 2)
     loss = error + penalty
@@ -137,7 +138,7 @@ def make_train_step(
     optimizer = make_optimizer(train, declared)
 
     def step(state: TrainState, images: jax.Array) -> tuple[TrainState, dict[str, jax.Array]]:
-        key = jax.random.fold_in(jax.random.key(train.seed), state.step)
+        key = jax.random.fold_in(key_of(train.seed), state.step)
         gradient = jax.grad(lambda p: tokenizer_loss(declared, p, images, config, key), has_aux=True)
         grads, metrics = gradient(state.params)
         updates, opt_state = optimizer.update(grads, state.opt_state, state.params)

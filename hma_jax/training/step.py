@@ -12,6 +12,7 @@ from einops import rearrange
 
 from hma_jax.config import MaskingConfig, ModelConfig, TrainConfig, check_micro_batches, check_objective, require
 from hma_jax.config.training import ActionLeak
+from hma_jax.kernels.random import GENERATOR, key_of
 from hma_jax.model.embodiments import Embodiment, EmbodimentTable
 from hma_jax.model.params import Declared, Use, is_spec
 from hma_jax.objective.losses import LossSums, TargetCounts, count_targets, loss_metrics, masked_loss, noise_keys
@@ -33,7 +34,8 @@ from hma_jax.training.state import FINITE, TrainState, all_finite
 Batch = dict[str, jax.Array]
 """tokens int32 [B, T, S] or latents [B, T, S, C], actions float32 [B, T, U] (raw, zero-padded),
 embodiment int32 [B]; perhaps real bool [B, T], False for frames that only fill up a window at its end; perhaps seed
-uint32 [2], not the number but the `jax.random.key_data` of its key, so that runs of other seeds are one program."""
+uint32 [2], not the number but the `jax.random.key_data` of its key (`key_of`), so that runs of other seeds are one
+program."""
 
 
 def make_train_step(
@@ -93,7 +95,7 @@ def make_train_step(
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, jax.Array]]:
         batch = dict(batch)
         seed = batch.pop("seed", None)
-        key = jax.random.key(config.seed) if seed is None else jax.random.wrap_key_data(seed)
+        key = key_of(config.seed) if seed is None else jax.random.wrap_key_data(seed, impl=GENERATOR)
         key = jax.random.fold_in(key, state.step)
         real_BT = batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
@@ -127,7 +129,8 @@ def make_train_step(
 
 
 def micro_batches(batch: Any, accumulate: int) -> Any:
-    """Rows [B, ...] as [A, B / A, ...]: micro-batch a takes rows a, a + A, ..., so that every device keeps the rows it has."""
+    """Rows [B, ...] as [A, B / A, ...]: micro-batch a takes rows a, a + A, ..., so that every device keeps the rows it
+    has."""
     return jax.tree.map(lambda x: rearrange(x, "(b a) ... -> a b ...", a=accumulate), batch)
 
 

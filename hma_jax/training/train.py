@@ -14,6 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ExecutionConfig, ModelConfig, TrainConfig
 from hma_jax.config.json import to_dict
+from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.flops import train_flops_per_step
 from hma_jax.model.hma import declare_model
@@ -54,7 +55,8 @@ def train_model(
     data the batches come from; resuming on other data is refused, and `modernise_provenance` brings what
     an earlier version said to today's form before they are compared. `execution` says how it is computed,
     `validation` on what it is watched: both may be others each time. `records` names what a batch is made of,
-    for the message when its step is not finite. Raises ConfigError, CheckpointError, SaveError, DivergedError, Interrupted.
+    for the message when its step is not finite. Raises ConfigError, CheckpointError, SaveError, DivergedError,
+    Interrupted.
     """
     declared = declare_model(model, table, execution)
     mesh = execution.mesh
@@ -73,11 +75,11 @@ def train_model(
     everywhere = NamedSharding(device_mesh, PartitionSpec())
     with jax.set_mesh(device_mesh):
         step = _jitted_step(make_train_step, model, table, replace(config, seed=0), execution, device_mesh)
-        seed = jax.device_put(jax.random.key_data(jax.random.key(config.seed)), everywhere)
+        seed = jax.device_put(jax.random.key_data(key_of(config.seed)), everywhere)
 
         def extendable(saved: dict[str, Any], step: int) -> tuple[str, ...]:
-            """A run may go on for more steps, or fewer, from where the rate did not depend on their number; not if it has
-            more of them already."""
+            """A run may go on for more steps, or fewer, from where the rate did not depend on their number; not if it
+            has more of them already."""
             same = steps_in_common(config.optimizer, saved["train"]["steps"], config.steps)
             return ("train.steps",) if step <= min(same, config.steps) else ()
 

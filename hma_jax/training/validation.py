@@ -13,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from hma_jax.config import ExecutionConfig, MaskingConfig, ModelConfig, check_micro_batches, require
+from hma_jax.kernels.random import key_of
 from hma_jax.model.embodiments import EmbodimentTable
 from hma_jax.model.hma import declare_model
 from hma_jax.model.params import Declared, Params
@@ -92,7 +93,7 @@ def make_sums(
     masking = replace(masking, change_weight=1.0)
 
     def sums(params: Params, batch: Mapping[str, jax.Array], number: jax.Array) -> tuple[LossSums, TargetCounts]:
-        key = jax.random.fold_in(jax.random.key(SEED), number)
+        key = jax.random.fold_in(key_of(SEED), number)
         valid_B, real_BT = batch["valid"], batch.get("real")
         masked = mask_batch(key, batch["tokens"], batch["embodiment"], model, masking, table, real_BT)
         masked = masked.among(jnp.broadcast_to(valid_B[:, None], masked.hidden_T.shape))
