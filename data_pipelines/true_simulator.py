@@ -15,7 +15,7 @@ import numpy as np
 from data_pipelines.sources.rlds.images import fit_image
 from hma_jax.config import require
 from hma_jax.config.base import require_choice
-from hma_jax.simulator.interface import chosen_episodes, whole_numbers
+from hma_jax.simulator.interface import chosen_episodes, each_start, whole_numbers
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
 
@@ -92,7 +92,7 @@ class TrueSimulator(ABC, Generic[W]):
         effect."""
         del seeds
         which = chosen_episodes(episodes, len(self))
-        each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
+        each = each_start(starts, len(which))
         require(len(each) == len(which), f"{len(which)} episodes need as many starts, got {len(each)}")
         for start in each:
             require(start.robot in self.robots, f"no robot {start.robot!r} here; there are {', '.join(self.robots)}")

@@ -54,6 +54,14 @@ def chosen_episodes(episodes: Sequence[int] | None, count: int) -> list[int]:
     return which
 
 
+def each_start(starts: Start | Sequence[Start], count: int) -> list[Start]:
+    """One for each of `count` episodes, where one is given for all. Raises ConfigError for what is none."""
+    each = list(starts) if isinstance(starts, Sequence) and not isinstance(starts, str) else [starts] * count
+    others = [start for start in each if not isinstance(start, Start)]
+    require(not others, f"an episode begins at a Start (the simulator's `starts` has some), not at {others[:1]}")
+    return each
+
+
 Judge = Callable[[AnySimulator], tuple[np.ndarray, np.ndarray]]
 """What the present frames are worth: (rewards float [B], bool [B]: the task is done and the episode over). One that has
 a method `begin(simulator, episodes)` is told of episodes that have just begun."""

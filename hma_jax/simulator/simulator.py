@@ -20,7 +20,7 @@ from hma_jax.config.base import require_choice
 from hma_jax.generation.episodes import Episodes
 from hma_jax.simulator.episode import Episode, Snapshot, begin_episode
 from hma_jax.simulator.folder import USUAL, find_decode, find_robots, find_starts, find_tokenizer
-from hma_jax.simulator.interface import chosen_episodes, whole_numbers
+from hma_jax.simulator.interface import chosen_episodes, each_start, whole_numbers
 from hma_jax.simulator.programs import Beginning, Programs, padded
 from hma_jax.simulator.robots import Outside, Robot
 from hma_jax.simulator.starts import Start
@@ -154,7 +154,7 @@ class Simulator:
         Of a start's frames the last T - 1 are seen. An int for `seeds` gives the b-th of these episodes seed + b.
         """
         which = chosen_episodes(episodes, len(self))
-        each = [starts] * len(which) if isinstance(starts, Start) else list(starts)
+        each = each_start(starts, len(which))
         counted = isinstance(seeds, (int, np.integer))
         numbers = [seeds + i for i in range(len(which))] if counted else whole_numbers("seeds", seeds)
         asked = f"{len(which)} episodes need as many starts and seeds, got {len(each)} and {len(numbers)}"

@@ -255,6 +255,11 @@ def test_what_lies_outside_is_clipped_and_said_or_refused(caplog):
     [
         (lambda sim: sim.step([None]), "1 actions|as many actions"),
         (lambda sim: sim.step([np.zeros(2), None]), "episode 0 has not begun"),
+        (
+            lambda sim: sim.reset("arm"),
+            r"an episode begins at a Start .the simulator's `starts` has some., not at \['arm'\]",
+        ),
+        (lambda sim: sim.reset([start(0, 2), None]), r"not at \[None\]"),
         (lambda sim: sim.reset(start(0, 2), seeds=[1]), "as many starts and seeds"),
         (lambda sim: sim.reset(start(0, 2), seeds=[0.5, 1]), r"seeds: whole numbers are needed, got \[0.5, 1\]"),
         (lambda sim: sim.reset(start(0, 2), seeds=None), "seeds: whole numbers are needed, got None"),
