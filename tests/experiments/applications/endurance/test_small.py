@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 
 from experiments.applications.endurance.tables import over_robots, read_rows
@@ -16,128 +17,131 @@ from tests.experiments.applications.endurance.committed import (
     rows_of_trained,
     words_of,
 )
+from tests.pages import table
 
 
 def test_the_page_shows_what_was_measured():
     ten, unlike = (read_rows(RESULTS / name) for name in ("endurance.csv", "unlike.csv"))
-    tried = [row for name in ("variants.csv", "own_past.csv") for row in read_rows(RESULTS / name)]
     check_tables(
         SMALL,
         {
             "| minute |": lambda label: [row for row in ten if row["part"] == float(label)],
-            "| variant, seconds |": by_label(tried),
             "| trained, seconds |": by_label(rows_of_trained()),
             "| drive |": lambda label: [row for row in unlike if row["drive"] == label and row["part"] == 3],
         },
     )
 
 
-def test_no_way_of_filling_frames_and_no_past_of_its_own_is_better():
-    page = words_of(SMALL)
-    variants, own_past = (
-        {(r["variant"], r["robot"], r["part"]): r for r in read_rows(RESULTS / f"{name}.csv")}
-        for name in ("variants", "own_past")
-    )
+MINUTE = {
+    "likeliest tokens": ("variants model/likeliest", "variants model/shipped"),
+    "temperature 0.4": ("variants model/temperature_0.4", "variants model/shipped"),
+    "order by confidence": ("variants model/confidence", "variants model/shipped"),
+    "streaming window": ("variants model/streaming", "variants model/shipped"),
+    "its own past, drawn once": ("own_past own_past/shipped", "variants model/shipped"),
+    "its own past, drawn once, likeliest tokens": ("own_past own_past/likeliest", "variants model/likeliest"),
+    "chained factors": ("chained chained", "chained shipped"),
+    'changes counted thrice: "weighed"': ("weighed", "chained shipped"),
+    '"weighed", likeliest tokens': ("weighed_likeliest", "weighed"),
+    'half as long again: "long"': ("long", "weighed"),
+    'half the bits: "coarse"': ("coarse", "weighed"),
+    'its own past, drawn thrice: "mended"': ("mended", "long"),
+    '"mended", likeliest tokens': ("mended_likeliest", "long_likeliest"),
+    'more data and its own past: "resumed"': ("resumed", "weighed"),
+    'a displaced past besides: "displaced"': ("displaced", "resumed"),
+    '"displaced", likeliest tokens': ("displaced_likeliest", "resumed_likeliest"),
+}
+"""Line of the table of what was tried -> (table and variant of the change, of what it is beside)."""
 
-    def beside(measure: str, variant: str, parts: tuple[int, ...], of: dict = variants) -> tuple[float, float]:
-        other = "model/shipped" if of is variants else variant.replace("own_past", "model")
-        rows = {k[1:]: row for k, row in of.items() if k[0] == variant and k[2] in parts}
-        return gain(measure, [(row, variants[other, *k]) for k, row in rows.items()])
+TEN = {
+    'changes counted thrice: "weighed"': ("endurance", "first_ten"),
+    'half as long again: "long"': ("long_ten", "endurance"),
+    '"mended", likeliest tokens': ("mended_ten", "endurance"),
+    'a displaced past besides: "displaced"': ("displaced_ten", "endurance"),
+}
+"""Of ten minutes."""
 
-    late = [x for v in ("likeliest", "temperature_0.4") for x in beside("object_found", f"model/{v}", (2, 3))]
-    assert "by {:+.2f} ± {:.2f} (likeliest), {:+.2f} ± {:.2f} (temperature 0.4)".format(*late) in page
-    confidence = beside("object_found", "model/confidence", (2, 3))
-    assert "and {:.2f} ± {:.2f} (confidence)".format(*confidence) in page
-    objects, tools = (beside(measure, "model/streaming", (2, 3)) for measure in ("object_found", "tool_found"))
-    said = "objects are found in {:.2f} ± {:.2f} more of the frames, but tools in {:.2f} ± {:.2f} fewer"
-    assert said.format(*objects, -tools[0], tools[1]) in page
-    psnr, follows = (beside(measure, "model/streaming", (1,)) for measure in ("psnr", "follows"))
+
+def later(name: str) -> dict[tuple, dict]:
+    """(robot, start, part) -> row after the first part of a table, and of one of its variants where it is named."""
+    file, _, variant = name.partition(" ")
+    rows = [row for row in read_rows(RESULTS / f"{file}.csv") if row["part"] > 1 and variant in ("", row["variant"])]
+    places = {(row["robot"], row["start"], row["part"]): row for row in rows}
+    assert len(places) == len(rows)
+    return places
+
+
+def beside(measure: str, name: str, other: str) -> tuple[float, float]:
+    of, before = later(name), later(other)
+    assert of.keys() == before.keys()
+    return gain(measure, [(row, before[place]) for place, row in of.items()])
+
+
+def test_what_each_change_brings_is_as_the_page_says():
+    columns = ("object_found", 2), ("tool_found", 2), ("psnr", 1)
+    shown = {
+        re.sub(r"\]\([^)]*\)|[\[*]", "", label): cells for label, cells in table(SMALL, "| what was changed |").items()
+    }
+    assert shown.keys() == MINUTE.keys()
+    for label, (_, *cells) in shown.items():
+        pair = MINUTE[label]
+        gained = [(*beside(measure, *pair), digits) for measure, digits in columns]
+        found = [f"{mean:+.{digits}f} ± {half:.{digits}f}" for mean, half, digits in gained]
+        ten = "{:+.2f} ± {:.2f}".format(*beside("object_found", *TEN[label])) if label in TEN else ""
+        assert cells == [*found, ten], label
+    starts = [{start for _, start, _ in later(pair[0])} for pair in MINUTE.values()]
+    assert starts == [{0}] * 6 + [{0, 1, 2, 3}] * 10
+
+
+def test_streaming_loses_motion_at_once():
+    page, rows = words_of(SMALL), [row for row in read_rows(RESULTS / "variants.csv") if row["part"] == 1]
+    each = {(row["variant"], row["robot"]): row for row in rows}
+    pairs = [(row, each["model/shipped", robot]) for (v, robot), row in each.items() if v == "model/streaming"]
+    psnr, follows = gain("psnr", pairs), gain("follows", pairs)
     assert f"it costs {-psnr[0]:.1f} ± {psnr[1]:.1f} dB in the first 20 seconds" in page
     assert "any more ({:.2f} ± {:.2f} there)".format(*follows) in page
-    for name, said in (
-        ("likeliest", "objects found {:+.2f} ± {:.2f}, PSNR {:.2f} ± {:.2f} dB;"),
-        ("shipped", "temperature of 0.7 {:+.2f} ± {:.2f} and {:.2f} ± {:.2f} dB."),
-    ):
-        found = [x for m in ("object_found", "psnr") for x in beside(m, f"own_past/{name}", (2, 3), own_past)]
-        assert said.format(*found) in page, name
 
 
-def test_chained_factors_keep_bodies_and_cost_decibels():
+def test_chained_factors_keep_bodies():
     page, found = words_of(SMALL), partial(gains, "chained")
     for measure, words in (
-        ("tool_found", "in {:.2f} ± {:.2f} more of the frames"), ("object_found", "than chance allows ({:+.2f} ± {:.2f})"),
         ("variance", "nearer to the truth's by {:.2f} ± {:.2f}, at the edge of chance"),
-        ("tool_close", "better in place ({:.2f} ± {:.2f})"),
-    ):  # fmt: skip
+        ("tool_close", "no better in place ({:.2f} ± {:.2f})"),
+    ):
         assert words.format(*found(measure)) in page, measure
-    loss, half = found("psnr")
-    assert f"at wrong places cost {-loss:.1f} ± {half:.1f} dB" in page
 
 
-def test_changes_counted_thrice_keep_bodies_and_cost_nothing():
+def test_changes_counted_thrice_keep_bodies():
     page, found = words_of(SMALL), partial(gains, "weighed")
     for measure, words in (
-        ("tool_found", "tools are found in {:.2f} ± {:.2f} more of the frames"),
-        ("variance", "nearer to the truth's by {:.2f} ± {:.2f}. Objects"),
-        ("object_found", "Objects are found in {:.2f} ± {:.2f} more"),
-        ("tool_close", "places (tools {:+.2f} ± {:.2f})"), ("psnr", "PSNR ({:.1f} ± {:.1f} dB)"),
+        ("variance", "nearer to the truth's by {:.2f} ± {:.2f};"), ("tool_close", "places (tools {:+.2f} ± {:.2f})"),
     ):  # fmt: skip
         assert words.format(*found(measure)) in page, measure
 
 
 def test_longer_training_and_a_past_of_its_own_keep_no_more_objects():
     page = words_of(SMALL)
-    minute = [gains("long", measure, "weighed") for measure in ("object_found", "psnr")]
-    assert "robot, {:+.2f} ± {:.2f}; PSNR {:.1f} ± {:.1f} dB)".format(*minute[0], *minute[1]) in page
-    rounds = [gains("mended", measure, "long") for measure in ("object_found", "psnr", "follows")]
-    said = 'found {:.2f} ± {:.2f} beside "long", PSNR {:.1f} ± {:.1f} dB, follows {:+.2f} ± {:.2f}.'
-    assert said.format(*rounds[0], *rounds[1], *rounds[2]) in page
-    tables = ("weighed", "long", "long_likeliest", "mended_likeliest")
-    weighed, drawn, long, mended = ({k: r for k, r in by_place(f"{n}.csv").items() if k[2] > 1} for n in tables)
-
-    def beside(measure: str, of: dict, other: dict) -> tuple[float, float]:
-        assert len(of) == 8 * 4 * 2 and of.keys() == other.keys()
-        return gain(measure, [(row, other[place]) for place, row in of.items()])
-
-    assert 'found {:+.2f} ± {:.2f} beside "long" at that'.format(*beside("object_found", mended, long)) in page
-    assert "sooner than when it draws ({:.2f} ± {:.2f})".format(*beside("object_found", long, drawn)) in page
-    three = [beside(measure, mended, weighed) for measure in ("object_found", "object_close", "psnr")]
+    drawn = beside("object_found", "long_likeliest", "long")
+    assert "sooner than when it draws ({:.2f} ± {:.2f})".format(*drawn) in page
+    three = [beside(measure, "mended_likeliest", "weighed") for measure in ("object_found", "object_close", "psnr")]
     said = "(objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, PSNR {:.1f} ± {:.1f} dB)"
     assert said.format(abs(three[0][0]), three[0][1], *three[1], *three[2]) in page
-    served, long = by_place("endurance.csv"), by_place("long_ten.csv")
-    assert len(served) == 8 * 10 and served.keys() == long.keys()
-    later = [(row, served[place]) for place, row in long.items() if row["part"] > 1]
-    last = over_robots([row for row in long.values() if row["part"] == 10], "object_found")[0]
-    ten = [gain(measure, later) for measure in ("object_found", "psnr", "follows")]
-    assert "found {:.2f} ± {:.2f} from the second minute on, in the last minute".format(*ten[0]) in page
-    said = "minute {:.0f} % of frames, PSNR {:.1f} ± {:.1f} dB, follows {:.2f} ± {:.2f}."
-    assert said.format(100 * last, *ten[1], *ten[2]) in page
-
-
-def test_half_the_bits_keep_no_more_objects():
-    page = words_of(SMALL)
-    found = [x for m in ("object_found", "object_close", "tool_close", "psnr") for x in gains("coarse", m, "weighed")]
-    said = "objects found {:.2f} ± {:.2f}, in place {:+.2f} ± {:.2f}, tools in place {:+.2f} ± {:.2f}, PSNR {:+.1f} ± {:.1f} dB"
-    assert said.format(*found) in page
+    last = over_robots([row for place, row in later("long_ten").items() if place[2] == 10], "object_found")[0]
+    ten = [x for measure in ("psnr", "follows") for x in beside(measure, "long_ten", "endurance")]
+    said = "in {:.0f} % of the frames of the last minute; from the second on PSNR {:.1f} ± {:.1f} dB, follows {:.2f} ± {:.2f}."
+    assert said.format(100 * last, *ten) in page
 
 
 def test_a_displaced_past_keeps_objects_for_a_minute_where_tokens_are_drawn():
     page = words_of(SMALL)
-    beside, before = partial(gains, "displaced", beside="resumed"), partial(gains, "displaced", beside="weighed")
-    (more, half), (less, off) = beside("object_found"), beside("psnr")
+    control, before = partial(gains, "displaced", beside="resumed"), partial(gains, "displaced", beside="weighed")
+    (more, half), (less, off) = control("object_found"), control("psnr")
     assert more > half and less < -off
-    assert f"found in {more:.2f} ± {half:.2f} more of the frames than with" in page
-    assert 'in {:.2f} ± {:.2f} more than with "weighed"'.format(*before("object_found")) in page
-    places = *beside("object_close"), *before("object_close")
-    assert "In place they are {:.2f} ± {:.2f} and {:.2f} ± {:.2f} more.".format(*places) in page
-    assert f'PSNR is {-less:.1f} ± {off:.1f} dB lower than with "resumed"' in page
+    assert 'beside "weighed", too, they are found in {:.2f} ± {:.2f} more'.format(*before("object_found")) in page
+    places = *control("object_close"), *before("object_close")
+    said = 'In place they are {:.2f} ± {:.2f} (beside "resumed") and {:.2f} ± {:.2f} ("weighed") more.'
+    assert said.format(*places) in page
     assert '{:+.1f} ± {:.1f} dB beside "weighed"'.format(*before("psnr")) in page
-    tools = *beside("tool_found"), *beside("follows")
-    assert '(found {:.2f} ± {:.2f}, follows {:.2f} ± {:.2f} beside "resumed")'.format(*tools) in page
-    likeliest, resumed = (by_place(f"{name}_likeliest.csv") for name in ("displaced", "resumed"))
-    assert len(likeliest) == 8 * 4 * 3 and likeliest.keys() == resumed.keys()
-    later = [(row, resumed[place]) for place, row in likeliest.items() if row["part"] > 1]
-    assert "nothing is gained, {:.2f} ± {:.2f}:".format(*gain("object_found", later)) in page
+    assert 'tools follow as they did ({:.2f} ± {:.2f} beside "resumed")'.format(*control("follows")) in page
     back = [
         over_robots([r for r in read_rows(RESULTS / f"{name}_hidden.csv") if r["kind"] == "hidden"], "found")[0]
         for name in ("displaced", "resumed")
@@ -153,8 +157,6 @@ def test_a_displaced_past_keeps_objects_for_a_minute_where_tokens_are_drawn():
 
     said = 'found in {} % of the frames of the first minute ("weighed": {}), {} of the second ({}), {} of the last ({})'
     assert said.format(*(found(minute, of) for minute in (1, 2, 10) for of in (ten, weighed))) in page
-    later = [(row, weighed[place]) for place, row in ten.items() if row["part"] > 1]
-    assert "the gain is {:.2f} ± {:.2f}, one".format(*gain("object_found", later)) in page
     kept = [[of[robot, 0, 4]["object_found"] for of in (ten, weighed)] for robot in ("pusher_sand", "omni_chalk")]
     assert kept[0][0] > 0.95 and kept[1][0] < 0.05 < 0.95 < kept[1][1]
 
@@ -164,12 +166,7 @@ def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
     served, ten = by_place("endurance.csv"), by_place("mended_ten.csv")
     assert len(served) == 8 * 10 and served.keys() == ten.keys()
     last = over_robots([row for row in ten.values() if row["part"] == 10], "object_found")[0]
-    later = [(row, served[place]) for place, row in ten.items() if row["part"] > 1]
-    gained = gain("object_found", later)
-    assert (
-        f"found in {100 * last:.0f} % of the frames of the last minute, {gained[0]:.2f} ± {gained[1]:.2f} beside"
-        in page
-    )
+    assert f"found in {100 * last:.0f} % of the frames of the last minute; pusher_sand keeps" in page
     for robot, measure, words in (
         ("pusher_sand", "object_found", '({:.0f} % of the last minute, "weighed" {:.0f})'),
         ("picker_slate", "tool_found", 'its own body ({:.0f} %, "weighed" {:.0f})'),
@@ -177,15 +174,6 @@ def test_ten_minutes_with_a_past_of_its_own_depend_on_the_robot():
         assert words.format(*(100 * of[robot, 0, 10][measure] for of in (ten, served))) in page
     back = over_robots([row for row in read_rows(RESULTS / "mended_hidden.csv") if row["kind"] == "hidden"], "found")[0]
     assert f"hidden comes back in {100 * back:.0f} % of the cases" in page
-
-
-def test_likeliest_tokens_are_no_better():
-    page = words_of(SMALL)
-    drawn, likeliest = by_place("weighed.csv"), by_place("weighed_likeliest.csv")
-    assert len(drawn) == 8 * 4 * 3 and drawn.keys() == likeliest.keys()
-    later = [(row, drawn[place]) for place, row in likeliest.items() if row["part"] > 1]
-    for measure, words in (("object_found", "objects found {:.2f} ± {:.2f}"), ("psnr", "PSNR {:+.1f} ± {:.1f} dB.")):
-        assert words.format(*gain(measure, later)) in page, measure
 
 
 def test_ten_minutes_are_as_the_page_says():
