@@ -27,6 +27,7 @@ from hma_jax.config import (
     check_objective,
     require,
 )
+from hma_jax.config.base import require_seed
 
 
 @dataclass(frozen=True)
@@ -178,6 +179,8 @@ class Study:
             points = getattr(self, axis)
             require(len(points) >= 1, f"{axis} is empty; give at least one point")
             require_increasing(axis, points, at_least=0 if "seeds" in axis else 1)
+        for seed in (*self.seeds, *self.ablation_seeds):
+            require_seed(seed, "a seed of seeds and ablation_seeds")
         self._check_tokens()
         # As training asks for them, which comes after data and tokenizer were made.
         check_objective(self.model, self.train.masking)

@@ -18,6 +18,12 @@ def require(condition: bool, message: str) -> None:
         raise ConfigError(message)
 
 
+def require_seed(seed: int, where: str) -> None:
+    """Raises ConfigError, which begins with `where`, unless `seed` differs from every other one: of a number JAX takes
+    32 bits, so that masks of 2^32 would be those of 0, and numpy takes none below 0."""
+    require(0 <= seed < 2**32, f"{where} must lie in [0, 2^32), got {seed}")
+
+
 def require_choice(value: Any, choices: tuple[Any, ...], where: str) -> None:
     """Raises ConfigError, which begins with `where`, unless `value` is one of `choices`."""
     known = ", ".join(map(str, choices))

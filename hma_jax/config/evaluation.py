@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require
+from hma_jax.config.base import check_choices, require, require_seed
 from hma_jax.config.model import ModelConfig
 
 SamplerKind = Literal["ddpm", "ddim", "dpm++"]
@@ -106,6 +106,7 @@ class EvalConfig:
         require(self.random_actions >= 1, "eval.random_actions must be at least 1")
         require(self.other_actions >= 0, "eval.other_actions must not be negative")
         require(self.batch >= 1, f"eval.batch must be at least 1, got {self.batch}")
+        require_seed(self.seed, "eval.seed")
         require(self.perplexity_group >= 1, f"eval.perplexity_group must be at least 1, got {self.perplexity_group}")
 
     @property

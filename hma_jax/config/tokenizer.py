@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from hma_jax.config.base import check_choices, require
+from hma_jax.config.base import check_choices, require, require_seed
 
 
 @dataclass(frozen=True)
@@ -120,6 +120,7 @@ class TokenizerTrainConfig:
         require(
             self.weight_decay >= 0, f"tokenizer training: weight_decay must not be negative, got {self.weight_decay}"
         )
+        require_seed(self.seed, "tokenizer training: seed")
         require(
             0 <= self.final_fraction <= 1,
             f"tokenizer training: final_fraction must lie in [0, 1], got {self.final_fraction}",

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from hma_jax.config.base import check_choices, require
+from hma_jax.config.base import check_choices, require, require_seed
 from hma_jax.config.model import ModelConfig
 
 Setting = Literal["forward", "passive", "full", "policy", "inverse"]
@@ -165,6 +165,7 @@ class TrainConfig:
         check_choices(self)
         require(self.steps >= 1, f"train.steps must be at least 1, got {self.steps}")
         require(self.batch >= 1, f"train.batch must be at least 1, got {self.batch}")
+        require_seed(self.seed, "train.seed")
         require(0 <= self.ema_decay < 1, f"train.ema_decay must lie in [0, 1), got {self.ema_decay}")
 
 

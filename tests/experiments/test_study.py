@@ -128,6 +128,8 @@ def test_the_seed_of_a_study_s_trials_is_one_of_its_seeds():
     with pytest.raises(ConfigError, match="train.seed: a trial has one of seeds; set seeds=3"):
         override(SMOKE, ["train.seed=3"])
     assert override(SMOKE, ["seeds=3"]).seeds == (3,)
+    with pytest.raises(ConfigError, match="a seed of seeds and ablation_seeds must lie in"):
+        override(SMOKE, ["ablation_seeds=[0, 4294967296]"])
 
 
 def test_the_advice_makes_a_study_continuous():

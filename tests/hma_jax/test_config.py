@@ -23,6 +23,7 @@ from hma_jax.config import (
     MupConfig,
     OptimizerConfig,
     TokenizerTrainConfig,
+    TrainConfig,
 )
 from hma_jax.config.base import check_choices
 from hma_jax.config.json import diff, to_strict_json
@@ -78,6 +79,13 @@ def test_choices_are_found_in_a_type_beside_none_and_in_tuples():
         (OptimizerConfig, {"weight_decay": -1.0}, "optimizer.weight_decay must not be negative, got -1.0"),
         (TokenizerTrainConfig, {"weight_decay": -1.0}, "weight_decay must not be negative, got -1.0"),
         (TokenizerTrainConfig, {"final_fraction": 5.0}, r"final_fraction must lie in \[0, 1\], got 5.0"),
+        (TokenizerTrainConfig, {"seed": -1}, r"tokenizer training: seed must lie in \[0, 2\^32\), got -1"),
+        (
+            TrainConfig,
+            {"seed": 2**32},
+            r"train.seed must lie in \[0, 2\^32\), got 4294967296",
+        ),  # its masks are those of 0
+        (EvalConfig, {"seed": 2**64}, r"eval.seed must lie in \[0, 2\^32\)"),
         (EvalConfig, {"batch": 0}, "eval.batch must be at least 1, got 0"),
         (EvalConfig, {"perplexity_group": 0}, "eval.perplexity_group must be at least 1, got 0"),
         (MeshConfig, {"min_shard_size": -1}, "mesh.min_shard_size must not be negative, got -1"),
