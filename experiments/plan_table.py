@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,16 +58,26 @@ def plan_table(
         table.caption += f"About {_duration(before.seconds)} to prepare: {describe(before, _duration)}."
     seeds = {p.trial.train.seed for p in plans.values()}
     shared = {trial_id(reference_trial(study, seed), done.provenance) for seed in seeds}
-    axes = _axes(sweeps, done.provenance)
+    axes, places = _axes(sweeps, done.provenance), _places(sweeps, done.provenance)
+    rows: dict[str, tuple[str, ...]] = {}
     for id, plan in plans.items():
-        trial, cost, over = plan.trial, plan.cost, "finished" if id in done.finished else done.left.get(id)
-        seed = f", seed {trial.train.seed}" if len(seeds) > 1 else ""
-        table.add_row(
-            escape(("reference" if id in shared else axes.get(id, "source")) + seed),
+        trial = plan.trial
+        rows[id] = (
+            "reference" if id in shared else axes.get(id, "source"),
+            f", seed {trial.train.seed}" if len(seeds) > 1 else "",
             f"{len(trial.datasets)}",
             "all" if trial.max_trajectories is None else _short_count(trial.max_trajectories),
             f"{trial.model.width}",
             *[f"{trial.train.steps:,}"] * several,
+        )
+    count = Counter(rows.values())  # an axis may vary what no column shows
+    for id, plan in plans.items():
+        (name, seed, *columns), cost = rows[id], plan.cost
+        over = "finished" if id in done.finished else done.left.get(id)
+        place = f" {places[id]}" if count[rows[id]] > 1 and id in places else ""
+        table.add_row(
+            escape(name + place + seed),
+            *columns,
             _count(cost.parameters),
             _count(cost.parameters_one_robot),
             "" if over else _flops(plan.flops).removesuffix("FLOP"),
@@ -133,6 +144,16 @@ def _axes(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
             own = "control" if point.role == CONTROL else sweep.remark(point) or sweep.name
             names.setdefault(trial_id(point.trial, provenance), {}).setdefault(sweep.name, own)
     return {id: " + ".join(dict.fromkeys(own.values())) for id, own in names.items()}
+
+
+def _places(sweeps: Sequence[Sweep], provenance: Provenance) -> dict[str, str]:
+    """Where trials stand on an axis of numbers, by id."""
+    return {
+        trial_id(point.trial, provenance): f"{point.x:g}"
+        for sweep in sweeps
+        if sweep.measured
+        for point in sweep.points
+    }
 
 
 def _count(parameters: int) -> str:
