@@ -12,7 +12,7 @@ from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg
 from experiments.cli.arguments import StudyOptions
 from experiments.cli.hosts import Hosts
 from experiments.evaluated import STAMP, describe_evaluation, require_same_evaluation
-from experiments.progress import console, step, tidy_table
+from experiments.progress import TidyTable, console, step, tidy_table
 from experiments.running.attempts import JOB
 from experiments.running.sealed import SAMPLES
 from experiments.setting import UNSET, Setting, make_setting, require_local, short
@@ -25,15 +25,16 @@ from hma_jax.runtime.files import write_file
 if TYPE_CHECKING:
     from data_pipelines.tokens.store import TokenStore
     from experiments.running.run_trial import Materials
+    from hma_jax.evaluation.summary import Summary
     from hma_jax.tokenizers.base import Tokenizer
     from hma_jax.training.runs import Run
 
 SHOWN = (
-    "perplexity", "accuracy", "diffusion_loss", "psnr", "ssim", "lpips", "delta_psnr", "action_nats",
-    "retrieval", "counterfactual_gain", "action_error", "action_gain",
+    "perplexity", "accuracy", "diffusion_loss", "psnr", "psnr_copy", "ssim", "lpips", "lpips_copy", "delta_psnr",
+    "action_nats", "retrieval", "counterfactual_gain", "action_error", "action_gain",
 )  # fmt: skip
-"""Metrics in the table of `hma evaluate`, where a model has them; evaluation.json holds all, and
-windows.parquet those of every window."""
+"""Metrics in the table of `hma evaluate`, where a model has them, beside what a copied frame has; evaluation.json
+holds all, and windows.parquet those of every window."""
 
 
 def evaluate(
@@ -127,20 +128,25 @@ def _evaluate(setting: Setting, run: Path, trained: Run, place: Path, replace: b
     if not is_writer():
         return
     summary = evaluation.summary
-    metrics = [m for m in SHOWN if m in summary.overall]
     which = ", averaged weights" if trained.weights == "ema" else ""
     when = f", step {trained.step:,}" if trained.step else ""  # a run that was converted has made no step here
-    table = tidy_table(f"{short(run)}{when}{which}", "dataset", *metrics)
+    console.print(table_of(summary, f"{short(run)}{when}{which}"))
+    write_evaluation(place, evaluation)
+    write_file(place / "evaluation.json", to_strict_json(summary.to_dict()))
+    made_from.save(place, STAMP)
+    wrote(place / "evaluation.json", place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
+
+
+def table_of(summary: Summary, title: str) -> TidyTable:
+    """What is `SHOWN` of every dataset, and of all."""
+    metrics = [m for m in SHOWN if m in summary.overall]
+    table = tidy_table(title, "dataset", *metrics)
     for name, stats in [*summary.datasets.items(), ("overall", summary.overall)]:
         table.add_row(name, *(plus_minus(stats[m].mean, stats[m].sem) if m in stats else "" for m in metrics))
     judged = {name: stats for name, stats in summary.datasets.items() if stats}
     if alone := [name for name, stats in judged.items() if all(s.clusters == 1 for s in stats.values())]:
         table.caption = f"No error of {few(alone)}: one held-out episode does not say how they differ."
-    console.print(table)
-    write_evaluation(place, evaluation)
-    write_file(place / "evaluation.json", to_strict_json(summary.to_dict()))
-    made_from.save(place, STAMP)
-    wrote(place / "evaluation.json", place / FILE, *[place / SAMPLES] * bool(evaluation.samples))
+    return table
 
 
 def _not_trained_on(trained: Run, materials: Materials) -> list[str]:
