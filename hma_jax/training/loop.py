@@ -29,6 +29,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from hma_jax.runtime.devices import usable_cores
 from hma_jax.runtime.exits import Exit, hand_on, lost_request
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer, meet
@@ -239,6 +240,7 @@ def _describe_start(step: int, execution: Mapping[str, Any]) -> dict[str, Any]:
         "execution": dict(execution),
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
+        "cores": usable_cores(),
         "processes": jax.process_count(),
         "jax": jax.__version__,
     }
