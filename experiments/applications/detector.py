@@ -9,7 +9,7 @@ The suite says where everything is; half of the frames it learns from are as RUN
 object is missing, so that it learns what nothing looks like. It sees frames of 64 pixels; those of a run that has fewer
 are enlarged.
 Writes detector.npz (half precision) and errors.csv, its own errors on held-out episodes. The same command goes on where
-it was stopped, and keeps a detector that is there.
+it was stopped (its frames are drawn again, in a minute or two), and keeps a detector that is there.
 """
 
 from __future__ import annotations

@@ -9,9 +9,9 @@ Expected: success grows with the generated trajectories; those of a model that i
 The 100 trajectories are an expert's, from starts that the world model never saw. For each seed ten of them are kept as
 recorded; of the others the actions are kept, and replayed from their own first frame in the learned simulator. Policies
 are trained on what it shows, not on that frame. Control: the same simulator under another trajectory's actions, so that
-pictures and actions do not belong together. With --without-actions RUN there is a second control, what a model generates
-that was trained on the same video without actions (`--set train.masking.setting=passive`). All policies are trained
-alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
+pictures and actions do not belong together. With --without-actions RUN there is a second control, what a model
+generates that was trained on the same video without actions (`--set train.masking.setting=passive`). All policies are
+trained alike (behaviour cloning, as many steps), and judged from the same starts in the true simulator.
 
 The error is that of a policy's actions in held-out recordings, mean squared, in standard deviations. With --actions
 DATASET the trajectories are recordings of a robot that no simulator judges (the paper's Language Table): policies are
@@ -129,8 +129,8 @@ def make_data(
 def imagine(
     simulator: Simulator, robot: Robot, demos: Demonstrations, given: int, kept: Path, update: Report
 ) -> np.ndarray:
-    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under its actions. Every batch
-    is kept in the directory `kept`, and found there again."""
+    """Images as `demos` has them, [N, L, H, W, 3], after the `given` ones the simulator's under its actions. Every
+    batch is kept in the directory `kept`, and found there again."""
     kept.mkdir(parents=True, exist_ok=True)
     trajectories, images = as_trajectories(demos, robot), np.zeros_like(demos.images)
     for first in range(0, len(demos), len(simulator)):

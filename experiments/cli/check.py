@@ -25,12 +25,13 @@ def check(
     """Say which action dimensions a model ignores, or has with another sign, scale or place than the recordings.
 
     Held-out windows are judged under the recorded actions and with one dimension held still, negated, scaled or
-    exchanged with another. The table gives what a dimension is worth: nats per token that are lost when it is held still.
-    Robots of too few held-out episodes are left out, and named. Writes RUN/check.json.
+    exchanged with another. The table gives what a dimension is worth: nats per token that are lost when it is held
+    still. Robots of too few held-out episodes are left out, and named. Writes RUN/check.json.
 
     Args:
         run: Directory of a training run.
-        out: Directory of a study with tokens and windows of the robots: your own recordings, or those it was trained on.
+        out: Directory of a study with tokens and windows of the robots: your own recordings, or those it was trained
+            on.
         robots: Only these. Otherwise all that have windows there.
         windows: Of each robot.
     """

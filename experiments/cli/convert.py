@@ -186,7 +186,8 @@ def to_stablehlo(
 
 
 def _decode(run: Path, frame: dict[str, Any], latents: dict[str, Any]) -> DecodeConfig:
-    """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, but for what is asked for (not None)."""
+    """How the frames of a run are filled: as its decode.json says, or else `PLAIN`, but for what is asked for (not
+    None)."""
     from hma_jax.simulator.folder import DECODE, find_decode
 
     found = find_decode(run) if (run / DECODE).exists() else PLAIN

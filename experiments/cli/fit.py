@@ -130,8 +130,8 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
 
 def _held_out(sweep: Sweep, provenance: Provenance, asked: str, x: float, how: str) -> tuple[Curve, list[Place]]:
     """The curve of `sweep` that AXIS=X or AXIS-SERIES=X asks for, and its trials at `x`; `how` one is added. Raises
-    ConfigError where a power law is not what the axis is to show, where it is not said which of several curves, and for a
-    curve without a trial there."""
+    ConfigError where a power law is not what the axis is to show, where it is not said which of several curves, and for
+    a curve without a trial there."""
     from experiments.analysis.scaling import curves_of
     from experiments.running.trial import trial_id
     from experiments.sweeps.sweep import POINT

@@ -40,10 +40,10 @@ def judge(
 ) -> None:
     """Run policies of many strengths from the same starts in the true and in the learned simulator, and compare.
 
-    Policies act on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and a random
-    one; the model itself, where it was trained to predict actions as well; your own. Success in the model is told by a
-    head, in the truth by the state; the head looks at true frames too, and a control executes what a policy does in
-    another episode. A robot without a true simulator is judged in the model alone, by a head that learns from
+    Policies act on images: checkpoints of behaviour cloning and of a Diffusion Policy along their training, and a
+    random one; the model itself, where it was trained to predict actions as well; your own. Success in the model is
+    told by a head, in the truth by the state; the head looks at true frames too, and a control executes what a policy
+    does in another episode. A robot without a true simulator is judged in the model alone, by a head that learns from
     recordings. Writes table, agreement with intervals, a page with clips, and a page on which a person can label
     successes blindly. Goes on where it was stopped. docs/judging.md says how to read it.
 
@@ -56,14 +56,15 @@ def judge(
             with the tool above a puck.
         policies: Python file with policies(robot), policies of your own by name, which are judged too. A function
             success(images, first) in it tells success in place of a trained head.
-        recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether they
-            succeeded: the head learns from them, and episodes begin as those that are held out.
+        recordings: Dataset of a robot without a true simulator (RLDS, LeRobot, robomimic) whose episodes say whether
+            they succeeded: the head learns from them, and episodes begin as those that are held out.
         split: Of --recordings. Default: train.
         reward: From which on a recorded step has reached the goal, with --recordings that have one in every step: they
             teach the head frame by frame, which takes far fewer of them than ends alone.
         registry: TOML file with entries of your own.
         real: What came of policies on the real robot, with --recordings: columns policy, successes, episodes.
-        starts: Held-out episodes at whose beginning every policy starts; of --recordings at most as many as are held out.
+        starts: Held-out episodes at whose beginning every policy starts; of --recordings at most as many as are held
+            out.
         batch: Of these, run at once. Default: all.
         frames: Of an episode, instead of the task's, or of what nine of ten recorded successes needed.
         hold: Frames in a row at the goal that make a success, instead of the task's, or of 2 of --recordings, whose
@@ -75,8 +76,8 @@ def judge(
         cloned: Checkpoints of behaviour cloning, 0 for none. Default: 6, with --recordings none.
         diffusion: Checkpoints of the Diffusion Policy. Default: 3, with --recordings none.
         seed: Of recordings, training and episodes.
-        labels: Saved by the blind page: only says how often that person agrees with what lies in --out, whatever else is
-            given.
+        labels: Saved by the blind page: only says how often that person agrees with what lies in --out, whatever else
+            is given.
     """
     from experiments.applications.judging.blind import compare_labels, read_labels, write_blind
     from experiments.applications.judging.config import JudgeConfig

@@ -189,7 +189,8 @@ def _check(
 
 
 def _require_no_trial(setting: Setting, run: Path) -> None:
-    """Raises ConfigError for the run of a trial: its result vouches for the log as it is, and its study for the steps."""
+    """Raises ConfigError for the run of a trial: its result vouches for the log as it is, and its study for the
+    steps."""
     require(
         run.name != RUN or not (run.absolute().parent / JOB).is_file(),
         f"{short(run)} is the run of a trial, and its study would refuse what was trained on; to train its model further: "
@@ -252,8 +253,8 @@ def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
 
 
 def _beginning(source: Path, run: Path) -> Run:
-    """The trained model in `source`. Where that is gone, what `run` has of it, if it began with one: a run needs no more
-    than that, and its own checkpoint, to go on."""
+    """The trained model in `source`. Where that is gone, what `run` has of it, if it began with one: a run needs no
+    more than that, and its own checkpoint, to go on."""
     from hma_jax.training.runs import load_run
 
     origin = None if source.exists() else _newest(run)[1].get("provenance", {}).get("origin")

@@ -264,8 +264,8 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, first: str | None) -> None:
-    """The command that reads the dataset as it was counted here, or what to try where nothing can be read. `first`: what
-    comes before either."""
+    """The command that reads the dataset as it was counted here, or what to try where nothing can be read. `first`:
+    what comes before either."""
     if windows is None:
         return
     if first:
