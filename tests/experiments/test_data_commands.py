@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from data_pipelines.tokens.store import TokenStore
@@ -67,6 +69,15 @@ def test_what_is_left_out_is_told(tmp_path, capsys):
     assert main([*command, "--out", str(tmp_path), "--min-frames", "4"]) == 0
     out = said(capsys)
     assert "1 episodes at 10 Hz" in out and "left out 1 x: fewer than 4 frames in a row" in out
+
+
+def test_pictures_that_are_no_cameras_are_told(tmp_path, capsys):
+    root = write_lerobot(tmp_path / "arm", "v2.1", camera="image")
+    info = json.loads((root / "meta/info.json").read_text())
+    info["features"]["observation.images.ir"] = {"dtype": "image", "shape": [8, 8, 1]}
+    (root / "meta/info.json").write_text(json.dumps(info))
+    assert main(["data", "convert", "lerobot", str(root), "--out", str(tmp_path)]) == 0
+    assert "left out: observation/ir; docs/own_data.md says what is a camera" in said(capsys)
 
 
 def test_who_meets_a_damaged_file_is_told_what_this_command_has(tmp_path, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -51,7 +52,7 @@ def robomimic(
     from data_pipelines.sources.robomimic import RobomimicSource
 
     opened = RobomimicSource(source, settings)
-    _convert(opened, destination, f"robomimic_{opened.task}")
+    _convert(opened, destination, f"robomimic_{opened.task}", opened.left_out)
 
 
 def lerobot(
@@ -69,7 +70,8 @@ def lerobot(
     """
     from data_pipelines.sources.lerobot import LeRobotSource
 
-    _convert(LeRobotSource(source, settings), destination, source.absolute().name)
+    opened = LeRobotSource(source, settings)
+    _convert(opened, destination, source.absolute().name, opened.left_out)
 
 
 def epic_kitchens(
@@ -125,7 +127,7 @@ def egoexo4d(
     _convert(EgoExo4dSource(source, settings), destination, NAME)
 
 
-def _convert(source: Source, destination: Destination, default_name: str) -> None:
+def _convert(source: Source, destination: Destination, default_name: str, no_cameras: Collection[str] = ()) -> None:
     from data_pipelines.convert.write import convert
     from data_pipelines.errors import DataError, without_advice
     from data_pipelines.sources.units import UnitError
@@ -147,6 +149,8 @@ def _convert(source: Source, destination: Destination, default_name: str) -> Non
     _say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
     for reason, count in done.left_out.items():
         _say(f"left out {count:,} x: {reason}")
+    if no_cameras:
+        _say(f"left out: {', '.join(no_cameras)}; docs/own_data.md says what is a camera")
     inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
     _say(
         "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "
