@@ -57,7 +57,9 @@ def rollout(
     computed once. All R sequences use the same random numbers (a function of the example's key
     and the frame), so a difference between them is the actions' doing. `hidden_BT` marks recorded
     chunks that the model is not shown; which it was trained without, says `objective.masking.never_shown`.
+    Raises ConfigError for shapes that do not fit the model or each other.
     """
+    _require_shapes(model, prompt, actions_BRTU, embodiment_B, key_B)
     prompt, actions_BRTU, hidden_BT = _recent(model, prompt, actions_BRTU, hidden_BT)
     batch, repeats, frames, _ = actions_BRTU.shape
     size = min(frames, model.config.frames)
@@ -174,6 +176,22 @@ def fold_in(key_B: jax.Array, data: int | jax.Array) -> jax.Array:
     return jax.vmap(lambda key: jax.random.fold_in(key, data))(key_B)
 
 
+def _require_shapes(
+    model: HMA, prompt: jax.Array, actions_BRTU: jax.Array, embodiment_B: jax.Array, key_B: jax.Array
+) -> None:
+    config = model.config
+    batch, *frames = jnp.shape(prompt)
+    token = [config.tokens, *([config.diffusion.token_channels] if config.diffusion else [])]
+    examples, *sequences = jnp.shape(actions_BRTU)
+    fits = frames[1:] == token and len(sequences) == 3 and sequences[2] == model.table.action_width
+    require(
+        fits and {(batch,)} == {(examples,), jnp.shape(embodiment_B), jnp.shape(key_B)[:1]},
+        f"a rollout takes a prompt [B, T', {', '.join(map(str, token))}], actions [B, R, T, {model.table.action_width}] "
+        "(whole chunks of a frame, filled up with zeros), B robots and B keys; got "
+        + ", ".join(str(jnp.shape(x)) for x in (prompt, actions_BRTU, embodiment_B, key_B)),
+    )
+
+
 def _recent(
     model: HMA, prompt: jax.Array, actions_BRTU: jax.Array, hidden_BT: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
@@ -181,7 +199,7 @@ def _recent(
     count, frames = prompt.shape[1], actions_BRTU.shape[2]
     require(
         1 <= count < frames,
-        f"a rollout from a prompt of {count} frames needs chunks for more than that, got {frames}",
+        f"a rollout needs 1 prompt frame or more, got {count}, and chunks for more frames than these, got {frames}",
     )
     require(model.config.frames > 1, "a model of one frame cannot continue anything")
     old = max(count - (model.config.frames - 1), 0)

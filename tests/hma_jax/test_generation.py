@@ -429,17 +429,24 @@ def test_a_session_makes_the_frames_of_a_rollout_one_by_one(slide: str, alignmen
     assert step._cache_size() == 1, "a step was compiled more than once"
 
 
-def test_a_rollout_without_chunks_for_new_frames_is_refused():
+@pytest.mark.parametrize(
+    ("prompt", "actions", "robots", "message"),
+    [
+        ((1, 2), (1, 1, 2), 1, "chunks for more frames than these, got 2"),
+        ((1, 0), (1, 1, 4), 1, "needs 1 prompt frame or more, got 0"),
+        ((1, 2), (1, 4), 1, r"a prompt \[B, T', 9\], actions \[B, R, T, 14\] .*; got \(1, 2, 9\), \(1, 4, 14\), "),
+        ((1, 2), (1, 1, 4), 2, r"takes a prompt .*; got \(1, 2, 9\), \(1, 1, 4, 14\), \(2,\), \(1,\)$"),
+    ],
+)
+def test_a_rollout_of_other_shapes_is_refused(prompt, actions, robots, message):
     config = model_config()
     declared, params = lively_params(config)
-    batch = random_batch(0, config, 1)
-    few = np.zeros((1, 1, 2, TABLE.action_width), np.float32)
-    with pytest.raises(ConfigError, match="needs chunks for more than that, got 2"):
+    with pytest.raises(ConfigError, match=message):
         rollout(
             declared.merge(params),
-            batch["tokens"][:, :2],
-            few,
-            batch["embodiment"],
+            np.zeros((*prompt, config.tokens), np.int32),
+            np.zeros((*actions, TABLE.action_width), np.float32),
+            np.zeros(robots, np.int32),
             jax.random.split(jax.random.key(0), 1),
             DecodeConfig(),
         )
