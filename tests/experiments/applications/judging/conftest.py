@@ -8,4 +8,4 @@ from experiments.applications.judging import agreement
 @pytest.fixture
 def few_draws(monkeypatch):
     for function in (agreement.agree, agreement.agree_with_counts, agreement.share, agreement.mean_above):
-        monkeypatch.setattr(function, "__defaults__", (50, 0))
+        monkeypatch.setattr(function, "__defaults__", (50,))
