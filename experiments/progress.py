@@ -39,6 +39,11 @@ Update = Callable[[int, int, str], None]
 """Called as update(done, total, note)."""
 
 
+def say(message: str) -> None:
+    """A message in anybody's words: nothing of it is markup, and the terminal alone breaks its lines."""
+    console.print(message, markup=False, soft_wrap=True)
+
+
 def _bars() -> Progress:
     return Progress(
         TextColumn("{task.description}"),

@@ -8,7 +8,7 @@ from typing import Any
 
 from experiments.preparing.made_from import Step, require_same
 from experiments.presets import get_preset
-from experiments.progress import SweepMonitor, console
+from experiments.progress import SweepMonitor, console, say
 from experiments.report.draw import draw
 from experiments.running.attempts import RESULT, State, read_states
 from experiments.running.closure import Closure
@@ -69,7 +69,7 @@ def run_study(
         require_judged(study, workspace, all_judged(sweeps))
         if earlier and earlier.provenance and (changes := diff(earlier.provenance, provenance)):
             what = f"note: changed since the last run here: {'; '.join(changes)}. Trials depend on it and run again"
-            console.print(what, markup=False, soft_wrap=True)
+            say(what)
         every = join_axes(study, workspace.root, earlier.axes if earlier else (), axes)
         shown = unique_trials(plan_sweeps(study, tuple(every.values())), provenance)
         trials = unique_trials(sweeps, provenance)

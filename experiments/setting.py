@@ -17,7 +17,7 @@ from tyro.conf import UseAppendAction, arg
 from experiments.override import override
 from experiments.presets import get_preset
 from experiments.program import PROGRAM
-from experiments.progress import console
+from experiments.progress import say
 from experiments.running.run_options import UNSET
 from experiments.running.workspace import Workspace
 from experiments.study import Study, on_tokenizer, on_user_data
@@ -188,11 +188,9 @@ def say_unmatched(registry: Path | None, names: Sequence[str]) -> None:
     given = [entry.name for entry in load_entries(registry)]
     unused, own = [n for n in given if n not in names], [n for n in names if n not in given and find_spec(n)]
     if unused and own:
-        console.print(
+        say(
             f"note: {short(registry)} has no entry called {few(own)}: the project's own is used. "
-            f"Its entries that nothing here uses: {few(unused)}",
-            markup=False,
-            soft_wrap=True,
+            f"Its entries that nothing here uses: {few(unused)}"
         )
 
 

@@ -36,7 +36,7 @@ from experiments.applications.scenes import Scenes, draw_scenes, point_names
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_rows
 from experiments.boundary import guarded
-from experiments.progress import console, step
+from experiments.progress import say, step
 from experiments.setting import short
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
@@ -274,7 +274,7 @@ def main() -> None:
     claim(asked.out, asked.run, simulator, {}, unused=("simulator.decode",))  # no frame is made
     if there := weights.exists():
         said = f"{short(weights)} of this run is there already; remove it to have it made again"
-        console.print(said, markup=False, soft_wrap=True)
+        say(said)
     else:
         make_detector(robots, simulator.tokenizer, asked.out)
     print(table.read_text())

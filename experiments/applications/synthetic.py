@@ -78,7 +78,7 @@ from experiments.applications.policies.policy import Policy
 from experiments.applications.simulators import load_simulator
 from experiments.applications.tables import write_table
 from experiments.boundary import guarded
-from experiments.progress import Pace, console, step
+from experiments.progress import Pace, say, step
 from experiments.running.workspace import Workspace
 from experiments.setting import use_entries
 from experiments.wrote import wrote
@@ -239,7 +239,7 @@ def find_lessons(asked: argparse.Namespace, simulator: Simulator) -> Lessons:
     held_out, _ = open_trajectories(asked.actions, asked.held_out or "val", *place)
     require_layout(trained_on, driven, simulator.model.table)
     for note in filter(None, map(told_of_frames, (trained_on, held_out))):
-        console.print(note, markup=False, soft_wrap=True)
+        say(note)
     return RecordedLessons(training, driven, trained_on, held_out)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, step, tidy_table
+from experiments.progress import console, say, step, tidy_table
 from experiments.running.workspace import Workspace
 from experiments.setting import UNSET, require_local
 from experiments.words import plus_minus
@@ -50,7 +50,7 @@ def check(
         check_fits(model.run, materials)
         chosen, left_out = choose_robots(run, model, materials, robots, windows, workspace.root)
         for why in left_out.values():
-            console.print(f"not checked: {why}", markup=False, soft_wrap=True)
+            say(f"not checked: {why}")
         say_what_it_may_have_seen(model.run, chosen, materials.store)
         found = check_run(run, model, materials, chosen, windows)
     names = {robot.name: robot.dimensions for robot in find_robots(run, model.table)}

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 from tyro.extras import SubcommandApp
 
 from experiments.presets import get_preset
-from experiments.progress import console
+from experiments.progress import console, say
 from experiments.wrote import wrote
 from hma_jax.config import DecodeConfig, SamplerConfig, Weights
 from hma_jax.config.evaluation import SamplerKind
@@ -59,7 +59,7 @@ def from_official(checkpoint: Positional[Path], out: Path) -> None:
     rates, without = _rates(run)
     write_run(run, out, {RATES: rates})
     for note in without:
-        console.print(note, markup=False, soft_wrap=True)
+        say(note)
     if run.model.conditioning == "cross_attention":
         console.print("note: cross-attention is computed here as the paper has it, by the release otherwise")
     _describe(run)
@@ -92,7 +92,7 @@ def to_official(run: Positional[Path], out: Path, weights: Weights = "auto") -> 
     require_free(out)
     loaded = load_run(run, weights)
     for remark in write_official(loaded, out):
-        console.print(f"note: {remark}", markup=False, soft_wrap=True)
+        say(f"note: {remark}")
     _describe(loaded)
     again = f"hma convert from-official {_quoted(out)} --out RUN"
     if loads_in_release(read_config(out)):
@@ -233,11 +233,9 @@ def _describe(run: Run) -> None:
 
     variant = "continuous" if run.model.diffusion else "discrete"
     count = declare_model(run.model, run.table).count()
-    console.print(
+    say(
         f"{variant} model, width {run.model.width}, {run.model.layers} layers, {count:,} parameters, robots: "
-        + ", ".join(run.table.names),
-        markup=False,
-        soft_wrap=True,
+        + ", ".join(run.table.names)
     )
 
 

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional, UseAppendAction, arg
 
-from experiments.progress import console
+from experiments.progress import console, say
 from experiments.running.workspace import Workspace, load_record
 from experiments.setting import short
 from experiments.wrote import wrote
@@ -55,10 +55,7 @@ def _show(root: Path) -> None:
 
     numbers = read_numbers(Workspace(root.absolute()))
     if not numbers.fits and numbers.isoflop is None:
-        console.print(
-            f"{short(root)} has no axis along which a loss may fall as a power, such as width: there is nothing to fit",
-            soft_wrap=True, highlight=False, markup=False,
-        )  # fmt: skip
+        say(f"{short(root)} has no axis along which a loss may fall as a power, such as width: there is nothing to fit")
         return
     table = Table(box=None, header_style="bold")
     for name in ("curve", "over", "L, nats per token", "exponents", "remarks"):
@@ -120,11 +117,10 @@ def _predict(root: Path, asked: str, out: Path | None, settings: tuple[str, ...]
     prediction = predict(curve, held, windows, result_hashes(results))
     path = out or workspace.predictions / f"{curve.name}-{text}.json".replace("/", "_")
     save_prediction(path, prediction)
-    console.print(
+    say(
         f"{curve.name} at {prediction.place}: {prediction.mean:.4f} nats per token, "
-        f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}",
-        soft_wrap=True, highlight=False, markup=False,
-    )  # fmt: skip
+        f"{prediction.low:.4f} to {prediction.high:.4f} with {prediction.level:.0%}"
+    )
     wrote(path, then=f"git add -f {shlex.quote(short(path))} && git commit, and only then run the trials")
 
 

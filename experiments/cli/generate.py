@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import Pace, console, step
+from experiments.progress import Pace, console, say, step
 from experiments.setting import UNSET, command, require_local, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ExecutionConfig, require
@@ -84,7 +84,7 @@ def generate(
     named = simulator.robot(robot) if robot else None
     recorded, driven = open_trajectories(actions, split, named, robots, simulator.tokenizer, stores)
     if note := told_of_frames(recorded):
-        console.print(note, markup=False, soft_wrap=True)
+        say(note)
     count = len(recorded) if episodes is None else min(episodes, len(recorded))
     mark = checkpoint_hash(run, simulator.model.step)
     source = GeneratedSource(simulator, driven, recorded, given=given, count=count, seed=seed, checkpoint=mark)
@@ -95,7 +95,7 @@ def generate(
             progress=lambda n, total, unit: update(n, total, unit + pace(n, total)),
         )  # fmt: skip
     for reason, left in done.left_out.items():
-        console.print(f"left out {left:,} x: {reason}", markup=False, soft_wrap=True)
+        say(f"left out {left:,} x: {reason}")
     with step("compare with the recordings") as update:
         found = compare(done.directory, recorded, given, clips, source.hz, update)
     made, still = found

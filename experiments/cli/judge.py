@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, step, tidy_table
+from experiments.progress import console, say, step, tidy_table
 from experiments.setting import UNSET, command, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import require
@@ -165,7 +165,7 @@ def _say(summary: dict) -> None:
     found = summary["agreement"]
     for said in (say_control(summary), say_beyond(summary), say_recorded(summary["head"]), "" if found else NOTHING):
         if said:
-            console.print(said, markup=False, soft_wrap=True)
+            say(said)
     if not found:
         return
     measures = list(next(iter(found.values()))["starts"])

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, arg
 
 from experiments.cli.bench.arguments import Model
-from experiments.progress import console, step, tidy_table
+from experiments.progress import console, say, step, tidy_table
 from experiments.setting import Preset, StudyArguments, make_setting
 from hma_jax.config import ExecutionConfig, MeshConfig, ModelConfig, TrainConfig, require
 from hma_jax.config.execution import Dtype, Remat
@@ -106,7 +106,7 @@ def plan(
     console.print(report)
     for name, made in rows:
         if made.refusal:
-            console.print(f"{name}: {made.refusal}", markup=False, soft_wrap=True)
+            say(f"{name}: {made.refusal}")
         counts = ", ".join(f"{n} {kind}" for kind, n in count_kinds(made.collectives).items()) or "none"
         console.print(f"[dim]{name}: compiled in {made.compile_seconds:.0f} s; collectives: {counts}[/]")
     console.print("[dim]collectives as they stand in the program, a loop's body once[/]")
@@ -169,4 +169,4 @@ def _print_sent(name: str, made: Plan) -> None:
 
 def _print_lines(title: str, lines: str) -> None:
     console.print(f"[italic]{title}[/]")
-    console.print(lines + "\n", markup=False, soft_wrap=True)
+    say(lines + "\n")

@@ -13,7 +13,7 @@ from experiments.cli.arguments import ModelOptions, RemakeOptions, SavingOptions
 from experiments.cli.begin import known, require_another_place, require_known, setting_of, strangers
 from experiments.cli.hosts import Hosts
 from experiments.preparing.made_from import Step
-from experiments.progress import console, step
+from experiments.progress import console, say, step
 from experiments.running.attempts import JOB, RUN
 from experiments.running.run_options import RunOptions
 from experiments.setting import UNSET, Setting, StudyArguments, make_setting, short
@@ -243,11 +243,9 @@ def _taken(run: Path, begin: Run | None) -> dict[str, Any] | None:
         f"{'; '.join(lines)}; name that one, or {place}",
     )
     if taken["step"] < origin["step"]:
-        console.print(
+        say(
             f"note: {short(run)} began with step {taken['step']:,} of a model that has {origin['step']:,} by now, and "
-            "goes on from its own checkpoint",
-            markup=False,
-            soft_wrap=True,
+            "goes on from its own checkpoint"
         )
     return taken
 
@@ -260,11 +258,7 @@ def _beginning(source: Path, run: Path) -> Run:
     origin = None if source.exists() else _newest(run)[1].get("provenance", {}).get("origin")
     if origin is None:
         return load_run(source, "auto")
-    console.print(
-        f"note: {short(source)} is gone; {short(run)} goes on from its own checkpoint, and was not compared with it",
-        markup=False,
-        soft_wrap=True,
-    )
+    say(f"note: {short(source)} is gone; {short(run)} goes on from its own checkpoint, and was not compared with it")
     return dataclasses.replace(load_run(run), step=origin["step"], provenance=origin["provenance"])
 
 
@@ -350,4 +344,4 @@ def say_data(trial: Trial, materials: Materials) -> None:
         soft_wrap=True,
     )
     for name, reason in chosen.mixture.dropped.items():
-        console.print(f"note: not trained on {name}: {reason}", markup=False, soft_wrap=True)
+        say(f"note: not trained on {name}: {reason}")

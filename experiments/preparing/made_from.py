@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from experiments.progress import console
+from experiments.progress import say
 from experiments.words import few
 from hma_jax.config import ConfigError, require
 from hma_jax.config.json import diff, from_dict, stable_hash, to_dict
@@ -128,9 +128,7 @@ def say_recorded(what: str, place: Path, there: Mapping[str, Any], now: Mapping[
     """Tells that something stays in use although other sources would make it now; of what both say."""
     lines = [line for name in there.keys() & now.keys() for line in diff(there[name], now[name], name)]
     if lines:
-        console.print(
+        say(
             f"note: {what} in {place} was made with other {'; '.join(lines)}. It stays in use; remove it to have "
-            "it made again",
-            markup=False,
-            soft_wrap=True,
+            "it made again"
         )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source, open_source
-from experiments.progress import Pace, console, step
+from experiments.progress import Pace, say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study
 from experiments.words import few
@@ -65,11 +65,9 @@ def _say_other_rates(study: Study, sources: Sequence[Source]) -> None:
     for spec, path in sources:
         own = None if find_format(path) == "rlds" else open_source((spec, path), study.store).hz  # RLDS says none
         if own not in (None, spec.hz):
-            console.print(
+            say(
                 f"note: {spec.name}: its files say {own:g} Hz, its entry {spec.hz:g} Hz, which is what counts; if the "
-                "files are right, correct the entry",
-                markup=False,
-                soft_wrap=True,
+                "files are right, correct the entry"
             )
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from experiments.preparing.made_from import Step, may_replace, require_same
 from experiments.preparing.sources import Source
-from experiments.progress import console, step
+from experiments.progress import say, step
 from experiments.running.workspace import Workspace
 from experiments.study import Study, SuiteConfig
 from experiments.words import few
@@ -56,11 +56,9 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
             progress=lambda name, done, total: update(done, total, name),
         )
     if kept:
-        console.print(
+        say(
             f"note: {few(kept)} in {workspace.suite}: made by an earlier version of the simulator, and still used; "
-            "--replace suite makes them again, and what follows from them",
-            markup=False,
-            soft_wrap=True,
+            "--replace suite makes them again, and what follows from them"
         )
     return [(spec, workspace.suite / spec.name / VERSION) for spec in specs]
 

@@ -25,7 +25,7 @@ from experiments.preparing.made_from import (
     say_recorded,
 )
 from experiments.preparing.sources import Source, open_source
-from experiments.progress import console, step
+from experiments.progress import console, say, step
 from experiments.running.closure import closure_hash, trace
 from experiments.running.machine import describe_machine
 from experiments.running.run_options import CHECKPOINTS
@@ -188,11 +188,9 @@ def _say_held_out_elsewhere(trained_from: MadeFrom | None, study: Study) -> None
     ]
     names = [name for name in study.all_names() if name in inputs.get("data", {})]
     if names and more:
-        console.print(
+        say(
             f"note: the tokenizer was trained on {few(names)} with fewer episodes held out ({'; '.join(more)}): it may "
-            "have seen frames that are held out here",
-            markup=False,
-            soft_wrap=True,
+            "have seen frames that are held out here"
         )
 
 

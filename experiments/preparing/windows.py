@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 from experiments.preparing.made_from import Step, dataset_differences, require_same
-from experiments.progress import console
+from experiments.progress import console, say
 from experiments.running.provenance import Provenance
 from experiments.running.workspace import Workspace
 from experiments.study import StoreConfig, Study
@@ -163,11 +163,9 @@ def _say_held_out(summary: dict[str, dict[str, int]], settings: StoreConfig) -> 
         if held_out > HELD_OUT * episodes and held_out > round(settings.val_fraction * episodes):
             many.append(f"{held_out} of {episodes} episodes of {name}")
     if many:
-        console.print(
+        say(
             f"note: held out, not trained on: {few(many)}. At least store.min_val={settings.min_val} are, but no more "
-            f"than store.max_val_fraction={settings.max_val_fraction:g} of a dataset, or one episode",
-            markup=False,
-            soft_wrap=True,
+            f"than store.max_val_fraction={settings.max_val_fraction:g} of a dataset, or one episode"
         )
 
 
@@ -177,11 +175,9 @@ def say_padded(summary: dict[str, dict[str, int]], frames: int, file: str) -> No
     if padded:
         most = sorted(padded, key=lambda name: -padded[name]["padded"] / padded[name]["episodes"])
         each = [f"{padded[name]['padded']} of {padded[name]['episodes']} of {name}" for name in most]
-        console.print(
+        say(
             f"note: training episodes too short for {frames} frames, whose windows end with padding: {few(each)}"
-            f"{f' ({file})' if len(each) > 3 else ''}",
-            markup=False,
-            soft_wrap=True,
+            f"{f' ({file})' if len(each) > 3 else ''}"
         )
 
 
@@ -195,4 +191,4 @@ def _remark(name: str, facts: dict[str, int], no_evaluation: str) -> None:
     if no_evaluation:
         remarks.append(f"it is not evaluated: {no_evaluation}")
     if remarks:
-        console.print(f"note: {name}: {'; '.join(remarks)}", markup=False, soft_wrap=True)
+        say(f"note: {name}: {'; '.join(remarks)}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from data_pipelines.publishing.claims import waiting_times
-from experiments.progress import console
+from experiments.progress import console, say
 from experiments.running.attempts import read_states
 from experiments.running.ledger import Ledger
 from experiments.running.workspace import Busy, Record, Workspace, load_record
@@ -60,7 +60,7 @@ def _draw(workspace: Workspace, record: Record) -> None:
     rows = read_rows(workspace)  # figures show what the files say
     checked = check_numbers(written, rows, numbers.results, numbers.windows, record.study.eval.perplexity_group)
     if checked.verdict == "bad":
-        console.print(f"note: {checked.text}", markup=False, soft_wrap=True)
+        say(f"note: {checked.text}")
     draw_figures(workspace, sweeps, rows, numbers)
     write_csv(workspace.fits, FitRow, fit_rows(numbers.fits, numbers.isoflop))
     others = write_tables(workspace, record, sweeps, states, provenance, numbers.results)

@@ -17,7 +17,7 @@ from data_pipelines.sources.settings import (
     LeRobotSettings,
     RobomimicSettings,
 )
-from experiments.progress import console, step
+from experiments.progress import say, step
 from experiments.setting import command
 from experiments.wrote import wrote
 from hma_jax.config import require
@@ -146,17 +146,17 @@ def _convert(source: Source, destination: Destination, default_name: str, no_cam
             rest = without_advice(str(error))
             advice = "Fetch the file again, or add" if rest != str(error) else "Add"
             raise DataError(f"{rest} {advice} --skip-damaged to leave it out.") from error
-    _say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
+    say(f"{done.episodes:,} episodes at {done.spec.hz:g} Hz in {done.shards} shards")
     for reason, count in done.left_out.items():
-        _say(f"left out {count:,} x: {reason}")
+        say(f"left out {count:,} x: {reason}")
     if no_cameras:
-        _say(f"left out: {', '.join(no_cameras)}; docs/own_data.md says what is a camera")
+        say(f"left out: {', '.join(no_cameras)}; docs/own_data.md says what is a camera")
     inspect = command("data inspect", done.directory, "--hz", f"{done.spec.hz:g}")
-    _say(
+    say(
         "to read it, unless an entry of this name is known: add `--entry FILE.toml` to the next command and give "
         "that file to all others with --registry; or add this to data_pipelines/registry/own.py:"
     )
-    _say(f"    {entry(done.spec)}")
+    say(f"    {entry(done.spec)}")
     wrote(done.directory, then=inspect)
 
 
@@ -219,15 +219,11 @@ def import_tokens(
             )
         facts, spec = manifest.tokenizer, manifest.spec
         what = f"latents of {facts.channels} values" if facts.channels else f"ids of {facts.vocab_size:,}"
-        _say(
+        say(
             f"{spec.name}: {len(manifest.train.episodes):,} + {len(manifest.val.episodes):,} episodes, "
             f"{facts.tokens} tokens per frame, {what}, by {facts.identity}; "
             f"{spec.hz:g} Hz, stride {spec.stride}"
         )
         wrote(store / spec.name)
     if tokenizer is None:
-        _say("note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets")
-
-
-def _say(line: str) -> None:
-    console.print(line, markup=False, soft_wrap=True)
+        say("note: without --tokenizer there are no frames, so evaluation in pixels cannot use these datasets")

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from data_pipelines.errors import NAMED
 from experiments.cli.data.next_command import no_window, other_rate, single_episode, tokenize_command
-from experiments.progress import console, step, tidy_table
+from experiments.progress import console, say, step, tidy_table
 from experiments.setting import say_unmatched, use_entries
 from experiments.wrote import wrote
 from hma_jax.config import ConfigError, require
@@ -237,7 +237,7 @@ def _print_entry(known: DatasetSpec | None, suggestion: Suggestion | None) -> No
             return
     for reason in suggestion.reasons:
         console.print(f"  {escape(reason)}", soft_wrap=True)
-    console.print(suggestion.python(), markup=False, soft_wrap=True)
+    say(suggestion.python())
     console.print(
         "Paste it into data_pipelines/registry/own.py, or write it with --entry FILE.toml and give that file "
         "to other commands with --registry.",
@@ -260,7 +260,7 @@ def _write_entry(path: Path, suggestion: Suggestion) -> None:
     wrote(path)
     if lines := [line for entry in there for line in diff(entry, spec)]:
         text = f"note: in place of the entry of {spec.name} that was there; changed: {'; '.join(lines)}"
-        console.print(text, markup=False, soft_wrap=True)
+        say(text)
 
 
 def _say_next(facts: Facts, windows: WindowFacts | None, entries: Path | None, first: str | None) -> None:

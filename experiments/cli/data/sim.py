@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from experiments.progress import console, step
+from experiments.progress import console, say, step
 from experiments.setting import command, command_words
 from experiments.words import few
 from experiments.wrote import wrote
@@ -112,11 +112,9 @@ def _to_simulate(out: Path, specs: Sequence[SimSpec], episodes: int, size: int, 
 
     kept = made_before(out, specs, episodes, size, seed)
     if kept:
-        console.print(
+        say(
             f"note: {few(kept)} in {out}: made by other versions of simulators, and still used; remove them to have them "
-            "made again",
-            markup=False,
-            soft_wrap=True,
+            "made again"
         )
     return [spec.name for spec in specs if spec.name not in kept]
 
