@@ -162,9 +162,14 @@ def read_info(directory: Location) -> DatasetInfo:
     """Raises DataError for a dataset_info.json that is missing or damaged."""
     path = directory / INFO
     values = read_object(path, if_missing=ADVICE, advice=ADVICE)
+    name, version = values.get("name"), values.get("version")
+    if isinstance(name, str) and name.isidentifier() and not is_name(name):  # tfds takes letters of any alphabet
+        raise DataError(
+            f"{path}: name is {shown(name)}: {NAME_RULE}. Change it there and in the names of the shards, which begin "
+            "with it."
+        )
     try:
         splits = [_split(split) for split in _list(values.get("splits", []), "splits")]
-        name, version = values.get("name"), values.get("version")
         file_format = values.get("fileFormat", values.get("file_format")) or "tfrecord"
         for text, what in ((name, "name"), (version, "version"), (file_format, "fileFormat")):
             if not is_name(text):

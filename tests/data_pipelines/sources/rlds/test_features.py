@@ -13,6 +13,7 @@ import pytest
 
 from data_pipelines import json_file
 from data_pipelines.errors import DataError
+from data_pipelines.sources.rlds.dataset import RldsDataset
 from data_pipelines.sources.rlds.features import DEEPEST, MOST_FIELDS, parse_features
 from data_pipelines.sources.rlds.schema import MOST_SHARDS, read_features, read_info, read_metadata
 from tests.data_pipelines.fakes import REAL_DATA, make_spec, write_rlds
@@ -251,6 +252,18 @@ def test_name_that_is_no_name_of_a_directory_is_refused(tmp_path, name):
     change_info(directory, name=name)
     with pytest.raises(DataError, match=r"dataset_info.json: name is .*use up to 128 letters"):
         read_metadata(directory, "train")
+
+
+def test_name_that_tfds_takes_is_to_be_changed_not_restored(tmp_path):
+    directory = write_rlds(tmp_path, make_spec(), [3])
+    change_info(directory, name="küche")
+    with pytest.raises(DataError, match="Change it there and in the names of the shards") as refused:
+        read_metadata(directory, "train")
+    assert "Restore" not in str(refused.value)
+    change_info(directory, name="kueche")
+    (shard,) = directory.glob("*.tfrecord-*")
+    shard.rename(directory / shard.name.replace(make_spec().name, "kueche"))
+    assert len(RldsDataset(directory)) == 1
 
 
 @pytest.mark.parametrize(
