@@ -10,7 +10,6 @@ or recorded as lost with its file and offset.
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Iterator
 from contextlib import closing
@@ -41,6 +40,7 @@ from data_pipelines.tokens.manifest import (
 from data_pipelines.tokens.part_files import Part, PartItem
 from data_pipelines.tokens.read_ahead import Begin, End, frames_ahead
 from hma_jax.config import require
+from hma_jax.runtime.cores import usable_cores
 
 if TYPE_CHECKING:
     from data_pipelines.sources.rlds.location import Location
@@ -91,7 +91,7 @@ def tokenize_dataset(
         spec, source, tokenizer, val_fraction, min_val, max_val,
         max_val_fraction=max_val_fraction, keep_frames=keep_frames, frame_step=frame_step, rate=rate,
     )  # fmt: skip
-    work = _Work(source, plan, tokenizer, batch, threads or min(_cores(), 8))
+    work = _Work(source, plan, tokenizer, batch, threads or min(usable_cores(), 8))
     lost = [
         LostEpisodes(_without_place(reason, source), episodes=count) for reason, count in sorted(source.skipped.items())
     ]
@@ -172,10 +172,6 @@ def _without_place(reason: str, source: EpisodeSource) -> str:
     place, name = str(source.location), source.location.name
     inside = reason.replace(f"{place}/", "")
     return inside.replace(place, name) if name else inside  # "." has none
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from experiments.running.workspace import Workspace
 from experiments.study import Study, SuiteConfig
 from experiments.words import few
 from hma_jax.config import require
+from hma_jax.runtime.cores import usable_cores
 
 
 def require_simulated(names: Sequence[str], advice: str = "Give RLDS directories with --data") -> None:
@@ -52,7 +52,7 @@ def make_suite(study: Study, workspace: Workspace, replace: Step | None = None) 
             validation=study.suite.validation,
             fewest=study.suite.fewest,
             names=[name for name in names if name not in kept],
-            workers=_cores(),
+            workers=usable_cores(),
             progress=lambda name, done, total: update(done, total, name),
         )
     if kept:
@@ -96,7 +96,3 @@ def _differences(name: str, directory: Path, suite: SuiteConfig) -> list[str] | 
 def _shortened(lines: Sequence[str], most: int = 8) -> list[str]:
     more = len(lines) - most
     return [*lines[:most], f"... and {more} more"] if more > 0 else list(lines)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 
 from experiments.running.slots import Slot
+from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.host_memory import KEPT_PAGES, keep_freed_memory
 
 _PARENT, _CORES = "HMA_PARENT_PID", "HMA_CORES"
@@ -52,7 +53,7 @@ def enter_child() -> None:
     cores = os.environ.get(_CORES)
     if cores:
         os.sched_setaffinity(0, {int(c) for c in cores.split(",")})
-    if hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) == 1:
+    if usable_cores() == 1:
         keep_freed_memory()
     parent = int(os.environ.get(_PARENT, "0"))
     if parent:

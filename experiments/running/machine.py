@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
-import os
 import platform
 import subprocess
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from hma_jax.runtime.cores import usable_cores
 
 PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "grain", "numpy")
 
@@ -19,7 +20,7 @@ def describe_machine(devices: Sequence[Any] = ()) -> dict[str, Any]:
     kinds = sorted({d.device_kind for d in devices})
     return {
         "processor": _processor(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": usable_cores(),
         "devices": [f"{sum(d.device_kind == k for d in devices)} x {k}" for k in kinds],
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),

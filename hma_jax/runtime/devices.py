@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 
 import jax
@@ -66,12 +65,6 @@ def peak_flops(dtype: str) -> float | None:
     if dtype == "float32" and jax.config.jax_default_matmul_precision in FULL_PRECISION:
         return peak.full_float32 * jax.device_count()
     return getattr(peak, dtype) * jax.device_count()
-
-
-def usable_cores() -> int:
-    """Cores of the processor that this process may use. On CPUs XLA shares sums out among them: the last digits of
-    results depend on how many they are."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def default_device() -> jax.Device:

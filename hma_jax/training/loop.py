@@ -29,7 +29,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from hma_jax.runtime.devices import usable_cores
+from hma_jax.runtime.cores import usable_cores
 from hma_jax.runtime.exits import Exit, hand_on, lost_request
 from hma_jax.runtime.locks import Lock
 from hma_jax.runtime.processes import Agreement, is_writer, meet
