@@ -34,10 +34,10 @@ def inside(root: Path, text: object) -> Path:
     return root / text
 
 
-def brief(text: object, longest: int = 500) -> str:
+def brief(text: object) -> str:
     """A message that may quote a file of others, of bounded length."""
     text = str(text)
-    return text if len(text) <= longest else f"{text[:longest]} ..."
+    return text if len(text) <= 500 else f"{text[:500]} ..."
 
 
 def shown(value: object, longest: int = 80) -> str:

@@ -27,9 +27,6 @@ class Shared:
     keep: tuple[int, ...] = ()  # steps after which its checkpoint stays, for those with more
 
 
-ALONE = Shared()
-
-
 def share_runs(trials: Mapping[str, Trial], former: Mapping[str, Trial] = {}) -> dict[str, Shared]:
     """For every trial of a study, by id. `former`: others that are finished (`trained.find_trained`)."""
     trained: dict[str, dict[str, int]] = defaultdict(dict)

@@ -103,15 +103,11 @@ def to_strict_json(values: Any) -> str:
     return json.dumps(json.loads(json.dumps(values), parse_constant=lambda _: None), indent=1)
 
 
-def from_json(cls: type, text: str) -> Any:
-    return from_dict(cls, json.loads(text))
-
-
-def stable_hash(config: Any, length: int = 16) -> str:
+def stable_hash(config: Any) -> str:
     """Hex digest of the canonical JSON: the same on every machine and Python version."""
     # Not `to_dict` of all of it: most of what is hashed is JSON already, and copying it takes longer than the rest.
     canonical = json.dumps(config, sort_keys=True, separators=(",", ":"), default=_of_dataclass)
-    return hashlib.sha256(canonical.encode()).hexdigest()[:length]
+    return hashlib.sha256(canonical.encode()).hexdigest()[:16]
 
 
 def _of_dataclass(config: Any) -> dict[str, Any]:

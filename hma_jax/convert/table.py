@@ -215,10 +215,8 @@ def to_official(params: Params, parts: Mapping[str, list[Part]]) -> dict[str, np
     return {part.name: part.to_official(arrays[path]) for path, own in parts.items() for part in own}
 
 
-def check_names(
-    want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], where: str, shown: int = 10
-) -> None:
-    """Raises ConfigError naming (the first few) tensors that are missing, too many or of another shape."""
+def check_names(want: Mapping[str, tuple[int, ...]], found: Mapping[str, tuple[int, ...]], where: str) -> None:
+    """Raises ConfigError naming (the first ten) tensors that are missing, too many or of another shape."""
     wrong = {
         "missing": [f"{n} {want[n]}" for n in want if n not in found],
         "not expected": [f"{n} {found[n]}" for n in found if n not in want],
@@ -227,7 +225,7 @@ def check_names(
         ],
     }
     lines = [
-        f"\n  {len(names)} {problem}: " + "; ".join(names[:shown]) + ("; ..." if len(names) > shown else "")
+        f"\n  {len(names)} {problem}: " + "; ".join(names[:10]) + ("; ..." if len(names) > 10 else "")
         for problem, names in wrong.items()
         if names
     ]

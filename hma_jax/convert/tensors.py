@@ -66,14 +66,14 @@ def read_safetensors(path: Path) -> dict[str, Stored]:
         raise ConfigError(f"{path}: no readable safetensors file ({error}); fetch it again") from error
 
 
-def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray], metadata: dict[str, str] | None = None) -> None:
+def write_safetensors(path: Path, tensors: Mapping[str, np.ndarray]) -> None:
     """Writes contiguous copies where needed; the values' bytes are kept. Raises OSError."""
     dense = {name: np.ascontiguousarray(x).reshape(x.shape) for name, x in tensors.items()}
     # safetensors puts a file in the place of ours that its owner alone may read: it gets the mode that the umask gave.
     path.touch()
     mode = stat.S_IMODE(path.stat().st_mode)
     try:
-        safetensors.numpy.save_file(dense, path, metadata)
+        safetensors.numpy.save_file(dense, path)
     except SafetensorError as error:
         raise OSError(f"{path} cannot be written: {error}; check the space on its disk") from error
     path.chmod(mode)

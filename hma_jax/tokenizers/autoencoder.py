@@ -10,13 +10,9 @@ import abc
 from functools import lru_cache
 
 import jax
-import numpy as np
 
 from hma_jax.config import TokenizerConfig
-from hma_jax.evaluation.metrics import psnr
-from hma_jax.evaluation.statistics import Stat, mean_and_sem
 from hma_jax.model.params import Declared, Params, declare
-from hma_jax.tokenizers.base import Tokenizer
 from hma_jax.tokenizers.network import Autoencoder, from_pixels, to_pixels
 from hma_jax.tokenizers.shared import BaseTokenizer
 
@@ -49,8 +45,3 @@ class AutoencoderTokenizer(BaseTokenizer):
     @abc.abstractmethod
     def _to_latents(self, tokens: jax.Array) -> jax.Array:
         """The decoder's input, float32 [B, S, bits], of tokens."""
-
-
-def reconstruction_psnr(tokenizer: Tokenizer, images: np.ndarray) -> Stat:
-    """PSNR in dB of images [n, H, W, 3] against what is left of them after encode and decode."""
-    return mean_and_sem(psnr(images, tokenizer.decode(tokenizer.encode(images))))

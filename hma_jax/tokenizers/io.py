@@ -7,7 +7,6 @@ scale of latents. It is written last, so a directory holds a whole tokenizer or 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,10 +59,9 @@ def load_tokenizer(
     directory: Path,
     expect: AnyTokenizerConfig | None = None,
     *,
-    devices: Sequence[jax.Device] | None = None,
     piece: int | None = None,
 ) -> BaseTokenizer:
-    """The tokenizer in `directory`. `devices` and `piece` are explained at `BaseTokenizer`.
+    """The tokenizer in `directory`. `piece` is explained at `BaseTokenizer`.
 
     Raises ConfigError if none is there, if a file is damaged, or if its configuration is not
     `expect` (when given), naming every field that differs.
@@ -80,7 +78,7 @@ def load_tokenizer(
     weights = _read_weights(directory)
     measured = {name: description[name] for name in kind.measured}
     try:
-        tokenizer = kind(config, weights, **measured, devices=devices, piece=piece)
+        tokenizer = kind(config, weights, **measured, piece=piece)
     except ConfigError as error:
         raise ConfigError(f"{directory}: {error}; {AGAIN}") from error
     require(

@@ -19,7 +19,7 @@ from experiments.cli.main import main
 from experiments.running import run_trial as trials
 from experiments.running import trial_main
 from experiments.running.attempts import Ended, outcome
-from experiments.running.shared_runs import ALONE
+from experiments.running.shared_runs import Shared
 from experiments.running.workspace import Workspace
 from hma_jax.runtime.exits import Exit
 from hma_jax.training import train as model_training
@@ -127,7 +127,9 @@ def write_job(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a trial of nothing."""
     inputs = {"store": "a", "manifest": "b", "tokenizer": "c"}
     (directory / "job.json").write_text(json.dumps({"provenance": inputs}))
-    monkeypatch.setattr("experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, ALONE))
+    monkeypatch.setattr(
+        "experiments.running.job.read_job", lambda record: (SimpleNamespace(source=None), None, Shared())
+    )
 
 
 # --- A full disk -----------------------------------------------------------------------------

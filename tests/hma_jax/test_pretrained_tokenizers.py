@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from hma_jax.config import AnyTokenizerConfig, ConfigError, Magvit2Config, PixelsConfig, SvdVaeConfig, TokenizerConfig
-from hma_jax.config.json import from_dict, from_json, to_json
+from hma_jax.config.json import from_dict, to_json
 from hma_jax.model.frames import compose, factorise
 from hma_jax.tokenizers.io import load_config, load_tokenizer, save_tokenizer
 from hma_jax.tokenizers.network import from_pixels, to_pixels
@@ -113,7 +114,7 @@ class Holder:
 
 def test_a_configuration_of_any_kind_comes_back_from_json():
     for config in (*CONFIGS.values(), TokenizerConfig(bits=12)):
-        assert from_json(Holder, to_json(Holder(config))) == Holder(config)
+        assert from_dict(Holder, json.loads(to_json(Holder(config)))) == Holder(config)
     with pytest.raises(ConfigError, match="unknown kind 'vq'; known: magvit2, svd-vae, pixels"):
         from_dict(Holder, {"tokenizer": {"kind": "vq"}})
 

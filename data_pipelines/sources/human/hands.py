@@ -56,7 +56,6 @@ def cut_episodes(
     min_frames: int,
     max_steps: int,
     origin: Callable[[int], str],
-    text: str = TEXT,
 ) -> Iterator[Episode | LeftOut]:
     """The episodes of [N, 4] positions of evenly spaced frames; `origin` names one by its first row."""
     found = runs(both_seen(positions))
@@ -76,5 +75,5 @@ def cut_episodes(
                 origin=origin(int(first)),
                 images={IMAGE: read_frames(np.arange(first, last))},
                 vectors={STATE: rows[:-1], ACTION: action(rows[:-1], rows[1:])},
-                instructions=[text] * int(last - first),
+                instructions=[TEXT] * int(last - first),
             )
