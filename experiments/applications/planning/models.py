@@ -25,8 +25,8 @@ class Model(Protocol):
     """Where a planner looks ahead."""
 
     def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:
-        """The present, after frames uint8 [H, W, 3] and the actions [A] between them. A model takes of all this what a
-        robot could know, or, the true one, the `state` itself."""
+        """The present, after frames uint8 [H, W, 3] and the actions between them, [A] or whole chunks. A model takes of
+        all this what a robot could know, or, the true one, the `state` itself."""
         ...
 
     def imagine(self, actions: np.ndarray) -> np.ndarray:
@@ -46,7 +46,7 @@ class LearnedModel:
         self._simulator, self._robot = simulator, robot
         self._present = None
 
-    def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State) -> None:
+    def begin(self, images: Sequence[np.ndarray], actions: Sequence[np.ndarray], state: State | None) -> None:
         del state
         seen = np.stack(images[-CONTEXT:])
         chunks = [self._robot.chunk(action) for action in actions[len(actions) + 1 - len(seen) :]]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from hma_jax.simulator.robots import Robot
 from tests.experiments.applications.runs import make_run
 from tests.hma_jax.simulator.small import ROBOTS, simulator
 
+PAGE = Path(__file__).parents[3] / "docs/planning.md"
 CONFIG = SearchConfig(candidates=16, iterations=4, knots=3, hold=2)
 TARGET = np.array([[0.6, -0.5], [0.1, 0.4], [-0.7, 0.2]])
 
@@ -115,6 +118,16 @@ def test_the_learned_model_imagines_again_from_the_same_present():
     assert (model.imagine(other) != imagined).any()
     np.testing.assert_array_equal(model.imagine(first), imagined)
     assert (to_picture(imagined[0, -1])(imagined) < to_picture(255 - imagined[0, -1])(imagined)).all()
+
+
+def test_the_program_of_the_page_plans(tmp_path, monkeypatch):
+    (text,) = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    make_run(tmp_path / "runs/mine")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(text.replace("my_robot", "pusher_sand"), names)
+    low, high = names["robot"].low, names["robot"].high
+    assert names["plan"].shape == (2, 2) and (names["plan"] >= low).all() and (names["plan"] <= high).all()
 
 
 def test_a_figure_shows_planners_that_always_or_never_succeed(tmp_path):
