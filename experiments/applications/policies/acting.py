@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 
 from experiments.applications.policies.demonstrations import Demonstrations
+from experiments.applications.policies.network import as_floats, shrink_bytes
 from experiments.applications.policies.policy import Counts
 
 STILL = 1e-4
@@ -39,10 +41,24 @@ def scale_of(demos: Demonstrations) -> Scale:
     return Scale(*(tuple(x.tolist()) for x in (actions.mean(0), std, actions.min(0), actions.max(0))))
 
 
-def action_chunks(demos: Demonstrations, steps: np.ndarray, chunk: int) -> np.ndarray:
-    """Raw [n, chunk, A]: the actions from each (episode, frame) [n, 2] on; the last one goes on past the end."""
+def make_examples(demos: Demonstrations, frames: int, chunk: int, size: int) -> dict[str, np.ndarray]:
+    """What a network is trained on: the `images` of all episodes, averaged down to `size`, and of each of the n frames
+    that count its `episode` [n], the frames `seen` by then [n, frames] and the `chunk` [n, chunk * A] of normalised
+    actions from there on; the first frame is repeated before the beginning, the last action past the end."""
+    steps = demos.steps()
     at = np.minimum(steps[:, 1:] + np.arange(chunk), demos.lengths[steps[:, 0]][:, None] - 1)
-    return demos.actions[steps[:, :1], at]
+    actions = scale_of(demos).normalise(demos.actions[steps[:, :1], at])
+    return {
+        "images": shrink_bytes(demos.images, size),
+        "episode": steps[:, 0],
+        "seen": np.maximum(steps[:, 1:] - np.arange(frames)[::-1], 0),
+        "chunk": actions.reshape(len(steps), -1),
+    }
+
+
+def frames_of(examples: Mapping[str, jax.Array], index: jax.Array) -> jax.Array:
+    """[B, frames, H, W, 3] in [-1, 1]: what is seen in the examples `index` [B]."""
+    return as_floats(examples["images"][examples["episode"][index][:, None], examples["seen"][index]])
 
 
 class ChunkPolicy:

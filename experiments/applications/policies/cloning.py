@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.applications.policies.acting import ChunkPolicy, Scale, action_chunks, scale_of
+from experiments.applications.policies.acting import ChunkPolicy, Scale, frames_of, make_examples, scale_of
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.learning import FitConfig, Report, fit, recent_frames
+from experiments.applications.policies.learning import FitConfig, Report, fit
 from experiments.applications.policies.network import (
     EncoderConfig,
     Params,
@@ -27,7 +27,6 @@ from experiments.applications.policies.network import (
     init_mlp,
     lit,
     mlp,
-    shrink_bytes,
 )
 from hma_jax.config import require
 
@@ -72,21 +71,14 @@ def train_bc(
 
     A function of its arguments; minutes on one core.
     """
-    steps, scale = demos.steps(), scale_of(demos)
-    data = {
-        "images": shrink_bytes(demos.images, config.encoder.size),
-        "episode": steps[:, 0],
-        "seen": recent_frames(steps, config.frames),
-        "chunk": scale.normalise(action_chunks(demos, steps, config.chunk)).reshape(len(steps), -1),
-    }
+    data = make_examples(demos, config.frames, config.chunk, config.encoder.size)
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
-        frames = as_floats(data["images"][data["episode"][index][:, None], data["seen"][index]])
-        planned = apply_bc(params, config, lit(frames, key, config.light))
+        planned = apply_bc(params, config, lit(frames_of(data, index), key, config.light))
         return jnp.mean((planned - data["chunk"][index]) ** 2)
 
     start = init_bc(config, demos.actions.shape[-1], seed)
-    return fit(start, loss, data, len(steps), config.fit, seed, report)
+    return fit(start, loss, data, len(data["episode"]), config.fit, seed, report)
 
 
 @partial(jax.jit, static_argnums=1)

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.applications.policies.acting import ChunkPolicy, Scale, action_chunks, scale_of
+from experiments.applications.policies.acting import ChunkPolicy, Scale, frames_of, make_examples
 from experiments.applications.policies.demonstrations import Demonstrations
-from experiments.applications.policies.learning import FitConfig, Report, fit, recent_frames
+from experiments.applications.policies.learning import FitConfig, Report, fit
 from experiments.applications.policies.network import (
     EncoderConfig,
     Params,
@@ -28,7 +28,6 @@ from experiments.applications.policies.network import (
     init_mlp,
     lit,
     mlp,
-    shrink_bytes,
 )
 from hma_jax.config import require
 
@@ -106,19 +105,13 @@ def train_diffusion(
     demos: Demonstrations, config: DiffusionConfig, seed: int = 0, report: Report = lambda done, total, note: None
 ) -> dict[int, Params]:
     """{step: parameters} for `config.fit.keep` and the last step; a function of its arguments."""
-    steps, scale = demos.steps(), scale_of(demos)
     kept = jnp.asarray(signal(config.levels))
-    data = {
-        "images": shrink_bytes(demos.images, config.encoder.size),
-        "episode": steps[:, 0],
-        "seen": recent_frames(steps, config.frames),
-        "chunk": scale.normalise(action_chunks(demos, steps, config.chunk)).reshape(len(steps), -1),
-    }
+    data = make_examples(demos, config.frames, config.chunk, config.encoder.size)
 
     def loss(params: Params, data, index: jax.Array, key: jax.Array) -> jax.Array:
         light, level_key, noise_key = jax.random.split(key, 3)
-        frames = as_floats(data["images"][data["episode"][index][:, None], data["seen"][index]])
-        seen = encode(params["encoder"], config.encoder, beside(lit(frames, light, config.light)))
+        frames = lit(frames_of(data, index), light, config.light)
+        seen = encode(params["encoder"], config.encoder, beside(frames))
         chunk = jnp.clip(data["chunk"][index], -CLIP, CLIP)
         level = jax.random.randint(level_key, (len(index),), 0, config.levels)
         noise = jax.random.normal(noise_key, chunk.shape)
@@ -127,7 +120,7 @@ def train_diffusion(
         return jnp.mean((denoise(params, seen, noised, level.astype(jnp.float32)) - noise) ** 2)
 
     start = init_diffusion(config, demos.actions.shape[-1], seed)
-    return fit(start, loss, data, len(steps), config.fit, seed, report)
+    return fit(start, loss, data, len(data["episode"]), config.fit, seed, report)
 
 
 @partial(jax.jit, static_argnums=1)

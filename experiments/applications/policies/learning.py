@@ -93,8 +93,3 @@ def ladder(steps: int, rungs: int, first: int = 20) -> tuple[int, ...]:
     require(rungs >= 2, f"a ladder from {first} to {steps} steps needs at least 2 rungs, got {rungs}")
     require(steps > first, f"the first checkpoint is that of {first} steps: training must be longer, not {steps} steps")
     return tuple(sorted({round(first * (steps / first) ** (i / (rungs - 1))) for i in range(rungs)}))
-
-
-def recent_frames(steps: np.ndarray, frames: int) -> np.ndarray:
-    """int [n, frames]: which frames an example (episode, frame) [n, 2] is shown, the first repeated before it."""
-    return np.maximum(steps[:, 1:] - np.arange(frames)[::-1], 0)
